@@ -143,6 +143,24 @@ def test_planted_mistakes_are_caught(mistake, tmp_path, capsys, monkeypatch):
     assert "FAILED" in output.out
 
 
+@pytest.mark.parametrize("steep", ["jnp.maximum(1 - (I1 - 3) / 0.5, 1e-6)", "jnp.maximum(1 - (I1 - 3) / 9.0, 1e-3)"])
+def test_a_steep_energy_is_no_jump(steep, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(figures, "gradient_check", lambda *_: None)
+    file = tmp_path / "mine.py"
+    file.write_text(
+        HEAD
+        + f"""
+    isochoric_derivatives = None
+
+    def isochoric_energy(self, I1, I2):
+        return -self.mu * 0.25 * jnp.log({steep})
+"""
+    )
+    main(["check", f"{file}:Law", "--out", str(tmp_path)])
+    output = capsys.readouterr()
+    assert "stable in uniaxial" in output.out and "the energy jumps" not in output.out
+
+
 def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):
     file = tmp_path / "mine.py"
     file.write_text(

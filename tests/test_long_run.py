@@ -179,7 +179,7 @@ def test_the_result_of_another_scene_is_not_replaced_by_resume(scene, tmp_path, 
     assert main(["simulate", str(scene), "--resume", "--out", str(tmp_path)]) == 2
     assert "result.h5 is the result of another scene: name another --out, or leave --resume" in capsys.readouterr().err
     long_run.refuse_unfinished(out, resume=False, text=SCENE)
-    long_run.refuse_unfinished(out, resume=True, text=SCENE.replace("770.0", "700.0"))
+    long_run.refuse_unfinished(out, resume=True, text="# of the same numbers\n" + SCENE.replace("770.0", "700.0"))
 
 
 @pytest.mark.parametrize("steps", [5, 8125, 8126, 40_000])

@@ -169,6 +169,9 @@ def test_a_scene_file_with_a_region_runs(tmp_path):
 def test_regions_that_lie_over_each_other_may_add_to_each_other(tmp_path):
     """Only what later regions replace everywhere changes nothing."""
     half, more = "[[region]]\nwhere = {x_min = 0.02}\n", "[[region]]\nwhere = {x_min = 0.0}\n"
+    own = f"{half}law = {{mu = [1500.0, 900.0]}}\n{more}law = {{mu = [1500.0, 900.0]}}\n"
+    with pytest.raises(lj.InputError, match=r"region\.0 changes nothing"):
+        _load(tmp_path, own)
     for first, second in ((half, half), (more, half), (half, more)):
         law = "law = {mu = [1500.0, 900.0]}\n" if first is not more else "law = {bulk = 6000.0}\n"
         scene = _load(tmp_path, f"{first}{law}{second}law = {{bulk = 5000.0}}\n")

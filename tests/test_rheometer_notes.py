@@ -10,18 +10,19 @@ from liverjax import InputError
 
 def test_moduli_beside_columns_of_a_dma_may_be_those_of_tension(tmp_path):
     """E taken for G is three times too large: the headings of the moduli alone do not tell."""
-    head, rows = "Frequency (Hz),{}Storage Modulus (kPa),{}Loss Modulus (kPa),{}\n", "0.1,9,1,2\n1,10,2,2\n"
+    head, rows = "Frequency (Hz),{}Storage Modulus (kPa),{}Loss Modulus (kPa),{},remark\n", "0.1,9,1,2,2\n1,10,2,2,2\n"
     told = {}
     for own, beside in (
         ("", "Static Force (N)"),
         ("", "Length (mm)"),
         ("", "Axial force (N)"),
         ("Shear ", "Length (mm)"),
+        ("", "Dynamic strain (%),Torque (uN.m)"),
     ):
         s = read_sweep(_write(tmp_path, head.format(own, own, beside) + rows))
         assert np.allclose(s.storage, [9000, 10000])
         told[own + beside] = [n for n in s.notes if "if these are moduli E, three times as large" in n]
-    assert [len(said) for said in told.values()] == [1, 1, 0, 0]
+    assert [len(said) for said in told.values()] == [1, 1, 0, 0, 0]
 
 
 def test_viscosities_are_named_as_not_read(tmp_path):

@@ -350,3 +350,10 @@ def test_small_units_are_read_and_unknown_ones_are_named(tmp_path):
         else:
             read[force] = read_time_test(tmp_path / "t.csv", "relaxation", Sample(0.01, 0.005))
     assert np.allclose(read["uN"].answer, read["N"].answer) and np.allclose(read["uN"].driven, read["N"].driven)
+
+
+def test_a_steady_cycle_begins_behind_its_load_and_has_no_offset(tmp_path):
+    t = np.linspace(0, 3, 151)
+    write(tmp_path / "t.csv", "time_s,strain,stress_Pa", t, 0.05 * np.sin(6 * t), 40 * np.sin(6 * t + 0.2))
+    notes = read_time_test(tmp_path / "t.csv", "relaxation").notes
+    assert not any("offset of the sensor" in note for note in notes)

@@ -347,7 +347,8 @@ def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
     k = int(np.argmax(test.time >= test.begun))
     here, load = float(test.answer[k]), abs(float(test.driven[k])) / float(np.max(np.abs(test.driven)))
     noise = noise_of_series(test.answer[np.isfinite(test.answer) & (test.time > test.begun)])
-    if load > AT_REST or not abs(here) > max(_IN_NOISE * noise, (OFFSET + 2 * load) * size):
+    # A steady cycle begins with an answer that lags behind.
+    if test.cyclic or load > AT_REST or not abs(here) > max(_IN_NOISE * noise, (OFFSET + 2 * load) * size):
         return []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
     return [

@@ -343,10 +343,10 @@ SLOW, FAST = 0.4, 15.0
 
 
 def _in_radians(hertz: np.ndarray) -> bool:
-    """Whether no frequency is a whole number, and all are whole numbers, to five digits, times 2 pi."""
+    """Whether no frequency is a whole number, and all are whole numbers times 2 pi, to the digits of a table."""
 
     def whole(x: np.ndarray) -> np.ndarray:
-        return np.abs(x - np.round(x)) < 1e-5 * x
+        return np.abs(x - np.round(x)) < 5e-4
 
     return bool(np.all(whole(hertz / (2 * np.pi)) & ~whole(hertz)))
 

@@ -5,6 +5,7 @@ new tangent, whether or not the run was stopped before it, so a resumed run ends
 """
 
 import time
+import tomllib
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -52,7 +53,7 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
                 before = file.attrs.get("scene", text)
         except OSError:
             return
-        if before != text:
+        if tomllib.loads(str(before).lstrip("\ufeff")) != tomllib.loads(text):  # comments may differ
             raise InputError(f"{out} is the result of another scene: name another --out, or leave --resume out")
 
 

@@ -388,8 +388,9 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
 
 
 #: Part of its change within a step by which an energy misses the work of the stress, from which a jump is looked for;
-#: the parts into which the step is cut then. A jump stays in one of them, the error of a smooth energy falls.
-_MISSED, _PARTS = 0.05, 32
+#: the parts into which the step is cut then, and how often. A jump stays in one of them, the error of an energy without
+#: one falls.
+_MISSED, _PARTS, _CUTS = 0.05, 32, 3
 
 
 def _jumps(law: Law, energy: Callable) -> list[Row]:
@@ -408,10 +409,16 @@ def _jumps(law: Law, energy: Callable) -> list[Row]:
         driven = SHEARS if what == "shear" else STRETCHES
         gap, change = missed(test, driven)
         for k in np.flatnonzero(gap > _MISSED * change + 1e-9 * np.nan_to_num(change).max()):
-            finer = np.linspace(driven[k], driven[k + 1], _PARTS + 1)
-            parts, _ = missed(test, finer)
-            if parts.max() > 0.5 * gap[k]:
-                at = finer[int(np.argmax(parts))]
+            low, high, most = driven[k], driven[k + 1], gap[k]
+            for _ in range(_CUTS):
+                finer = np.linspace(low, high, _PARTS + 1)
+                parts, _ = missed(test, finer)
+                worst = int(np.argmax(parts))
+                low, high = finer[worst], finer[worst + 1]
+                if not parts[worst] > 0.5 * most:
+                    break
+            else:
+                at = low
                 found = f"by {parts.max():.3g} Pa at {what} {at:.3g} in {test.replace('_', ' ')}"
                 return [Row("the energy jumps", found, "its stress does not know it", False)]
     return []

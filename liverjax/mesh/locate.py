@@ -57,15 +57,28 @@ def around_a_point(corners: np.ndarray) -> np.ndarray:
     return _all_alike(parts)
 
 
-def on_a_line(corners: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Whether tetrahedra with corners (E, 4, 3) meet the line through the origin along an axis (3,)."""
-    flat = corners @ np.linalg.svd(axis[None])[2][1:].T  # seen along the axis: (E, 4, 2)
-    met = np.zeros(len(flat), bool)
+def around_a_point_in_plane(corners: np.ndarray) -> np.ndarray:
+    """Whether the shadows of tetrahedra, with corners (E, 4, 2) in a plane, hold the origin."""
+    met = np.zeros(len(corners), bool)
     for face in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]):
-        a, b, c = np.moveaxis(flat[:, face], 1, 0)
+        a, b, c = np.moveaxis(corners[:, face], 1, 0)
         parts = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))])
         met |= _all_alike(parts)
     return met
+
+
+#: An element with middles of its edges as eight with straight edges: numbers of its nodes.
+_EIGHTHS = np.array(
+    [[0, 4, 5, 6], [1, 4, 7, 8], [2, 5, 7, 9], [3, 6, 8, 9], [5, 8, 4, 6], [5, 8, 6, 9], [5, 8, 9, 7], [5, 8, 7, 4]]
+)
+
+
+def straight_corners(mesh: TetMesh, x: np.ndarray) -> np.ndarray:
+    """Corners (E, 4, 3), or (8 E, 4, 3) of elements with curved edges, at positions x (V, 3) [m]."""
+    if mesh.order == 1:
+        return x[np.asarray(mesh.tetrahedra)]
+    nodes = np.stack([np.asarray(a) for a in mesh.element_nodes[:10]], axis=1)
+    return x[nodes[:, _EIGHTHS].reshape(-1, 4)]
 
 
 def _all_alike(parts: np.ndarray) -> np.ndarray:

@@ -13,8 +13,8 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.ligament import Ligament
-from liverjax.physics.contact.obstacle import Obstacle, centre_in_body, missed_depth, touches_without_pressure
-from liverjax.physics.contact.passage import passes_through
+from liverjax.physics.contact.obstacle import Obstacle, missed_depth, touches_without_pressure
+from liverjax.physics.contact.passage import passed_in_step
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.scenes import regions
@@ -90,7 +90,7 @@ _SMALL = 0.02
 def mesh_sentence(scene: Scene, result: Result) -> str:
     """One line on the mesh error of the positions at the last step, with the remedy."""
     assert result.mesh_error is not None
-    if np.ravel(np.asarray(result.status))[-1] not in (status.CONVERGED, status.ONE_STEP):
+    if np.asarray(result.status)[-1] not in (status.CONVERGED, status.ONE_STEP):
         return "mesh error: the last step failed, so that there is nothing of which to state it"
     u = np.asarray(result.positions[-1]) - np.asarray(scene.mesh.points)
     size = float(np.linalg.norm(u, axis=1).max())
@@ -259,18 +259,20 @@ def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result,
 
 def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: np.ndarray) -> str:
     """A sentence if the obstacle, at 0, `moved` (T + 1, 3), passed the surface of the body within a step."""
-    ways = np.linalg.norm(np.diff(moved, axis=0), axis=1)
-    radius, last = float(np.asarray(obstacle.radius)), len(ways)
-    farthest = int(np.argmax(np.linalg.norm(moved, axis=1)))
-    for k in sorted({farthest, last, *(np.flatnonzero(ways > radius) + 1)} - {0}):
-        before = scene.mesh.points if k == 1 else result.positions[k - 2]
-        both = np.stack([np.asarray(before), np.asarray(result.positions[k - 1])])
-        ends = centre_in_body(obstacle, scene.mesh, both[1], moved[k])
-        if ends or passes_through(obstacle, scene.mesh, both, moved[k - 1 : k + 1]):
+    ways, radius = np.linalg.norm(np.diff(moved, axis=0), axis=1), float(np.asarray(obstacle.radius))
+    centres, axis = np.asarray(obstacle.position, float) + moved, np.asarray(obstacle.axis, float)
+    if obstacle.shape == "cylinder":  # it may slide along its axis
+        ways = np.linalg.norm(np.diff(moved - np.outer(moved @ axis, axis), axis=0), axis=1)
+    for k in np.flatnonzero(ways > radius) if radius > 0 else []:
+        before = scene.mesh.points if k == 0 else result.positions[k - 1]
+        both = np.stack([np.asarray(before), np.asarray(result.positions[k])])
+        triangles = np.asarray(obstacle.triangles)
+        what = passed_in_step(obstacle.shape, axis, scene.mesh, both, centres[k : k + 2], triangles)
+        if what:
             return (
-                f"{name} {'has its centre in' if ends else 'went through'} the body in step {k}, in which it moves "
-                f"{ways[k - 1]:.2g} m, with a radius of {radius:.2g} m: it passed the surface between two steps, so "
-                "that forces of contact are missing or act to the wrong side; take more steps"
+                f"{name} {what} the body in step {k + 1}, in which it moves {ways[k]:.2g} m, with a radius of "
+                f"{radius:.2g} m: it passed the surface between two steps, so that forces of contact are missing or "
+                "act to the wrong side; take more steps"
             )
     return ""
 
@@ -286,10 +288,8 @@ def _of_contacts(scene: Scene, result: Result) -> list[str]:
             continue
         dt = 0.0 if scene.solve.dt is None else scene.solve.dt
         place = partial(physics.displacement, steps=scene.solve.steps, dt=dt)
-        if found is None:
-            first, moved = place(0), jax.vmap(place)(jnp.arange(1, steps + 1))
-        else:
-            first, moved = jnp.zeros(3), found[number]
+        moved = jax.vmap(place)(jnp.arange(1, steps + 1)) if found is None else found[number]
+        first = jnp.zeros(3) if isinstance(physics, PressedObstacle) else place(0)
         lost = _lost_contact(name, physics, scene, result, np.concatenate([first[None], moved]))
         said += [lost] if lost else _between_points(name, physics, scene, result, moved)
     return said

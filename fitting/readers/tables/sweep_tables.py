@@ -167,11 +167,12 @@ def _perhaps_tensile(cells: list[str], columns: list[Column]) -> list[str]:
     """A note if the moduli state neither shear nor tension, and another heading is one of tests in tension."""
     moduli = [c for c in columns if c.quantity in MODULI]
     sign = next((c for c in cells if _OF_DMA.search(c.replace("_", " ").strip('" '))), None)
-    if sign is None or any(is_tensile(c) or names_shear(c) for c in moduli):
+    turned = any(re.search(r"torque|angle|drehmoment|winkel|m/rad", cell.lower()) for cell in cells)
+    if sign is None or turned or any(is_tensile(c) or names_shear(c) for c in moduli):
         return []
     names = " and ".join(dict.fromkeys(c.name for c in moduli))
     return [
-        f"{names} are taken as moduli of shear, G; the column {sign.strip()!r} is one of tests in tension, compression "
+        f"{names}: taken as shear, G; the column {sign.strip()!r} is one of tests in tension, compression "
         "or bending: if these are moduli E, three times as large, name them E' and E''"
     ]
 

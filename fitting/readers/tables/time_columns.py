@@ -31,6 +31,8 @@ WORDS = (
     ("tensile stress", "tensile stress"),
     ("tensile strain", "tensile strain"),
     ("compressive stress", "tensile stress"),
+    ("compression stress", "tensile stress"),
+    ("compression strain", "tensile strain"),
     ("compressive strain", "tensile strain"),
     ("engineering stress", "tensile stress"),
     ("engineering strain", "tensile strain"),

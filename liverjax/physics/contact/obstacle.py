@@ -22,13 +22,13 @@ from jax.typing import DTypeLike
 from liverjax.core import bounds, history
 from liverjax.core.did_you_mean import as_word, hint
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Array, Content, Indices, Number, Numbers, param, replace, static, struct
+from liverjax.core.struct import Content, Indices, Number, Numbers, param, replace, static, struct
 from liverjax.laws.base import Law
 from liverjax.mesh import promotion, selection, surface
-from liverjax.mesh.locate import around_a_point, on_a_line
 from liverjax.mesh.shape_functions import triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
+from liverjax.physics.contact.passage import in_body
 from liverjax.physics.contact.shapes import SHAPES, Distance, distance
 from liverjax.solvers.attached import Attached
 
@@ -126,7 +126,9 @@ class Obstacle(Physics):
                 f"{name} position = {np.asarray(self.position).tolist()} begins {deepest:.3g} m inside the body: move "
                 "it out"
             )
-        if centre_in_body(self, mesh, mesh.points, self.displacement(0, 1, 0.0)):
+        centre = np.asarray(self.position, float) + np.asarray(self.displacement(0, 1, 0.0))
+        axis = np.asarray(self.axis, float)
+        if in_body(self.shape, axis, mesh, np.asarray(mesh.points), centre[None], np.asarray(self.triangles)).any():
             raise InputError(f"{name} position = {np.asarray(self.position).tolist()} is inside the body: move it out")
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -302,19 +304,6 @@ def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
 def touching_distance(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     """Distance (m,) [m] that counts as touching."""
     return _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))
-
-
-def centre_in_body(obstacle: Obstacle, mesh: TetMesh, x: Array, moved: Array) -> bool:
-    """Whether the centre of a sphere, or a part of a cylinder's axis, is in the body at positions x (V, 3) [m]. Contact
-    then acts to the wrong side, or not at all: only the surface has distances.
-    """
-    centre = np.asarray(obstacle.position, float) + np.asarray(moved, float)
-    corners = np.asarray(x, float)[np.asarray(mesh.tetrahedra)] - centre
-    if obstacle.shape == "sphere":
-        return bool(around_a_point(corners).any())
-    if obstacle.shape == "cylinder":
-        return bool(on_a_line(corners, np.asarray(obstacle.axis, float)).any())
-    return False
 
 
 #: Fewest and most points along the edge of a triangle at which a depth between the points of contact is looked for.

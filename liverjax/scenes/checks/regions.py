@@ -42,7 +42,7 @@ def check_region_elements(scene: Scene) -> None:
         if not region.law and not region.viscosity and not region.porosity:
             raise InputError(f"region.{k} changes nothing: give e.g. law = {{mu = 2000.0}}")
     _check_own_laws(scene.region)
-    _check_hidden(scene.region)
+    _check_hidden(scene.region, last + 1)
 
 
 def _check_law(law: Law, region: Region, name: str) -> None:
@@ -107,17 +107,20 @@ def check_region_porosity(porosity: Porosity | None, region: Region, name: str) 
         raise InputError(f"{name}: {error}") from None
 
 
-def _check_hidden(regions: tuple[Region, ...]) -> None:
+def _check_hidden(regions: tuple[Region, ...], elements: int) -> None:
     """Refuse a region whose numbers later regions replace in all of its elements."""
     taken: dict[str, np.ndarray] = {}
+    nothing = np.zeros(elements, bool)
     for k, region in reversed(list(enumerate(regions))):
-        elements, names = np.asarray(region.elements), sorted(_names_of(region))
-        if all(name in taken and np.isin(elements, taken[name]).all() for name in names):
+        own, names = np.asarray(region.elements), _names_of(region)
+        law = taken.get("law", nothing)[own]  # a law of its own has all numbers anew
+        if all(np.all(taken.get(n, nothing)[own] | (law if n.startswith("law.") else False)) for n in names):
             raise InputError(
                 f"region.{k} changes nothing: later regions give all of its elements the same numbers anew; leave it "
                 "out, or give other places"
             )
-        taken |= {name: np.union1d(taken.get(name, elements), elements) for name in names}
+        for name in names:
+            taken.setdefault(name, nothing.copy())[own] = True
 
 
 def _names_of(region: Region) -> set[str]:
