@@ -55,3 +55,13 @@ def test_the_command_says_where_the_answers_begin(tmp_path, capsys):
     assert main(["relaxation", str(tmp_path / "r.csv"), "--modes", "1", "--out", str(tmp_path)]) == 0
     assert "begin 0.01 s after the load" in capsys.readouterr().err
     assert "short_times" not in json.loads((tmp_path / "fit.json").read_text())["error_shares"]
+
+
+def test_a_creep_test_has_no_stress_that_falls(tmp_path):
+    """It said so of the modulus that the compliance stands for."""
+    time = np.geomspace(FIRST, 100.0, 50)
+    rows = "\n".join(f"{t:.8g},{J:.10g}" for t, J in zip(time, time**0.2 / 800 * noise(50), strict=True))
+    (tmp_path / "c.csv").write_text(f"time_s,creep_compliance_1/Pa\n{rows}\n")
+    test = read_time_test(tmp_path / "c.csv", "creep", Sample(None, None), 0.0, 0.0)
+    said = [w for w in with_short_times(time_tests.fit(test, "auto"), test).warnings if "nothing tells how much" in w]
+    assert len(said) == 1 and said[0].startswith("the relaxation modulus falls by")

@@ -166,7 +166,7 @@ def test_a_wrong_unit_of_one_test_is_named(scale):
 def test_a_factor_that_sizes_of_samples_explain_is_no_alarm(relative, explained):
     fit = springpots_in_time.choose_together(wide_and_long(1.05, 0), "prony", relative=relative)
     (told,) = [w for w in fit.warnings if "the tests agree if" in w]
-    assert ("sizes of samples differ so much" in told) == explained
+    assert ("errors in the sizes of the samples explain this" in told) == explained
     assert ("look for another temperature" in told) != explained
 
 

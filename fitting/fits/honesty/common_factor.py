@@ -38,7 +38,7 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
         "times those of the others: "
     )
     if abs(np.log(factor)) < 2 * np.sqrt(2) * relative:
-        return [said + "sizes of samples differ so much, and are in the errors that are stated with them"]
+        return [said + "errors in the sizes of the samples explain this, and the errors with these sizes contain it"]
     return [
         said
         + "look for another temperature, another sample, or a wrong size of it, and fit the tests one by one until "
