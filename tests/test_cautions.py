@@ -227,6 +227,13 @@ def test_a_thin_plate_that_a_sphere_goes_through_and_touches_from_below_is_told(
     assert not passed(plate, sphere(plate, [0.05, 0.05, 0.03], by=np.array([0.0, 0.0, -0.012])))
 
 
+def test_a_body_that_comes_into_the_way_afterwards_is_not_told():
+    """The sphere falls beside the body, which is beside its way at the beginning of the step and in it at the end."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (4, 4, 4))
+    ball = sphere(mesh, [0.15, 0.05, 0.2], by=np.array([0.0, 0.0, -0.3]))
+    assert not passed(mesh, ball, positions=np.asarray(mesh.points) + np.array([0.1, 0.0, 0.0]))
+
+
 def test_an_obstacle_that_another_body_of_the_mesh_stands_in_the_way_of_is_not_told():
     """Its triangles are those of the body that it may touch."""
     box = lj.shapes.box((0.1, 0.1, 0.1), (4, 4, 4))

@@ -169,6 +169,11 @@ def test_a_scene_file_with_a_region_runs(tmp_path):
 def test_regions_that_lie_over_each_other_may_add_to_each_other(tmp_path):
     """Only what later regions replace everywhere changes nothing."""
     half, more = "[[region]]\nwhere = {x_min = 0.02}\n", "[[region]]\nwhere = {x_min = 0.0}\n"
+    scene = _load(tmp_path, "")
+    numbers = lj.Region(elements=np.arange(3), law={"bulk": 5000.0})
+    law = lj.Region(elements=np.arange(4), law=lj.laws.NeoHookean(mu=700.0, bulk=5000.0))
+    with pytest.raises(lj.InputError, match=r"region\.0 changes nothing"):
+        lj.check_scene(replace(scene, region=(numbers, law)))
     own = f"{half}law = {{mu = [1500.0, 900.0]}}\n{more}law = {{mu = [1500.0, 900.0]}}\n"
     with pytest.raises(lj.InputError, match=r"region\.0 changes nothing"):
         _load(tmp_path, own)

@@ -352,6 +352,17 @@ def test_small_units_are_read_and_unknown_ones_are_named(tmp_path):
     assert np.allclose(read["uN"].answer, read["N"].answer) and np.allclose(read["uN"].driven, read["N"].driven)
 
 
+def test_noise_in_the_row_at_rest_is_no_offset(tmp_path):
+    """It is as large as that of the other rows."""
+    t = np.concatenate([np.linspace(0, 1, 11), np.geomspace(1.1, 100, 40)])
+    strain, rng = 0.05 * np.minimum(t, 1.0), np.random.default_rng(4)
+    stress = driven(SOLID, t, strain, "relaxation") + 6.0 * rng.standard_normal(len(t))
+    stress[0] = 9.0  # 1.5 deviations, 7 % of the peak
+    write(tmp_path / "t.csv", "time_s,strain,stress_Pa", t, strain, stress)
+    notes = read_time_test(tmp_path / "t.csv", "relaxation").notes
+    assert not any("offset of the sensor" in note for note in notes)
+
+
 def test_a_steady_cycle_begins_behind_its_load_and_has_no_offset(tmp_path):
     t = np.linspace(0, 3, 151)
     write(tmp_path / "t.csv", "time_s,strain,stress_Pa", t, 0.05 * np.sin(6 * t), 40 * np.sin(6 * t + 0.2))

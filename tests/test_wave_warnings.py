@@ -106,7 +106,14 @@ def test_scales_that_no_tissue_has_are_told(moduli, words):
 
 
 @pytest.mark.parametrize(
-    ("hertz", "told"), [([376.991, 565.487], True), ([18.85, 37.7], True), ([60.0, 90.0], False), ([62.8, 94.2], False)]
+    ("hertz", "told"),
+    [
+        ([376.991, 565.487], True),
+        ([18.85, 37.7], True),
+        ([60.0, 90.0], False),
+        ([710.0, 1420.0], False),
+        ([62.8, 94.2], False),
+    ],
 )
 def test_frequencies_in_radians_are_told(hertz, told):
     """A liver at 1.8 m/s becomes one at 11 m/s, which a stiff tissue may have, and its modulus 39 times as large."""
