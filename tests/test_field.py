@@ -14,7 +14,7 @@ import liverjax as lj
 from fitting.__main__ import main
 from fitting.fits import field, inclusion, scene_numbers
 from fitting.methods import prior
-from fitting.methods.estimate import Estimate
+from fitting.methods.estimate import Estimate, bias_sentences
 from fitting.readers import displacements
 from fitting.reports import field_report
 from liverjax.core.struct import replace
@@ -503,3 +503,29 @@ def test_a_sphere_is_found_where_it_is():
     true = [*np.asarray(centre), 0.016, 800.0, 2400.0]
     assert np.all(np.abs(found.values - true) < 5 * found.standard_errors), (values, found.standard_errors)
     assert 0.5 < found.chi2 / found.components < 1.5
+
+
+@pytest.mark.parametrize(
+    ("sd", "bias", "level", "mesh"),
+    [
+        ([3.0, 3.4], [0.46, 0.1], True, None),  # a bar that is only moved: the mesh was blamed, and nothing else said
+        ([0.05, 3.0], [0.04, 0.46], False, None),
+        ([0.05, 0.6], [0.5, 0.1], False, "by a third or more"),
+        ([0.05, 0.6], [0.1, 0.1], False, "at 50% of the nodes"),
+    ],
+)
+def test_a_map_whose_level_is_open_says_so_and_the_mesh_is_blamed_for_its_own_share(sd, bias, level, mesh):
+    found = SimpleNamespace(sd=np.array(sd), mesh_bias=np.array(bias))
+    assert (field.level_sentence(found) is not None) == level
+    said = field.bias_sentence(found)
+    assert said is None if mesh is None else mesh in said
+
+
+def test_numbers_that_no_mesh_determines_are_not_blamed_on_the_mesh():
+    """Two moduli in series, only moved: 938 ± 7e9, and the sentence was to refine the mesh."""
+    found = {"names": ("mu", "law.mu"), "values": np.array([938.0, 2900.0]), "mesh_bias": np.array([2e3, 3e3])}
+    (said,) = bias_sentences(SimpleNamespace(**found, standard_errors=np.array([7e9, 1e10])))
+    assert said.startswith("the data do not determine mu, law.mu") and "refine" not in said
+    (said,) = bias_sentences(SimpleNamespace(**found, standard_errors=np.array([10.0, 10.0])))
+    assert "by a third or more" in said
+    assert bias_sentences(SimpleNamespace(**found, standard_errors=np.array([5e3, 5e3]))) == []

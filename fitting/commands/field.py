@@ -114,6 +114,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     content = _files(options) | {"map": field_report.of_field(found) | {"mesh_error_over_noise": beside}}
     _warn(field_report.noise_sentence(found))
     _warn(field.distance_sentence(found))
+    _warn(field.level_sentence(found))
     _warn(field.bias_sentence(found))
     if options.sphere:
         sphere = inclusion.estimate(problem, options.name, inclusion.start_from(problem, found))

@@ -355,17 +355,33 @@ def distance_sentence(found: Field) -> str | None:
     )
 
 
+#: Least standard deviation of the logarithm, at the best known node, from which the data leave the map's level open.
+OPEN = 0.5
+
+
+def level_sentence(found: Field) -> str | None:
+    """A sentence if the data do not determine how stiff the map is at any node; None if they do."""
+    least = float(np.min(found.sd))
+    if not least > OPEN:
+        return None
+    return (
+        f"the data leave the level of the map open: at no node is it known better than to a factor of "
+        f"{np.exp(least):.2g}; motions alone determine ratios, so give a traction or a measured force"
+    )
+
+
 def bias_sentence(found: Field) -> str | None:
     """A sentence if the mesh moves the map by more than its standard deviation at some node; None if it does not, or if
     this is not known.
     """
     if found.mesh_bias is None:
         return None
-    largest, beyond = np.abs(found.mesh_bias).max(), np.abs(found.mesh_bias) > found.sd
-    if largest > LARGEST_BIAS:
-        return f"the mesh moves the map by a third or more ({largest:.0%}): too much to be corrected; refine the mesh"
+    beyond = np.abs(found.mesh_bias) > found.sd
     if not beyond.any():
         return None
+    largest = np.abs(found.mesh_bias)[beyond].max()
+    if largest > LARGEST_BIAS:
+        return f"the mesh moves the map by a third or more ({largest:.0%}): too much to be corrected; refine the mesh"
     return (
         f"the mesh moves the map by up to {largest:.0%}, and by more than the standard deviation at "
         f"{beyond.mean():.0%} of the nodes: subtract mesh_bias from its logarithm, or refine the mesh"

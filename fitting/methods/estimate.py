@@ -159,6 +159,8 @@ def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
 
 #: Largest relative change of a number by the mesh at which the first-order estimate `mesh_bias` is used.
 LARGEST_BIAS = 0.3
+#: Standard error over the value from which the data do not determine a number.
+UNKNOWN = 100.0
 
 
 def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], missing: np.ndarray) -> np.ndarray:
@@ -178,7 +180,16 @@ def bias_sentences(estimate: Estimate) -> list[str]:
     bias, values = estimate.mesh_bias, np.asarray(estimate.values)
     if bias is None:
         return []
-    lost = np.flatnonzero(~(np.abs(bias) <= LARGEST_BIAS * np.abs(values)))
+    errors = estimate.standard_errors
+    unknown = np.flatnonzero(np.isfinite(errors) & (errors > UNKNOWN * np.abs(values)))
+    if len(unknown):  # their bias is roundoff, as much enlarged
+        names = ", ".join(estimate.names[k] for k in unknown)
+        return [
+            f"the data do not determine {names}: the standard errors are more than {UNKNOWN:g} times the values, and "
+            "another mesh does not help; motions without a force determine ratios of moduli alone: give a traction or "
+            "a measured force, or fit fewer numbers"
+        ]
+    lost = np.flatnonzero(~(np.abs(bias) <= LARGEST_BIAS * np.abs(values)) & ~(np.abs(bias) <= errors))
     if len(lost):
         names = ", ".join(estimate.names[k] for k in lost)
         return [f"the mesh moves {names} by a third or more: the data do not determine them on this mesh; refine it"]

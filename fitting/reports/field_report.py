@@ -98,6 +98,8 @@ def of_field(found: Field) -> Content:
         "name": found.name,
         "smallest": float(found.modulus.min()),
         "largest": float(found.modulus.max()),
+        "smallest_standard_deviation_of_ln": float(np.min(found.sd)),
+        "largest_standard_deviation_of_ln": float(np.max(found.sd)),
         "prior_deviation": found.deviation,
         "correlation_length_m": found.length,
         "largest_mesh_bias_of_ln": None if found.mesh_bias is None else float(np.abs(found.mesh_bias).max()),
@@ -185,9 +187,10 @@ def table_of_field(found: Field) -> str:
             f"{h['deviation']:8g}  {h['chi2_per_component']:14.4f}  {h['iterations']:10.0f}  {h['evaluations']:11.0f}  "
             f"{h['seconds']:7.1f}"
         )
-    known = int(np.sum(found.eigenvalues > 1))
+    known, factors = int(np.sum(found.eigenvalues > 1)), np.exp([np.min(found.sd), np.max(found.sd)])
     rows.append(
-        f"{found.name} from {found.modulus.min():.4g} to {found.modulus.max():.4g}; the data determine "
+        f"{found.name} from {found.modulus.min():.4g} to {found.modulus.max():.4g}, known to a factor of "
+        f"{factors[0]:.3g} to {factors[1]:.3g} (one standard deviation); the data determine "
         f"{'at least ' if known == len(found.eigenvalues) else ''}{known} directions of the map; {found.seconds:.1f} s"
     )
     return "\n".join(rows)
