@@ -27,13 +27,17 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
     return float(np.hypot(gap, 4 * RADIUS / simulation.radius))
 
 
+#: Change of a number, in its own sizes, from which it has run away: other points do not determine it.
+RUNAWAY = 10.0
+
+
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     """Errors by their source, then by the names of `edges.values`.
 
     The share of the band's ends is the larger of the two changes, if noise does not explain it (`edges.decided_by`);
-    the square of what noise causes is subtracted from its square, and it is at most as large as the number. The share
-    of long times is that of the farther end of `long_times.equilibrium_interval`, as a standard deviation. That of
-    short times is what `short_times` says.
+    the square of what noise causes is subtracted from its square. If a number runs away, its share is its own size. The
+    share of long times is that of the farther end of `long_times.equilibrium_interval`, as a standard deviation. That
+    of short times is what `short_times` says.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -49,7 +53,8 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
             change, scatter = (fit.details[key][part][name] for key in ("band_sensitivity", "band_scatter"))
             beyond = np.sqrt(max(0.0, change**2 - max(noise[name], scatter) ** 2))
             # A number that the other points do not determine may run away: it is unknown by its own size.
-            out["band"][name] = max(out["band"][name], float(min(beyond, max(abs(known[name][0]), noise[name]))))
+            own = max(abs(known[name][0]), noise[name])
+            out["band"][name] = max(out["band"][name], float(own if beyond > RUNAWAY * own else beyond))
     for source, moved in (("mesh", fit.uncertainty.mesh_bias), ("time_step", fit.uncertainty.time_step_bias)):
         if moved is not None and fit.parameters is None:
             out[source] = _of_modes(fit, moved)
