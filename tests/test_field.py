@@ -511,6 +511,7 @@ def test_a_sphere_is_found_where_it_is():
         ([3.0, 3.4], [0.46, 0.1], True, None),  # a bar that is only moved: the mesh was blamed, and nothing else said
         ([0.05, 3.0], [0.04, 0.46], False, None),
         ([0.05, 0.6], [0.5, 0.1], False, "by a third or more"),
+        ([0.05, 0.6], [0.1, 0.5], False, "by up to 10%"),
         ([0.05, 0.6], [0.1, 0.1], False, "at 50% of the nodes"),
     ],
 )
