@@ -50,10 +50,10 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
     if resume and not folder.exists() and out.exists() and text is not None:
         try:
             with h5py.File(out) as file:
-                before = file.attrs.get("scene", text)
-        except OSError:
+                before = tomllib.loads(str(file.attrs.get("scene", text)).lstrip("\ufeff"))
+        except (OSError, tomllib.TOMLDecodeError):  # no result of a scene
             return
-        if tomllib.loads(str(before).lstrip("\ufeff")) != tomllib.loads(text):  # comments may differ
+        if before != tomllib.loads(text):  # comments may differ
             raise InputError(f"{out} is the result of another scene: name another --out, or leave --resume out")
 
 

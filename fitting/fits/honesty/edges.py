@@ -189,13 +189,13 @@ def _moved_most(fit: Fit) -> list[str]:
 
 
 #: Relative change above which a number is not determined by the other points, so that its new value means nothing.
-_RUNS_AWAY = 10.0
+RUNS_AWAY = 10.0
 
 
 def _relative_change(change: float, value: float) -> str:
     if not value:
         return f"{change:+.2g}"
     part = change / value
-    if abs(part) >= _RUNS_AWAY:
+    if abs(part) >= RUNS_AWAY:
         return "more than tenfold"
     return f"{100 * part:+.2g} %" if abs(part) < 0.995 else f"{100 * part:+.3g} %"  # not 1e+02 %

@@ -27,10 +27,6 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
     return float(np.hypot(gap, 4 * RADIUS / simulation.radius))
 
 
-#: Change of a number, in its own sizes, from which it has run away: other points do not determine it.
-RUNAWAY = 10.0
-
-
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     """Errors by their source, then by the names of `edges.values`.
 
@@ -54,7 +50,7 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
             beyond = np.sqrt(max(0.0, change**2 - max(noise[name], scatter) ** 2))
             # A number that the other points do not determine may run away: it is unknown by its own size.
             own = max(abs(known[name][0]), noise[name])
-            out["band"][name] = max(out["band"][name], float(own if beyond > RUNAWAY * own else beyond))
+            out["band"][name] = max(out["band"][name], float(own if beyond > edges.RUNS_AWAY * own else beyond))
     for source, moved in (("mesh", fit.uncertainty.mesh_bias), ("time_step", fit.uncertainty.time_step_bias)):
         if moved is not None and fit.parameters is None:
             out[source] = _of_modes(fit, moved)
