@@ -10,6 +10,7 @@ from fitting.__main__ import main
 from fitting.fits.families import models
 from fitting.master import master_curve, shifts, temperature_laws, temperature_sweeps
 from fitting.readers.frequency_sweep import Sweep
+from fitting.reports import one_page
 from liverjax.core.errors import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -126,7 +127,8 @@ def test_a_file_with_a_column_of_temperature(tmp_path, unit, order):
     write_rows(tmp_path / "a.csv", unit, order=order)
     data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
     assert np.allclose(data.temperatures, TEMPERATURES, atol=0.05) and data.shift_factors is None
-    assert not any("repeated" in note for own in data.sweeps for note in own.notes)
+    # A file of several temperatures repeats its frequencies, and begins again with the lowest.
+    assert not any("repeated" in note or "sorted" in note for own in data.sweeps for note in own.notes)
     head, *rows = (tmp_path / "a.csv").read_text().splitlines()
     (tmp_path / "b.csv").write_text("\n".join([head, *(row for row in rows for _ in range(2))]) + "\n")
     again = temperature_sweeps.read_temperatures([tmp_path / "b.csv"])
@@ -188,7 +190,31 @@ def test_the_command_shifts_several_files_and_fits_the_curve(tmp_path, capsys):
     assert len(again) == 60 and np.all(np.diff(again["frequency_Hz"]) >= 0)
     table = np.genfromtxt(out / "shift_factors.csv", delimiter=",", names=True)
     assert np.allclose(np.log10(table["shift_factor"]), TRUE[2:7], atol=5e-3)
-    assert "reference" in capsys.readouterr().out and (out / "shift.png").exists()
+    told = capsys.readouterr()
+    assert "reference" in told.out and "nearest" not in told.err and (out / "shift.png").exists()
+
+
+def test_the_command_says_which_temperature_it_took_and_prints_the_factors_on_the_page(tmp_path, capsys, monkeypatch):
+    write_rows(tmp_path / "a.csv")
+    pages = []
+    monkeypatch.setattr(one_page, "save", lambda figure, file: pages.append(figure))
+    words = [str(tmp_path / "a.csv"), "--model", "spectrum", "--report", "--out", str(tmp_path / "out")]
+    between = TEMPERATURES[REFERENCE] - 273.15 + 3
+    assert main([*words, "--master", f"{between:g}"]) == 0
+    assert f"nearest to {between:g} °C" in capsys.readouterr().err
+    (text,) = (t.get_text() for t in pages[0].texts if t.get_family() == ["monospace"])
+    assert "log10 a_T" in text and "  reference" in text and "WLF: C1" in text
+    with pytest.raises(SystemExit):
+        main([*words, "--master", "nan"])
+    assert "'nan' is no temperature" in capsys.readouterr().err
+
+
+def test_a_sweep_at_several_temperatures_that_fits_nothing_gets_the_remedy(tmp_path, capsys):
+    rows = [f"{f},{m * (1 + f)},{m * f},{T}\n" for T, m in ((20, 1e3), (30, 1e6)) for f in (1, 2, 3)]
+    file = tmp_path / "a.csv"
+    file.write_text("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n" + "".join(rows))
+    assert main([str(file), "--out", str(tmp_path / "out")]) == 2
+    assert "give --master, or a file for each temperature" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

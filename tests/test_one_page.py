@@ -6,7 +6,8 @@ import pytest
 from conftest import ROOT
 
 from fitting.__main__ import main
-from fitting.fits import viscoelastic
+from fitting.fits import instrument, viscoelastic
+from fitting.fits.simulated_rheometer import Simulation
 from fitting.readers import rheometer
 from fitting.reports import one_page, sweep_report
 from liverjax.core.versions import versions
@@ -30,6 +31,17 @@ def test_the_page_holds_it_all(more):
     for axes in figure.axes:
         box = axes.get_tightbbox()
         assert box.x0 >= 0 and box.x1 <= paper.x1 and box.y0 >= extent.y1
+
+
+def test_no_line_is_wider_than_the_page():
+    """The lines of a compressed sample were cut off at the edge."""
+    sweep = rheometer.read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
+    fit = viscoelastic.closed_form(sweep, 3)
+    fit.details["precompression"] = instrument.compression_numbers(fit, Simulation(precompression=0.1))
+    content = sweep_report.summary(fit, sweep) | {"notes": [], "versions": versions()}
+    lines = one_page.text_of_page(sweep, [fit], content)
+    assert max(map(len, lines)) <= one_page.CHARACTERS
+    assert "if the volume is kept" in re.sub(r"\s+", " ", " ".join(lines))
 
 
 @pytest.mark.draws

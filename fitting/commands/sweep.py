@@ -1,6 +1,7 @@
 """``python -m fitting SWEEP.csv``: a generalised Maxwell model from a rheometer's frequency sweep."""
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -81,16 +82,16 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 #: Value of `--master` without a temperature: the middle temperature is the reference.
-MIDDLE = float("nan")
+MIDDLE = "middle"
 
 
-def _celsius(text: str) -> float:
+def _celsius(text: str) -> float | str:
     try:
-        return float(text)
+        if text == MIDDLE or math.isfinite(float(text)):
+            return text if text == MIDDLE else float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no temperature in degrees Celsius: give the file first"
-        ) from None
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is no temperature in degrees Celsius: give the file first")
 
 
 def _add_sample(command: argparse.ArgumentParser) -> None:
@@ -160,11 +161,12 @@ def run(options: argparse.Namespace) -> int:
         return together.run(options)
     options.method = options.method or "torsion"
     shift: Content = {}
+    shifted = ""
     tests = _tests_to_predict(options)  # before the fit: a bad file would lose it
     if options.master is None:
         sweep = shared_options.usable_sweep(options, options.sweep[0])
     else:
-        sweep, shift = _master(options)
+        sweep, shift, shifted = _master(options)
     for note in sweep.notes:
         print(f"note: {note}", file=sys.stderr)
     import_meanwhile()
@@ -189,7 +191,7 @@ def run(options: argparse.Namespace) -> int:
     if options.report:
         from fitting.reports import one_page
 
-        one_page.write(options.out / "report.pdf", sweep, fits, content)
+        one_page.write(options.out / "report.pdf", sweep, fits, content, shifted)
         print(f"written: {options.out}/report.pdf")
     for name, (low, high) in (profile or {}).items():
         ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
@@ -200,20 +202,25 @@ def run(options: argparse.Namespace) -> int:
     return 0 if fits[-1].converged else 1
 
 
-def _master(options: argparse.Namespace) -> tuple["Sweep", dict]:
-    """Write and print the master curve of the files; return it with its part of fit.json."""
+def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
+    """Write and print the master curve of the files; return it with its part of fit.json, and the printed table."""
     from fitting.master import master_curve, master_report, temperature_sweeps
     from fitting.readers import rheometer
 
-    reference = None if options.master != options.master else options.master + 273.15
+    reference = None if options.master == MIDDLE else options.master + 273.15
     data = temperature_sweeps.read_temperatures(options.sweep)
     found = master_curve.master_curve(data, reference, options.vertical)
     writable(options.out, ("shift_factors.csv", "master_curve.csv", "shift.png"))
     master_report.write_master_curve(options.out, found)
-    print(master_report.shift_table(found))
+    table = master_report.shift_table(found)
+    print(table)
+    at = found.shifts.temperatures[found.shifts.reference]
+    if reference is not None and abs(at - reference) > 0.5:
+        nearest = f"the measured temperature nearest to {options.master:g} °C"
+        print(f"note: the reference is {at - 273.15:.4g} °C, {nearest}", file=sys.stderr)
     print(f"written: {options.out}/shift_factors.csv, master_curve.csv, shift.png")
     sweep = rheometer.within(found.sweep, options.min_frequency, options.max_frequency)
-    return sweep, {"shift": master_curve.shift_numbers(found)}
+    return sweep, {"shift": master_curve.shift_numbers(found)}, table
 
 
 def _tests_to_predict(options: argparse.Namespace) -> list["Measured"]:
@@ -317,14 +324,14 @@ def _check_precompression(options: argparse.Namespace) -> None:
     from fitting.rigs import compression
 
     compression.check_strain(options.precompression)
-    for name, asked in (
-        ("--with", bool(options.others)),
-        ("--profile", options.profile),
-        ("--samples", options.samples is not None),
-        (f"{len(options.sweep)} samples", len(options.sweep) > 1),
-    ):
+    for name, asked in (("--with", bool(options.others)), (f"{len(options.sweep)} samples", len(options.sweep) > 1)):
         if asked:
             raise InputError(f"--precompression works for one sample only: leave out {name}, or --precompression")
+    for name, asked in (("--profile", options.profile), ("--samples", options.samples is not None)):
+        if asked:
+            raise InputError(
+                f"{name} is computed for a sample that is not compressed: leave out {name}, or --precompression"
+            )
     if options.model != "prony" and options.method != "closed-form":
         raise InputError(
             f"--precompression with --model {options.model} is computed in closed form, since the modes that a "

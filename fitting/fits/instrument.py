@@ -325,18 +325,26 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
     factors, kept = compression.shares(law, strain), compression.incompressible(law, strain)
     force = fit.details["force_of_law_N"] if glued else compression.smooth_force(law, strain, simulation.radius)
     G0, rest = float(fit.model.shear_modulus), float(fit.model.equilibrium_modulus)
-    unknown = glued and "force_of_law_mesh_bias_N" not in fit.details
+    noise = force * uncertainty.equilibrium_error(fit.uncertainty) / G
+    of_mesh = fit.details.get("force_of_law_mesh_bias_N", 0.0) * rest / G
     return {
         "strain": strain,
         "height_at_rest_m": simulation.height / (1 - strain),
         "plates": "glued" if glued else "smooth",
         "law": simulation.law,
         "bulk_over_shear_modulus": float(np.asarray(law.bulk_modulus())) / G,
-        "modulus_if_incompressible": None if kept is None else factors.relaxing / kept,
+        "modulus_if_incompressible": None if glued or kept is None else _changed(fit, factors, kept),
         "smooth_factor_of_relaxing_moduli": factors.relaxing,
         "smooth_factor_of_equilibrium_modulus": factors.equilibrium,
         "axial_force_N": force * rest / G,
-        "axial_force_standard_error_N": force * uncertainty.equilibrium_error(fit.uncertainty) / G,
-        "axial_force_mesh_bias_N": None if unknown else fit.details.get("force_of_law_mesh_bias_N", 0.0) * rest / G,
+        "axial_force_standard_error_N": noise,
+        "axial_force_mesh_bias_N": of_mesh,
+        "axial_force_total_error_N": float(np.hypot(noise, of_mesh)),
         "axial_force_at_once_N": force * G0 / G,
     }
+
+
+def _changed(fit: Fit, before: compression.Shares, after: compression.Shares) -> float:
+    """G0 by the factors `after` over G0 by the factors `before`; both parts of the measured moduli stay."""
+    stands = float(fit.model.equilibrium_modulus) / float(fit.model.shear_modulus)
+    return (1 - stands) * before.relaxing / after.relaxing + stands * before.equilibrium / after.equilibrium

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -19,10 +19,13 @@ from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, bfgs, levenberg_marquardt_host
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import compression, torsion
+from fitting.rigs.glued_compression import Glued, glued
 from liverjax import laws
 from liverjax.core import status
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.physics import viscosity
 from liverjax.physics.viscosity import Prony
 
 
@@ -140,7 +143,15 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
         )
     tall = height / (1 - simulation.precompression)
     rest = torsion.make_rig(simulation.radius, tall, cell, density=simulation.density)
-    return compression.compressed(rest, laws.typical(simulation.law), simulation.precompression)
+    rig = compression.compressed(rest, laws.typical(simulation.law), simulation.precompression)
+    found, _ = _without_mesh(simulation.radius, height, simulation.law, simulation.precompression)
+    return replace(rig, meshless=jnp.array([found.relaxing, found.standing]))
+
+
+@cache
+def _without_mesh(radius: float, gap: float, law: str, strain: float) -> tuple[Glued, Glued]:
+    """`glued_compression.glued` by the name of the law: a fit needs it twice."""
+    return glued(radius, gap, laws.typical(law), strain)
 
 
 def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
@@ -230,7 +241,8 @@ def through_torsion(
     found = found._replace(converged=bool(found.converged) and worst == status.CONVERGED)
     details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
     if rig.held is not None:
-        details["force_of_law_N"] = float(torsion.axial_force(rig, law))
+        force, missed = _without_mesh(simulation.radius, simulation.height, simulation.law, simulation.precompression)
+        details |= {"force_of_law_N": force.force, "force_of_law_mesh_bias_N": -missed.force}
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
     at = BestPoint("torsion", found, storage, loss, advice)
     fit = fit_at(sweep, at, kind, (running, compiling), details)
@@ -259,13 +271,13 @@ def _with_shared_errors(fit: Fit, start: Fit) -> Fit:
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     """Change of the parameters by the simulation's mesh and time steps, to first order (`mesh_bias`).
 
-    At small strain both follow from moduli without a mesh: by the recursion, and in continuous time. The moduli of a
-    compressed sample without a mesh are extrapolated from a finer mesh.
+    At small strain both follow from moduli without a mesh: by the recursion, and in continuous time. Those of a
+    compressed sample come from quadratic elements, whose own error is the share of the mesh (`glued_compression`).
     """
     law, omega, scales = data
     scaled, prony = law_and_prony(fit.kind.maxwell(fit.solution.u), law, simulation)
     if simulation.precompression:
-        meshless, exact = _of_finer_mesh(fit, scaled, prony, omega, simulation)
+        meshless, exact = _of_held(scaled, prony, omega, simulation)
     else:
         program = compiled(partial(_of_no_mesh, steps=simulation.steps), scaled, prony, omega, short=True)
         meshless, exact = (np.asarray(G) for G in program(scaled, prony, omega))
@@ -288,26 +300,18 @@ def _of_no_mesh(law: laws.Law, prony: Prony, omega: jax.Array, steps: int) -> tu
     return torsion.linear_moduli(law, prony, omega, steps), torsion.linear_moduli(law, prony, omega, None)
 
 
-#: Cell length of the finer mesh, divided by that of the mesh, for the extrapolation.
-FINER = 0.62
-
-
-def _of_finer_mesh(
-    fit: Fit, law: laws.Law, prony: Prony, omega: jax.Array, simulation: Simulation
-) -> tuple[np.ndarray, np.ndarray]:
-    """Complex moduli (n,) of a compressed sample without a mesh: by the recursion, and in continuous time.
-
-    The error of the mesh is assumed to be of second order.
+def _of_held(law: laws.Law, prony: Prony, omega: jax.Array, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
+    """Complex moduli (n,) of a compressed sample, with what the meshes of `_without_mesh` may still miss: by the
+    recursion, and in continuous time.
     """
-    cell = simulation.cell_size or torsion.linear_cell_for(simulation.radius, simulation.height)
-    rig = rig_of(simulation._replace(cell_size=FINER * cell))
+    rig = rig_of(simulation)
     of, moduli = jax.jit(torsion.held)(rig, law), jax.jit(torsion.held_moduli, static_argnums=4)
-    fine, exact = (np.asarray(moduli(of, rig, prony, omega, steps)) for steps in (simulation.steps, None))
-    found = fit.storage + 1j * fit.loss
-    meshless = found + (fine - found) / (1 - FINER**2)
-    force = float(torsion.axial_force(rig, laws.typical(simulation.law)))
-    fit.details["force_of_law_mesh_bias_N"] = (fit.details["force_of_law_N"] - force) / (1 - FINER**2)
-    return meshless, meshless + exact - fine
+    recursion, exact = (np.asarray(moduli(of, rig, prony, omega, steps)) for steps in (simulation.steps, None))
+    _, missed = _without_mesh(simulation.radius, simulation.height, simulation.law, simulation.precompression)
+    ratios = np.asarray(viscosity.complex_ratios(prony, omega, None))
+    factor = missed.relaxing * (1 - ratios.sum(axis=0)) + missed.standing * (1 - np.sum(prony.ratios))
+    more = float(law.shear_modulus()) * factor
+    return recursion + more, exact + more
 
 
 def _simulation_details(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.frequency_sweep import Sweep, some
-from fitting.readers.rheometer import REPEATED, read_all_sweeps
+from fitting.readers.rheometer import REPEATED, SORTED, read_all_sweeps
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
@@ -92,7 +92,7 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     if np.any(factors <= 0):
         raise InputError(f"{path}: a shift_factor of {factors.min():g} is not above 0: it is a factor of frequencies")
     if group.max() > 0:  # every temperature has the same frequencies
-        sweep = sweep._replace(notes=tuple(note for note in sweep.notes if REPEATED not in note))
+        sweep = sweep._replace(notes=tuple(note for note in sweep.notes if REPEATED not in note and note != SORTED))
     out = []
     for k in range(group.max() + 1):
         mine = group == k

@@ -11,7 +11,7 @@ import scipy.optimize
 
 from fitting.methods.host import Array, arrays_of
 from fitting.readers.frequency_sweep import check_sweep
-from fitting.readers.rheometer import Sweep
+from fitting.readers.rheometer import WARM, Sweep
 from liverjax.core.errors import InputError
 
 
@@ -173,7 +173,8 @@ def refuse_impossible(sweep: Sweep) -> Spectrum:
     dense = spectrum(sweep)
     if dense.misfit > HOPELESS:
         above = np.median(sweep.loss / sweep.storage)
-        hint = (
+        warm = next((note for note in sweep.notes if WARM in note), None)
+        hint = warm or (
             f"loss_modulus is {above:.1f} times storage_modulus (are the two columns exchanged, or in different units?)"
             if above > 1
             else "check columns and units"

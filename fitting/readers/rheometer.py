@@ -126,7 +126,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
         )
     order = np.argsort(omega, kind="stable")
     if not np.array_equal(order, np.arange(len(omega))):
-        notes.append("the frequencies were not in ascending order and have been sorted")
+        notes.append(SORTED)
     repeated = len(omega) - len(np.unique(omega))
     if repeated:
         notes.append(f"{repeated} {REPEATED}")
@@ -135,12 +135,16 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)
 
 
+#: A note on lines in another order.
+SORTED = "the frequencies were not in ascending order and have been sorted"
 #: A note on frequencies that several lines have, after their number.
 REPEATED = (
     "frequencies are repeated; each line counts as a measurement of its own, unless the lines of a frequency share "
     "their noise"
 )
 
+#: Words of the note on a sweep at several temperatures.
+WARM = "and one material at one temperature is fitted"
 #: Differences within one sweep, of the temperature [K] and of the strain (largest over smallest), that get a note.
 WARMER, STRAINED = 2.0, 1.5
 
@@ -164,8 +168,7 @@ def _what_differs(sweep: Sweep) -> list[str]:
     if heat.size and np.ptp(heat) > WARMER:
         low, high = celsius(np.array([heat.min(), heat.max()]))
         out.append(
-            f"the temperatures are {low:.4g} to {high:.4g} °C, and one material at one temperature is fitted: give "
-            "--master, or a file for each temperature"
+            f"the temperatures are {low:.4g} to {high:.4g} °C, {WARM}: give --master, or a file for each temperature"
         )
     if strain.size and strain.min() > 0 and strain.max() > STRAINED * strain.min():
         out.append(

@@ -20,17 +20,18 @@ WIDTH, HEIGHT, TEXT, MARGIN = 8.27, 11.69, 0.56, 0.06
 CHARACTERS, SIZE = 104, 8.0
 
 
-def write(file: Path, sweep: Sweep, fits: list[Fit], content: Content) -> None:
+def write(file: Path, sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> None:
     """Write the page as PDF, or in another format that the name of the file states.
 
     Args:
         sweep, fits: as in `sweep_report.write`.
         content: content of fit.json.
+        first: lines before the table of the fit.
     """
-    save(page(sweep, fits, content), file)
+    save(page(sweep, fits, content, first), file)
 
 
-def page(sweep: Sweep, fits: list[Fit], content: Content) -> "Figure":
+def page(sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> "Figure":
     """The page as a figure."""
     figure = pyplot().figure(figsize=(WIDTH, HEIGHT))
     place = {"left": 0.12, "right": 0.96, "top": 0.91, "bottom": TEXT + 0.04, "wspace": 0.3}
@@ -41,20 +42,22 @@ def page(sweep: Sweep, fits: list[Fit], content: Content) -> "Figure":
     figure.suptitle(
         f"{Path(sweep.source).name or 'sweep'}: {content['model']}, {content['method']}", fontsize=11, y=0.975
     )
-    lines = text_of_page(sweep, fits, content)
+    lines = text_of_page(sweep, fits, content, first)
     size = min(SIZE, 72 * HEIGHT * (TEXT - 0.5 * MARGIN) / (1.25 * len(lines)))
     figure.text(MARGIN, TEXT - 0.01, "\n".join(lines), family="monospace", fontsize=size, va="top", linespacing=1.2)
     return figure
 
 
-def text_of_page(sweep: Sweep, fits: list[Fit], content: Content) -> list[str]:
+def text_of_page(sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> list[str]:
     """The lines below the pictures."""
     f = content["shear_waves"]["frequency_Hz"]
     rows = [
         f"{len(f)} frequencies from {f[0]:.3g} to {f[-1]:.3g} Hz; errors are standard errors",
         "",
-        *sweep_report.table(sweep, fits).splitlines(),
+        *([*first.splitlines(), ""] if first else []),
     ]
+    for row in sweep_report.table(sweep, fits).splitlines():
+        rows += [row] if len(row) <= CHARACTERS else textwrap.wrap(row, CHARACTERS, subsequent_indent="  ")
     for head, sentences in (("Notes", content["notes"]), ("To be careful of", content["warnings"])):
         if sentences:
             rows += ["", f"{head}:"]

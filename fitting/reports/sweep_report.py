@@ -467,11 +467,11 @@ def _compression(fits: list[Fit]) -> list[str]:
     if not found:
         return []
     forces = ", ".join(
-        f"{f['axial_force_N']:.3g} ± {f['axial_force_standard_error_N']:.1g} N ({f['plates']} plates)" for f in found
+        f"{f['axial_force_N']:.3g} ± {f['axial_force_total_error_N']:.1g} N ({f['plates']} plates)" for f in found
     )
     one = found[0]
     kept = one["modulus_if_incompressible"]
-    if_kept = "" if kept is None else f"; G0 is {kept:.4g} times as large if the material keeps its volume"
+    if_kept = "" if kept is None else f"; smooth plates: G0 is {kept:.4g} times as large if the volume is kept"
     return [
         f"numbers describe the sample before it was compressed by {100 * one['strain']:.3g} % from "
         f"{one['height_at_rest_m']:.4g} m (law {one['law']}, K / G {one['bulk_over_shear_modulus']:.3g}{if_kept})",

@@ -68,8 +68,8 @@ def shares(law: Law, strain: float) -> Shares:
     return Shares(relaxing, relaxing + a**4 * s / G)
 
 
-def incompressible(law: Law, strain: float) -> float | None:
-    """`Shares.relaxing` of the same law if the sample keeps its volume: s is then that of the law without U(J).
+def incompressible(law: Law, strain: float) -> Shares | None:
+    """`shares` of the same law if the sample keeps its volume: s is then that of the law without U(J).
 
     None for a law that has no part without volume.
     """
@@ -80,7 +80,9 @@ def incompressible(law: Law, strain: float) -> float | None:
     a = 1 / np.sqrt(axial)
     side, _, s = _cauchy(own, a, axial)
     s -= side  # the pressure that leaves the side free of force
-    return float(a**6 * s / (axial**2 - a**2) / float(np.asarray(law.shear_modulus())))
+    G = float(np.asarray(law.shear_modulus()))
+    relaxing = float(a**6 * s / (axial**2 - a**2) / G)
+    return Shares(relaxing, relaxing + float(a**4 * s / G))
 
 
 def side_stretch(law: Law, strain: float) -> float:

@@ -87,7 +87,8 @@ class Linearised(NamedTuple):
     inverse: jax.Array  # of the stiffness (n, n) in a motion too fast to relax
     relaxing: jax.Array | None  # relaxing part of the stiffness; then its constant part; None: all relaxes
     standing: jax.Array | None
-    bias: jax.Array | None = None  # of the mesh of a compressed sample: `geometry_factor` at rest
+    held: "Held | None" = None  # the compressed sample; then the part of the stress that stands
+    stands: Number = 1.0
     mass: jax.Array | None = None  # (n,) [kg] of each coordinate, with inertia; then stiffness and vibrations
     elastic: jax.Array | None = None  # (n, n) [N/m]
     modes: Vibrations | None = None
@@ -120,9 +121,9 @@ def rest_masses(rig: Rig) -> jax.Array:
 
 def _without_inertia(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
     if rig.held is not None:
-        relaxing, standing, bias = held(rig, law)
-        standing = standing * (1.0 if prony is None else 1 - jnp.sum(jnp.asarray(prony.ratios)))
-        return Linearised(jnp.linalg.inv(relaxing + standing), relaxing, standing, bias)
+        of, stands = held(rig, law), 1.0 if prony is None else 1 - jnp.sum(jnp.asarray(prony.ratios))
+        standing = stands * of.standing
+        return Linearised(jnp.linalg.inv(of.relaxing + standing), of.relaxing, standing, of, stands)
     if prony is None or prony.part == "all":
         return Linearised(jnp.linalg.inv(rest_stiffness(rig, law)), None, None)
     isochoric, volumetric = (rest_stiffness(rig, part(law)) for part in (isochoric_part, volumetric_part))
@@ -197,11 +198,24 @@ class Held(NamedTuple):
     relaxing: jax.Array  # (n, n) [N/m]: `about_held`
     standing: jax.Array
     bias: jax.Array  # of its mesh at rest: `geometry_factor`
+    factors: jax.Array  # R and S (2,) [1] of its mesh, as in `glued_compression`
+    meshless: jax.Array | None  # R and S (2,) without a mesh, if they are known
+
+    def bias_at(self, modulus: Number, stands: Number) -> jax.Array:
+        """Bias of the mesh, of a sample whose stress relaxes by `modulus` (complex), down to `stands`."""
+        if self.meshless is None:
+            return self.bias + 0j
+        own, true = (R * modulus + S * stands for R, S in (self.factors, self.meshless))
+        return jnp.asarray(own / true)
 
 
 def held(rig: Rig, law: Law) -> Held:
     """Input of `held_moduli` from a rig of `compression.compressed`."""
-    return Held(*about_held(rig, law), geometry_factor(replace(rig, held=None, height=rest_height(rig)), law))
+    relaxing, standing = about_held(rig, law)
+    whole, part = (1 / jnp.linalg.inv(relaxing + s * standing)[-1, -1] for s in (1.0, 0.5))
+    factors = jnp.stack([2 * part - whole, 2 * (whole - part)]) / exact_stiffness(rig, law)
+    bias = geometry_factor(replace(rig, held=None, height=rest_height(rig)), law)
+    return Held(relaxing, standing, bias, factors, rig.meshless)
 
 
 def moving_response(rest: Linearised, modulus: Number, square: Number) -> Response:
@@ -235,5 +249,8 @@ def held_moduli(of: Held, rig: Rig, prony: Prony, omega: jax.Array, steps: int |
     ratios = viscosity.complex_ratios(prony, omega, None if steps is None else 2 * jnp.pi / (omega * steps))
     stands = 1 - jnp.sum(jnp.asarray(prony.ratios))
     parts = Linearised(of.relaxing, of.relaxing, stands * of.standing)
-    stiffness = jax.lax.map(lambda modulus: steady_response(parts, modulus).stiffness, 1 - jnp.sum(ratios, axis=0))
-    return 2 * rig.height / (jnp.pi * rig.radius**2) * stiffness / of.bias
+
+    def shown(modulus: jax.Array) -> jax.Array:
+        return steady_response(parts, modulus).stiffness / of.bias_at(modulus, stands)
+
+    return 2 * rig.height / (jnp.pi * rig.radius**2) * jax.lax.map(shown, 1 - jnp.sum(ratios, axis=0))

@@ -31,6 +31,9 @@ class Rig:
     held: jax.Array | None = param(
         "m", "positions (V, 3) of the compressed sample; None: it is not (`compression`)", default=None
     )
+    meshless: jax.Array | None = param(
+        "1", "R and S (2,) of the compressed sample without a mesh (`glued_compression`); None: not known", default=None
+    )
     free_height: bool = static(default=False, about="the top plate may also move along the axis under no axial force")
 
 

@@ -202,7 +202,10 @@ def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
         jnp.append(lift_0, lift),
         statistics,
     )
-    bias = still.stiffness / (modulus * exact_stiffness(rig, o.law)) if rest.bias is None else rest.bias + 0j
+    if rest.held is None:
+        bias = still.stiffness / (modulus * exact_stiffness(rig, o.law))
+    else:
+        bias = rest.held.bias_at(modulus, rest.stands)
     return run, bias
 
 

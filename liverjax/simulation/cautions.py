@@ -1,4 +1,4 @@
-"""Cautions about a run that converged: one sentence each, on the host."""
+"""Cautions about a run: one sentence each, on the host."""
 
 from functools import partial
 
@@ -13,12 +13,15 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.ligament import Ligament
+from liverjax.physics.base import Physics
+from liverjax.physics.contact.friction import RoughObstacle
 from liverjax.physics.contact.obstacle import Obstacle, missed_depth, touches_without_pressure
 from liverjax.physics.contact.passage import passed_in_step
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.scenes import regions
 from liverjax.scenes.by_element import by_element
+from liverjax.scenes.checks.rigid_motion import loose_piece
 from liverjax.scenes.scene import Scene, histories, named_physics
 from liverjax.simulation.automatic import qualities
 from liverjax.simulation.obstacle_forces import obstacle_forces
@@ -52,6 +55,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         *_of_stress_at_start(scene, result),
         *_of_growing_motion(scene, result),
         *_of_contacts(scene, result),
+        *_of_friction_alone(scene, result),
         *_of_pressures(scene, result),
         *_of_volumes(scene, result),
     ]
@@ -297,6 +301,25 @@ def _of_contacts(scene: Scene, result: Result) -> list[str]:
 
 #: Times by which changes of the pressure from step to step exceed those over two steps if a scheme is unstable.
 ALTERNATING = 3.0
+
+
+def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
+    """Whether a static run failed whose body only friction holds: it may have to slide."""
+    rough = any(isinstance(physics, RoughObstacle) for physics in scene.physics)
+    failed = np.isin(result.statistics.status, (status.CONVERGED, status.ONE_STEP, status.STALLED), invert=True)
+    if not rough or scene.solve.kind != "static" or not failed.any():
+        return []
+
+    def without_friction(physics: Physics) -> tuple[np.ndarray, np.ndarray]:
+        return Obstacle.holds(physics, scene.mesh) if isinstance(physics, RoughObstacle) else physics.holds(scene.mesh)
+
+    loose = loose_piece(scene, without_friction)
+    if not loose:
+        return []
+    return [
+        f"the run failed, and only friction holds {loose} against sliding away: if the friction is too small, no state "
+        "of rest exists; take a larger friction, [[fixed]], or kind = 'dynamic'"
+    ]
 
 
 def _of_pressures(scene: Scene, result: Result) -> list[str]:

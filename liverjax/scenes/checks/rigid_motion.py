@@ -1,10 +1,11 @@
 """Is every piece of the body held against rigid motions?"""
 
-from collections.abc import Container
+from collections.abc import Callable, Container
 
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.physics.base import Physics
 from liverjax.physics.prescribed import free_places
 from liverjax.scenes.scene import Scene, named_physics
 
@@ -28,6 +29,18 @@ def check_hold(scene: Scene, before: dict[str, int]) -> None:
 
 def check_held(scene: Scene) -> None:
     """Refuse a connected piece that nothing holds: a static solution does not exist then."""
+    loose = loose_piece(scene, lambda physics: physics.holds(scene.mesh))
+    if loose:
+        raise InputError(f"nothing holds {loose} against every rigid motion: add [[fixed]] or kind = 'dynamic'")
+
+
+def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.ndarray]]) -> str:
+    """The first connected piece with a free rigid motion, in words, or "".
+
+    Args:
+        scene: `Scene`.
+        holds: node numbers (n,) and directions (n, 3) that a further physics holds.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -35,7 +48,7 @@ def check_held(scene: Scene) -> None:
     rows, columns = np.tile(each[0], len(each)), np.concatenate(each)
     pieces, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
     fixed = np.argwhere(~free_places(scene.mesh, scene.fixed, scene.displaced))
-    both = [(fixed[:, 0], np.eye(3)[fixed[:, 1]]), *(physics.holds(scene.mesh) for physics in scene.physics)]
+    both = [(fixed[:, 0], np.eye(3)[fixed[:, 1]]), *(holds(physics) for physics in scene.physics)]
     numbers, directions = (np.concatenate(a) for a in zip(*both, strict=True))
     for piece in range(pieces):
         nodes = np.flatnonzero(label == piece)
@@ -43,8 +56,8 @@ def check_held(scene: Scene) -> None:
         points = np.asarray(scene.mesh.points)
         held = points[numbers[inside]] - points[nodes].mean(axis=0)
         if _rigid_rank(held, directions[inside], np.ptp(points[nodes], axis=0).max()) < 6:
-            which = f"piece {piece} ({len(nodes)} nodes)" if pieces > 1 else "the body"
-            raise InputError(f"nothing holds {which} against every rigid motion: add [[fixed]] or kind = 'dynamic'")
+            return f"piece {piece} ({len(nodes)} nodes)" if pieces > 1 else "the body"
+    return ""
 
 
 def _rigid_rank(points: np.ndarray, directions: np.ndarray, size: float) -> int:

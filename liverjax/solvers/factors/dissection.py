@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-#: A group of so few nodes is not divided; from so many elements on, diagonal planes and smallest cuts are tried.
-LEAF, MANY = 40, 200
+#: A group of so few nodes is not divided; from so many nodes on, diagonal planes and smallest cuts are tried.
+LEAF, MANY = 40, 400
 #: Least part of the elements on one side of a plane; part on each side of the plane that a smallest cut may reach.
 LEAST, BESIDE = 0.25, 0.07
 #: A smallest cut is taken if its estimated work is below this part of the plane's: planes leave straighter parts.
@@ -43,7 +43,7 @@ class _Cut(NamedTuple):
 
 def work(own: Any, border: Any) -> Any:
     """Multiplications that eliminate `own` unknowns, which are coupled with `border` others."""
-    return own**3 / 3 + own**2 * border + own * border**2
+    return own * (own * own / 3 + own * border + border * border)  # powers would take most of the dissection's time
 
 
 def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, list[int]]]:
@@ -83,13 +83,14 @@ def _best_cut(elements: np.ndarray, centres: np.ndarray, part: _Part, V: int) ->
     n, span = len(part.elements), (np.empty(V, int), np.empty(V, int))
     least, most = max(1, int(LEAST * n)), min(n - 1, int(np.ceil((1 - LEAST) * n)))
     best = _Cut(np.inf, part.elements, 1)
-    for direction in DIRECTIONS if n > MANY else DIRECTIONS[:3]:
+    many = len(part.nodes) > MANY
+    for direction in DIRECTIONS if many else DIRECTIONS[:3]:
         order = part.elements[np.argsort(centres[part.elements] @ direction, kind="stable")]
-        found = _work_of_cuts(elements[:, order], part, span)[least - 1 : most]
+        found = _work_of_cuts(elements[:, order], part, span, slice(least - 1, most))
         k = int(np.argmin(found))
         if found[k] < best.work:
             best = _Cut(found[k], order, least + k)
-    if n <= MANY:
+    if not many:
         return best
     low, high = max(1, best.first - int(BESIDE * n)), min(n - 1, best.first + int(BESIDE * n))
     before, near, after = np.split(best.order, [low, high])
@@ -97,31 +98,31 @@ def _best_cut(elements: np.ndarray, centres: np.ndarray, part: _Part, V: int) ->
     _first_and_last(elements[:, plane.order], span)
     for own in _smallest_cuts(elements[:, near], part.nodes, span, (low, high)):
         order, first = np.concatenate([before, near[own], near[~own], after]), low + int(own.sum())
-        found = _work_of_cuts(elements[:, order], part, span)[first - 1]
+        found = _work_of_cuts(elements[:, order], part, span, slice(first - 1, first))[0]
         if found < min(BETTER * plane.work, best.work):
             best = _Cut(found, order, first)
     return best
 
 
 def _first_and_last(nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray]) -> None:
-    """Write the first and the last element of each node, (V,) each, for the nodes (E, n) of elements in an order."""
+    """Write the first and the last element of each node, (V,) each, for the nodes (n, E) of elements in an order."""
     number = np.repeat(np.arange(nodes.shape[1]), len(nodes))
     every = nodes.T.ravel()
     span[0][every[::-1]] = number[::-1]
     span[1][every] = number
 
 
-def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Work (n,) of a cut after each element of an order with these nodes (E, n): the work of the nodes between, and
+def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.ndarray], at: slice) -> np.ndarray:
+    """Work of the cuts after the elements `at` of an order with these nodes (n, E): the work of the nodes between, and
     twice the work of the next cut on each side, as if the side were a cube.
     """
     n, m = nodes.shape[1], len(part.border)
     _first_and_last(nodes, span)
-    begun, over = (np.cumsum(np.bincount(own[part.nodes], minlength=n)).astype(float) for own in span)
-    later_begun, later_over = (np.cumsum(np.bincount(own[part.border], minlength=n)) for own in span)
+    begun, over = (np.cumsum(np.bincount(own[part.nodes], minlength=n))[at].astype(float) for own in span)
+    later_begun, later_over = (np.cumsum(np.bincount(own[part.border], minlength=n))[at] for own in span)
     between = begun - over
-    one = work(over ** (2 / 3), later_begun + between)
-    other = work((len(part.nodes) - begun) ** (2 / 3), m - later_over + between)
+    one = work(np.square(np.cbrt(over)), later_begun + between)
+    other = work(np.square(np.cbrt(len(part.nodes) - begun)), m - later_over + between)
     return work(between, m) + 2 * (one + other)
 
 

@@ -1,0 +1,130 @@
+"""A compressed sample between glued plates by quadratic elements: what the coarse mesh of the torsion rig misses.
+
+The sample is glued, so it bulges, and the stresses at the rims of the plates are infinite. Linear elements of the
+torsion rig are a fifth too stiff there, against a few percent in pure torsion. So factors and force are computed once
+for each law and strain, with a quarter of the cylinder that is fine at the rims.
+
+A sample whose stress relaxes by m = G*/G0, down to m_inf, shows the modulus G0 (R m + S m_inf). Both factors come from
+two harmonic solutions about the compressed state; others are within 1e-4 of a sum of this form.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+import liverjax as lj
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.laws import Law
+from liverjax.mesh import cylinders
+from liverjax.mesh.promotion import quadratic
+from liverjax.mesh.tetrahedra import with_points
+
+#: Cells at the rim of a plate, over the shorter of radius and half of the height: finest first, coarser ones where a
+#: large strain inverts the elements at the rim.
+RIMS = (0.1, 0.25, 0.5)
+#: Cells of a second mesh with the same numbers of cells, over those at the rim: the difference tells the mesh's error.
+COARSER = 2.5
+#: Longest cells over the radius; along the axis twice as long.
+LARGEST = 0.34
+#: Corners of the polygon in place of the circle.
+CORNERS = 16
+#: Largest strain of one load step.
+_STEP = 0.05
+
+
+class Glued(NamedTuple):
+    """Factors of the moduli at rest [1] that a compressed sample shows, and its force before it relaxes [N]."""
+
+    relaxing: float  # R
+    standing: float  # S
+    force: float
+
+
+def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Glued]:
+    """Factors and force of a sample that glued plates compress by `strain`, and what the meshes may miss of each.
+
+    Two meshes are extrapolated by the first order, that of stresses which are infinite at the rims. The change by the
+    extrapolation, with its sign, is the second result.
+
+    Args:
+        radius: of the plates, and of the sample at rest [m].
+        gap: height of the compressed sample [m].
+        law: its law.
+        strain: part of the height at rest.
+
+    Raises:
+        InputError: the sample cannot be compressed so far.
+    """
+    for rim in RIMS:
+        mesh, wider = (_quarter(radius, gap / (1 - strain), rim, coarser) for coarser in (1.0, COARSER))
+        # The same neighbours, and so the same compiled program.
+        fine, coarse = (_on_mesh(own, radius, law, strain) for own in (mesh, with_points(mesh, wider.points)))
+        if fine is not None and coarse is not None:
+            change = [(a - b) / (COARSER - 1) for a, b in zip(fine, coarse, strict=True)]
+            return Glued(*(a + d for a, d in zip(fine, change, strict=True))), Glued(*change)
+    raise InputError(
+        f"--precompression {strain:g}: the simulated sample could not be compressed so far; give less, or --method "
+        "closed-form, whose plates are smooth"
+    )
+
+
+def _quarter(radius: float, height: float, rim: float, coarser: float) -> lj.TetMesh:
+    """A quarter of the cylinder; cells at the rims are `coarser` times as long, the number of cells is the same."""
+    cell = rim * min(radius, height / 2)
+    inwards = _wider(cylinders.graded(radius, {0.0: cell}, LARGEST * radius), coarser)
+    half = _wider(cylinders.graded(height / 2, {0.0: cell}, 2 * LARGEST * radius), coarser)
+    radii, heights = radius - inwards[::-1], np.concatenate([half, height - half[-2::-1]])
+    return quadratic(cylinders.sector(radii, heights, CORNERS, CORNERS // 4).mesh)
+
+
+def _wider(places: np.ndarray, factor: float) -> np.ndarray:
+    """Places from 0 to the same end, the first one `factor` times as far away."""
+    end = places[-1]
+    return end * (places / end) ** (1 + np.log(factor) / np.log(places[1] / end))
+
+
+def _on_mesh(mesh: lj.TetMesh, radius: float, law: Law, strain: float) -> Glued | None:
+    """The numbers of one mesh; None if the run failed."""
+    sets = {name: np.asarray(nodes) for name, nodes in mesh.node_sets.items()}
+    bottom, top = sets["bottom"], sets["top"]
+    # Between the plates, without the axis: the planes y = 0 and x = 0.
+    planes = [np.setdiff1d(sets[name], np.concatenate([bottom, top, sets["axis"]])) for name in ("start", "end")]
+    axis = np.setdiff1d(sets["axis"], np.concatenate([bottom, top]))
+    height = float(np.ptp(np.asarray(mesh.points)[:, 2]))
+
+    def scene(along: tuple[str, str, str], lift: float, solve: lj.Solve) -> lj.Scene:
+        held = [(bottom, "xyz"), *zip((*planes, axis), along, strict=True)]
+        return lj.Scene(
+            mesh=mesh,
+            law=law,
+            fixed=tuple(lj.Fixed(nodes=jnp.asarray(nodes), axes=axes) for nodes, axes in held),
+            displaced=(lj.Displaced(nodes=jnp.asarray(top), by=jnp.array([0.0, 0.0, lift])),),
+            solve=solve,
+        )
+
+    steps = max(1, int(np.ceil(strain / _STEP)))
+    pressed = lj.simulate(
+        scene(("y", "x", "xy"), -strain * height, lj.Solve(steps=steps, tolerance=1e-9, volumetric="element"))
+    )
+    if np.any(np.asarray(pressed.status) != 0):
+        return None
+    x, force = pressed.positions[-1], 4 * np.asarray(pressed.reactions[-1])[top]
+    # A turn moves the planes along their normals.
+    turned = scene(("xz", "yz", "xyz"), 0.0, lj.Solve(kind="harmonic", volumetric="element"))
+    turn = jnp.zeros(x.shape, complex).at[top, :2].set(jnp.stack([-x[top, 1], x[top, 0]], axis=1))
+    size = 2 * height * (1 - strain) / (np.pi * radius**4) / float(np.asarray(law.shear_modulus()))
+
+    def seen(stands: float) -> float:
+        """R + S stands: the modulus shown if all of G0 relaxes at once (m = 1), over G0."""
+        prony = lj.Prony(ratios=jnp.array([1 - stands]), relaxation_times=jnp.array([1.0]))
+        moved = lj.harmonic(replace(turned, viscosity=prony), [1.0], jnp.ones(1, complex), x, turn).check()
+        on_plate, at = 4 * np.asarray(moved.reactions[0].real)[top], np.asarray(x)[top]
+        torque = np.sum(at[:, 0] * on_plate[:, 1] - at[:, 1] * on_plate[:, 0])
+        # The plate turns, and the force that it has carried since the compression does not.
+        return size * float(torque - stands * np.sum(at[:, :2] * force[:, :2]))
+
+    much, little = seen(0.8), seen(0.2)
+    standing = (much - little) / (0.8 - 0.2)
+    return Glued(little - 0.2 * standing, standing, -float(force[:, 2].sum()))
