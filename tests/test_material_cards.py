@@ -1,6 +1,7 @@
 """Material cards, read back as the program reads them: the moduli are those of the model."""
 
 import re
+import tomllib
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -10,6 +11,7 @@ from conftest import ROOT
 from fitting.__main__ import main
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.reports import material_cards
+from liverjax.scenes.scene_file import scene_from
 
 OMEGA = np.geomspace(0.01, 100, 9)
 SOLID = Maxwell(np.array(770.0), np.array([0.235, 0.333]), np.array([0.27, 0.03]))
@@ -72,21 +74,33 @@ def from_ansys(text):
     return complex_modulus(shear * (1 - a.sum()), shear * a, tau)
 
 
+def from_liverjax(text):
+    """As a scene file is read: the shear modulus of the law at rest, the part of it that each mode relaxes."""
+    body = '[mesh]\nshape = "box"\nsize = [1, 1, 1]\ncells = [1, 1, 1]\n[[fixed]]\nwhere = {z_max = 0.0}\n'
+    motion = "[[displaced]]\nwhere = {z_min = 1.0}\nby = [0.01, 0, 0]\n[solve]\ndt = 0.01\n"
+    scene = scene_from(tomllib.loads(body + motion + text), ".")
+    shear, bulk = float(scene.law.shear_modulus()), float(scene.law.bulk_modulus())
+    assert (3 * bulk - 2 * shear) / (6 * bulk + 2 * shear) == pytest.approx(material_cards.POISSON)
+    g = np.asarray(scene.viscosity.ratios)
+    return complex_modulus(shear * (1 - g.sum()), shear * g, scene.viscosity.relaxation_times)
+
+
 @pytest.mark.parametrize("model", [SOLID, FLUID, MANY], ids=["solid", "fluid", "many modes"])
 def test_cards_read_back_are_the_model(model, tmp_path):
     told = material_cards.write(tmp_path, model)
     readers = {"febio.feb": from_febio, "abaqus.inp": from_abaqus, "ansys.inp": from_ansys}
+    readers["liverjax.toml"] = from_liverjax
     for name, reader in readers.items():
         if name == "febio.feb" and len(model.ratios) > 6:
             assert not (tmp_path / name).exists() and "FEBio has at most 6 modes" in told[0]
             continue
-        # Ten digits; of a fluid Abaqus keeps a millionth of G0.
+        # Ten digits; of a fluid Abaqus and liverjax keep a millionth of G0.
         off = np.abs(reader((tmp_path / name).read_text()) - exact(model))
         assert np.all(off <= 1e-8 * np.abs(exact(model)) + 2e-6 * float(model.shear_modulus) * (model is FLUID)), name
     assert any("fluid" in t for t in told) == (model is FLUID)
 
 
-@pytest.mark.parametrize("card", ["febio", "abaqus", "ansys", "sofa"])
+@pytest.mark.parametrize("card", ["scene_tables", "febio", "abaqus", "ansys", "sofa"])
 def test_cards_say_which_times_they_hold(card):
     """The modes of a springpot follow it over the measured band; a card alone does not show that."""
     text = getattr(material_cards, card)(SOLID)

@@ -15,7 +15,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         prog=prog,
         description="Fit the numbers of a hyperelastic law to moduli that change with the amplitude of the strain, at "
         "one frequency, and show the third harmonic that the law predicts.",
-        epilog="The errors (±) are of noise alone: an error of the gap, of 50 µm of 1 mm, adds 5 %% to every "
+        epilog="The errors (±) are of noise alone: an error of the gap, of 50 µm of 1 mm, adds 5 % to every "
         f"modulus and strain. {EXIT_CODES}",
     )
     command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")

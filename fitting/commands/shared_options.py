@@ -33,7 +33,9 @@ def add_cards_and_samples(command: argparse.ArgumentParser) -> None:
     """Options --samples and --cards."""
     command.add_argument("--samples", type=int, metavar="N", help="4 chains of N draws of the posterior, posterior.csv")
     command.add_argument(
-        "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
+        "--cards",
+        action="store_true",
+        help="material cards for liverjax, FEBio, Abaqus, Ansys and SOFA too, in DIR/cards",
     )
 
 

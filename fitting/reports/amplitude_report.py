@@ -49,7 +49,7 @@ def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequen
 
 def table(sweep: StrainSweep, fits: list[StrainFit]) -> str:
     """Table of the laws, the best first, and the third harmonic of the best at the largest strain."""
-    most, third = 100 * sweep.strain[-1], 100 * fits[0].third[-1]
+    most, third = 100 * sweep.strain[-1], round(100 * fits[0].third[-1], 9)
     said = f"{fits[0].law.label}: at a strain of {most:.3g} % the third harmonic is {third:.2g} % of the first"
     return "\n".join([curves_report.table([f.law for f in fits]), said])
 

@@ -139,7 +139,7 @@ def table(fits: list[LawFit]) -> str:
     lines = [f"{'law':18s} {'error':>7s} {'run':>8s} {'compile':>8s} {'AICc':>8s}  G0 [Pa]    parameters"]
     for f in best_first(fits):
         parameters = ", ".join(
-            f"{n} → {f.limits[n]}" if n in f.limits else f"{n} {v:.4g} ± {e:.1g}{'' if u == '1' else ' ' + u}"
+            f"{n} → {f.limits[n]}" if n in f.limits else f"{n} {v:.4g} ± {e:.2g}{'' if u == '1' else ' ' + u}"
             for n, v, e, u in zip(f.names, f.values, f.standard_errors, f.units, strict=True)
         )
         lines.append(

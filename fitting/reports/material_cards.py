@@ -1,4 +1,4 @@
-"""Prony modes as material cards of FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
+"""Prony modes as material cards of liverjax, FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
 
 All cards are neo-Hookean with G0, the instantaneous shear modulus. The whole stress relaxes, as in the simulations here
 (part = "all"). A shear test does not determine the bulk modulus, which follows from Poisson's ratio `POISSON`.
@@ -12,12 +12,14 @@ from fitting.methods.generalised_maxwell import Maxwell
 
 #: Poisson's ratio of the elastic law: nearly incompressible.
 POISSON = 0.49
-#: Terms that FEBio's viscoelastic material has, and the largest sum of ratios for Abaqus (it must be below 1).
-FEBIO_TERMS, ABAQUS_SUM = 6, 1 - 1e-6
+#: Terms that FEBio's viscoelastic material has.
+FEBIO_TERMS = 6
+#: Largest sum of ratios for Abaqus and liverjax, where it must be below 1.
+LARGEST_SUM = 1 - 1e-6
 
 
 def write(folder: Path, model: Maxwell) -> list[str]:
-    """Write the four files; returns sentences on what a program cannot represent."""
+    """Write the files; returns sentences on what a program cannot represent."""
     folder.mkdir(parents=True, exist_ok=True)
     told = []
     if len(model.ratios) > FEBIO_TERMS:
@@ -25,9 +27,16 @@ def write(folder: Path, model: Maxwell) -> list[str]:
         (folder / "febio.feb").unlink(missing_ok=True)
     else:
         (folder / "febio.feb").write_text(febio(model))
-    if np.sum(model.ratios) > ABAQUS_SUM:
-        told.append("the model is a fluid: Abaqus needs an equilibrium modulus, its card keeps a millionth of G0")
-    for name, card in (("abaqus.inp", abaqus), ("ansys.inp", ansys), ("sofa.xml", sofa)):
+    if np.sum(model.ratios) > LARGEST_SUM:
+        told.append(
+            "the model is a fluid: Abaqus and liverjax need an equilibrium modulus, their cards keep a millionth of G0"
+        )
+    for name, card in (
+        ("liverjax.toml", scene_tables),
+        ("abaqus.inp", abaqus),
+        ("ansys.inp", ansys),
+        ("sofa.xml", sofa),
+    ):
         (folder / name).write_text(card(model))
     return told
 
@@ -44,6 +53,32 @@ def _bulk(shear: float) -> float:
 
 def _written_number(value: float) -> str:
     return f"{float(value):.10g}"
+
+
+def _below_one(ratios: np.ndarray) -> np.ndarray:
+    """The ratios, those of a fluid reduced so that a millionth does not relax."""
+    return np.asarray(ratios) * min(1.0, LARGEST_SUM / max(float(np.sum(ratios)), 1e-300))
+
+
+def scene_tables(model: Maxwell) -> str:
+    """Tables of a scene file of liverjax: the law with G0, and its relaxation."""
+    G0, ratios, times = model
+    return "\n".join(
+        [
+            "# SI units: Pa, s. Copy both tables into a scene file.",
+            f"# {_span(model)}",
+            f"# A shear test does not determine bulk: Poisson's ratio is {POISSON} here.",
+            "[law]",
+            'name = "neo_hookean"',
+            f"mu = {_written_number(float(G0))}",
+            f"bulk = {_written_number(_bulk(float(G0)))}",
+            "",
+            "[viscosity]",
+            f"ratios = [{', '.join(map(_written_number, _below_one(ratios)))}]",
+            f"relaxation_times = [{', '.join(map(_written_number, times))}]",
+            "",
+        ]
+    )
 
 
 def febio(model: Maxwell) -> str:
@@ -76,10 +111,8 @@ def febio(model: Maxwell) -> str:
 def abaqus(model: Maxwell) -> str:
     """Hyperelastic, instantaneous moduli, C10 = G0 / 2 and D1 = 2 / K; a line g, k, tau for each mode."""
     G0, ratios, times = model
-    kept = np.asarray(ratios) * min(1.0, ABAQUS_SUM / max(float(np.sum(ratios)), 1e-300))
-    rows = [
-        f"{_written_number(g)}, {_written_number(g)}, {_written_number(t)}" for g, t in zip(kept, times, strict=True)
-    ]
+    kept = zip(_below_one(ratios), times, strict=True)
+    rows = [f"{_written_number(g)}, {_written_number(g)}, {_written_number(t)}" for g, t in kept]
     return "\n".join(
         [
             "** SI units: Pa, s. Add *DENSITY.",

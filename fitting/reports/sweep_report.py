@@ -467,7 +467,7 @@ def _compression(fits: list[Fit]) -> list[str]:
     if not found:
         return []
     forces = ", ".join(
-        f"{f['axial_force_N']:.3g} ± {f['axial_force_total_error_N']:.1g} N ({f['plates']} plates)" for f in found
+        f"{f['axial_force_N']:.3g} ± {f['axial_force_total_error_N']:.2g} N ({f['plates']} plates)" for f in found
     )
     one = found[0]
     kept = one["modulus_if_incompressible"]

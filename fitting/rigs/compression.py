@@ -41,7 +41,7 @@ class Shares(NamedTuple):
 def check_strain(strain: float) -> None:
     """Raise `InputError` for a strain that is impossible for a sample."""
     if not 0 <= strain <= LARGEST:
-        meant = f"{strain / 100:g}" if 1 < strain <= 100 * LARGEST else "0.05"  # in percent
+        meant = f"{strain / 100:g}" if 1 <= strain <= 100 * LARGEST else "0.05"  # in percent
         raise InputError(
             f"--precompression {strain:g} is the part of the height by which the plates compress the sample, from 0 to "
             f"{LARGEST:g}: give e.g. --precompression {meant}"
