@@ -210,7 +210,9 @@ def through_torsion(
     """
     from liverjax.physics.viscosity import check_viscosity
 
+    begin = time.perf_counter()
     data = simulation_data(sweep, simulation)
+    pressing = time.perf_counter() - begin if simulation.precompression else 0.0  # nearly all of it is compilation
     rig, law, *_, scales = data
     check_viscosity(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
     u0, kind = jnp.asarray(start.solution.u), start.kind
@@ -245,7 +247,7 @@ def through_torsion(
         details |= {"force_of_law_N": force.force, "force_of_law_mesh_bias_N": -missed.force}
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
     at = BestPoint("torsion", found, storage, loss, advice)
-    fit = fit_at(sweep, at, kind, (running, compiling), details)
+    fit = fit_at(sweep, at, kind, (running, compiling + pressing), details)
     if simulation.is_linear and kind.prior is None:
         fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
     return _as_told_before(with_alike_points(fit, sweep) if INDEPENDENT in start.details else fit, start)
