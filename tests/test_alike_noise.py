@@ -55,6 +55,7 @@ def test_errors_of_smoothed_noise_are_right(width):
     assert 0.5 < rms < 1.3 and rms_plain > 2, (rms, rms_plain)
 
 
+@pytest.mark.slow
 def test_independent_noise_is_left_alone():
     X, seen = points(), 0
     J, places, group = fields(X), np.repeat(X, 3, axis=0), np.tile(np.arange(3), len(X))

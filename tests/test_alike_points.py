@@ -32,6 +32,7 @@ def drifting(seed: int, length: float) -> Sweep:
     return Sweep(OMEGA, storage * (1 + noise[:, 0]), loss * (1 + noise[:, 1]))
 
 
+@pytest.mark.slow
 def test_errors_of_a_drift_hold_the_truth():
     """Of 24 sweeps; errors of independent noise hold the numbers in half of them."""
     before, after = [], []

@@ -127,7 +127,7 @@ MISTAKES = {
 
 
 #: One of a wrong derivative, of a wrong value, and of a state that no derivative has. The others run with -m slow.
-FIRST = ("wrong sign", "wrong beyond moderate stretches", "wrong modulus stated", "NaN at rest", "a jump")
+FIRST = ("wrong sign", "wrong modulus stated", "NaN at rest", "a jump")
 
 
 @pytest.mark.parametrize("mistake", [m if m in FIRST else pytest.param(m, marks=pytest.mark.slow) for m in MISTAKES])
@@ -159,6 +159,21 @@ def test_a_steep_energy_is_no_jump(steep, tmp_path, monkeypatch, capsys):
     main(["check", f"{file}:Law", "--out", str(tmp_path)])
     output = capsys.readouterr()
     assert "stable in uniaxial" in output.out and "the energy jumps" not in output.out
+
+
+def test_a_law_of_the_volume_alone_does_not_jump():
+    """In tests that keep the volume its energy is 0, but for roundoff of 1e-28 Pa: that was called a jump."""
+
+    @lj.struct
+    class Volume(lj.Law):
+        k: float = lj.param("Pa", typical=2000.0)
+        invariants = ("J",)
+
+        def strain_energy(self, I):
+            return self.k / 4 * (I.J**2 - 1 - 2 * jnp.log(I.J))
+
+    law = Volume(k=2000.0)
+    assert gradient_check._jumps(law, law.energy) == []
 
 
 def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):

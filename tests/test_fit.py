@@ -117,6 +117,7 @@ def draws():
     return np.stack([s.values for s in spreads]), np.stack([s.standard_errors for s in spreads]), spreads
 
 
+@pytest.mark.slow
 def test_spreads_are_the_best_possible(draws):
     values, errors, _ = draws
     # mathematics: G0 1.5 %, g1 1.8 %, g2 2.1 %, tau1 2.3 %, tau2 7.4 % (relative standard deviations)

@@ -44,7 +44,6 @@ def off_terzaghi(scene: lj.Scene) -> list[float]:
     return [float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs]
 
 
-@pytest.mark.core
 def test_terzaghis_column_under_an_oscillating_load(verified):
     """Of first order in the layer that is open to the top, as runs in time are."""
     errors = np.array([off_terzaghi(column(n, 1, 1.0)) for n in (12, 24)])

@@ -265,6 +265,7 @@ def test_the_total_error_has_every_share(tmp_path):
     assert len(ends) == 1 and "relaxation_times" in ends[0] and "modulus" not in ends[0]
 
 
+@pytest.mark.slow
 def test_whole_intervals_hold_the_moduli_where_the_gap_is_not_told():
     """Noise of 1 %, a gap off by 50 um of 4 mm (seeded): intervals of noise alone miss half of them."""
     rng, inside, noise_alone = np.random.default_rng(0), 0, 0

@@ -50,6 +50,7 @@ def test_the_interval_holds_where_a_mode_relaxes_after_the_test():
     assert np.median(errors) > 10 and np.mean(held) >= 0.85
 
 
+@pytest.mark.slow
 def test_the_interval_is_that_of_the_standard_error_where_the_test_is_long_enough():
     """The same material without the slow mode."""
     held, ratios = [], []

@@ -190,9 +190,16 @@ def test_factors_of_glued_plates_are_known_within_their_stated_error(name, gap):
     mesh = glued_compression._quarter(0.01, gap / (1 - STRAIN), 0.04, 1.0)
     fine = glued_compression._on_mesh(mesh, 0.01, law, STRAIN)
     for a, b, error in zip(found, fine, missed, strict=True):
-        assert abs(a - b) < 1.2 * abs(error)
+        # Cells of 0.04 in place of 0.1 miss half of what those miss: 0.4 to the power of 0.75.
+        assert abs(a - 0.5 * error - b) < 0.25 * abs(error)
     near, _ = glued_compression.glued(0.01, gap, law, 1e-3)
     assert near.relaxing + near.standing == pytest.approx(1, abs=2e-3)
+
+
+@pytest.mark.slow
+def test_glued_plates_that_fold_the_sample_are_refused(law):
+    with pytest.raises(InputError, match="could not be compressed so far; give less"):
+        glued_compression.glued(0.01, 0.01, law, 0.5)
 
 
 @pytest.mark.parametrize(

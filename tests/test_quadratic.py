@@ -336,7 +336,7 @@ def test_every_feature_runs_on_both_orders(feature):
 @pytest.mark.parametrize(
     "feature",
     [
-        "elastic",
+        pytest.param("elastic", marks=pytest.mark.slow),
         pytest.param("porous", marks=pytest.mark.core),
         "pressure",
         pytest.param("isochoric", marks=pytest.mark.slow),

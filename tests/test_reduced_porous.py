@@ -162,6 +162,7 @@ def test_all_motions_pressures_and_points_are_the_full_model_in_motion(trained):
     _assert_same(trained.unseen[0], trained.full[0].positions, trained.full[0].pressure)
 
 
+@pytest.mark.slow
 def test_points_serve_motion_and_pressure_and_the_errors_are_stated(trained):
     scene, model = trained.scene, trained.model
     assert len(model.points) < scene.mesh.weights.size and model.pressures.modes.shape[0] == 3

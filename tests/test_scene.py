@@ -219,6 +219,20 @@ def test_a_hinge_is_not_enough():
     scene_from(content)
 
 
+def test_a_piece_that_hangs_on_doubled_nodes_is_told_so():
+    """Two boxes side by side with nodes of their own in the face between them: "add [[fixed]]" would split the body."""
+    box = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    points, tets = np.asarray(box.points), np.asarray(box.tetrahedra)
+    both = lj.tet_mesh(
+        np.concatenate([points, points + np.array([1.0, 0.0, 0.0])]), np.concatenate([tets, tets + len(points)])
+    )
+    low = np.flatnonzero(np.asarray(both.points)[:, 0] == 0)
+    held = (lj.Fixed(nodes=jnp.asarray(low)),)
+    scene = lj.Scene(mesh=both, law=lj.laws.NeoHookean(mu=1.0, bulk=10.0), fixed=held)
+    with pytest.raises(lj.InputError, match="merge the 4 nodes that are at the place of another one, if"):
+        lj.check_scene(scene)
+
+
 @pytest.mark.parametrize("text", [b"[mesh", b"\xff\xfe\x00", None])
 def test_files_that_are_no_scenes(text, tmp_path, capsys):
     file = tmp_path / "scene.toml"

@@ -80,6 +80,18 @@ def test_derivatives_are_those_of_the_runs(scene, model):
     assert lanes[0] == pytest.approx(float(separated(700.0)), rel=1e-12)
 
 
+def test_traced_values_outside_of_the_range_have_no_answer(model):
+    """The polynomials gave -7 m on a body of 0.1 m, and a slope."""
+
+    def tip(mu):
+        return lj.separated_displacement(model, {"law.mu": mu, "body.gravity.2": -0.8})[-1, 2]
+
+    low, high = np.asarray(model.ranges[model.names.index("law.mu")])
+    found = np.asarray(jax.vmap(tip)(jnp.array([low, high, 0.9 * low, 1.1 * high])))
+    assert np.array_equal(np.isnan(found), [False, False, True, True])
+    assert np.isnan(jax.jit(jax.grad(tip))(1.1 * high)) and np.isfinite(jax.jit(jax.grad(tip))(high))
+
+
 def test_a_loaded_mesh_is_refused(scene):
     """Its displacements were measured from the given shape, where they end: noise."""
     with pytest.raises(InputError, match=r"no separated form: take the scene of lj.unloaded"):
@@ -94,6 +106,7 @@ def test_a_loaded_mesh_is_refused(scene):
         ({"body.gravity": (1.0, 2.0)}, {}, r"body.gravity.0"),
         ({"law.mu": (900.0, 600.0)}, {}, "lowest and the highest"),
         ({"law.mu": 600.0}, {}, "lowest and the highest"),
+        ({"law.mu": (-500.0, 1000.0)}, {}, r"ranges reach law.mu = -500: law.mu"),
         (RANGES, {"points": 1}, "2 or more"),
         (RANGES, {"points": 50}, "2000 runs at most"),
         pytest.param({"law.mu": (1e-3, 2e-3)}, {"points": 2, "checks": 1}, "narrow the ranges", marks=pytest.mark.slow),

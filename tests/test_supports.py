@@ -170,6 +170,7 @@ def test_a_turned_body_slides_as_the_straight_one(changes):
     assert size > 1e-3 and np.abs(found[0] - found[1]).max() < 1e-6 * size
 
 
+@pytest.mark.slow
 def test_reactions_of_a_slide_are_along_its_normal():
     mesh = box()
     turned = lj.tet_mesh(np.asarray(mesh.points) @ TURN.T, mesh.tetrahedra)

@@ -231,6 +231,22 @@ def test_failed_rows_are_told_by_the_process_that_comes_last(files, monkeypatch)
     assert done.file == out and list(done.failed) == [2] and done.computed == 3
 
 
+def test_rows_that_end_crushed_are_told(files, capsys):
+    """They converged, and only `simulate` said that no tissue does it: a cube between walls, pressed to a tenth."""
+    walls = '[[fixed]]\nwhere = {z_min = -1.0, z_max = 0.099}\naxes = "xy"\n'
+    pressed = '[[displaced]]\nwhere = {z_max = 0.0}\nby = [0.0, 0.0, 0.01]\naxes = "z"\n'
+    (files / "scene.toml").write_text(SCENE.replace("[solve]\nsteps = 2", f"{walls}{pressed}[solve]\nsteps = 6"))
+    (files / "rows.csv").write_text("displaced.0.by.2\n0.01\n0.09\n0.02\n")
+    words = command(files, "--out", str(files / "rows.h5"))
+    assert main(words) == 0
+    told = capsys.readouterr().err
+    assert "caution: in 1 rows elements end below a fifth" in told and "worst: row 2, J = 0" in told
+    with h5py.File(files / "rows.h5") as found:
+        J = found["volume_ratios"][:]
+    assert np.allclose(J[:, 0], [0.9, 0.1, 0.8], rtol=0.1) and np.all(J[:, 0] <= J[:, 1])
+    assert main([*words, "--resume"]) == 0 and "worst: row 2" in capsys.readouterr().err
+
+
 #: Parts that a row may change, beside the cube.
 PARTS = """
 [[obstacle]]

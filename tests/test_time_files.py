@@ -287,7 +287,7 @@ def test_noise_and_single_wrong_rows_are_no_other_course(tmp_path, kind):
 @pytest.mark.parametrize(
     ("kind", "offset", "told"),
     [
-        ("relaxation", 10.0, True),
+        pytest.param("relaxation", 10.0, True, marks=pytest.mark.slow),
         pytest.param("relaxation", -6.0, True, marks=pytest.mark.slow),
         ("relaxation", 0.0, False),
         ("creep", 3e-3, True),

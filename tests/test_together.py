@@ -162,7 +162,7 @@ def test_a_wrong_unit_of_one_test_is_named(scale):
     assert not any("try another --model" in w for w in fit.warnings)
 
 
-@pytest.mark.parametrize(("relative", "explained"), [(0.0, False), (0.03, True)])
+@pytest.mark.parametrize(("relative", "explained"), [pytest.param(0.0, False, marks=pytest.mark.slow), (0.03, True)])
 def test_a_factor_that_sizes_of_samples_explain_is_no_alarm(relative, explained):
     fit = springpots_in_time.choose_together(wide_and_long(1.05, 0), "prony", relative=relative)
     (told,) = [w for w in fit.warnings if "the tests agree if" in w]
@@ -303,7 +303,9 @@ def with_deviations(stated: float, noise: float, springpot: bool = False) -> Swe
     return Sweep(WIDE, *noisy, *(stated * noisy), source="stated.csv")
 
 
-@pytest.mark.parametrize("model", ["prony", pytest.param("fractional", marks=pytest.mark.slow), "spectrum"])
+@pytest.mark.parametrize(
+    "model", ["prony", *(pytest.param(m, marks=pytest.mark.slow) for m in ("fractional", "spectrum"))]
+)
 def test_given_deviations_are_believed_beside_another_test(model):
     """5 % stated and 1 % of scatter: twice the file has errors smaller by sqrt(2), and agrees with itself."""
     from fitting.fits.families.springpots_in_time import choose_together

@@ -438,10 +438,10 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         fits[0].details["density_kg_m3"] = options.density
     if options.method != "closed-form":
         fits.append(_simulated(options, corrected, fits[0], simulation))
-    for fit in fits if options.precompression else ():
-        fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
     for fit in fits:
         fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
+    for fit in fits if options.precompression else ():  # its errors contain those by the size of the sample
+        fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
     return fits, corrected
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fitting.fits import simulated_rheometer, viscoelastic
+from fitting.fits.honesty import total_error
 from fitting.fits.honesty.edges import HALF_DECADE
 from fitting.fits.viscoelastic import Fit, Kind
 from fitting.methods import as_prony_modes, host, uncertainty
@@ -326,6 +327,7 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
     force = fit.details["force_of_law_N"] if glued else compression.smooth_force(law, strain, simulation.radius)
     G0, rest = float(fit.model.shear_modulus), float(fit.model.equilibrium_modulus)
     noise = force * uncertainty.equilibrium_error(fit.uncertainty) / G
+    of_modulus = force * total_error.total_errors(fit).get("equilibrium_modulus", 0.0) / G
     of_mesh = fit.details.get("force_of_law_mesh_bias_N", 0.0) * rest / G
     return {
         "strain": strain,
@@ -339,7 +341,7 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
         "axial_force_N": force * rest / G,
         "axial_force_standard_error_N": noise,
         "axial_force_mesh_bias_N": of_mesh,
-        "axial_force_total_error_N": float(np.hypot(noise, of_mesh)),
+        "axial_force_total_error_N": float(np.hypot(of_modulus, of_mesh)),
         "axial_force_at_once_N": force * G0 / G,
     }
 

@@ -320,7 +320,9 @@ def _simulation_details(
     simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli
 ) -> dict[str, object]:
     """Settings and statistics of the simulation, for the report."""
-    whole = simulation.part == "all"  # then the bias is the same at every frequency, and known
+    # At rest, if the whole stress relaxes, the bias of the run is the same at every frequency.
+    known = simulation.part == "all" and rig.held is None
+    rest = rig if rig.held is None else replace(rig, held=None, height=torsion.rest_height(rig))
     return {
         "law": simulation.law,
         "radius_m": simulation.radius,
@@ -328,7 +330,7 @@ def _simulation_details(
         "density_kg_m3": simulation.density,
         "nodes": rig.mesh.number_of_nodes,
         "elements": rig.mesh.number_of_elements,
-        "geometry_factor": float(np.asarray(m.bias)[0].real if whole else torsion.geometry_factor(rig, law)),
+        "geometry_factor": float(np.asarray(m.bias)[0].real if known else torsion.geometry_factor(rest, law)),
         "steps_per_cycle": simulation.steps,
         "scheme": simulation.scheme,
         "part": simulation.part,

@@ -155,12 +155,6 @@ def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
     return jax.jacfwd(lambda q: forces(q, stress(q)))(rest) - standing, standing
 
 
-def axial_force(rig: Rig, law: Law) -> jax.Array:
-    """Force [N] with which a compressed sample, before it relaxes, pushes the plates apart."""
-    x = sample_positions(rig, *coordinates(rig, jnp.zeros(number_of_coordinates(rig), rig.mesh.points.dtype)))
-    return -work_conjugates(rig, x, mjed.internal_force(rig.mesh, law, x))[1]
-
-
 def steady_response(rest: Linearised, modulus: Number) -> Response:
     """Response in a steady cycle in which the relaxing stress is `modulus` (complex) times the elastic stress."""
     if rest.relaxing is None or rest.standing is None:

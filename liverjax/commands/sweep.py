@@ -1,6 +1,7 @@
 """``liverjax sweep SCENE.toml PARAMETERS.csv``: one scene, once for every row of a table."""
 
 import argparse
+import math
 import sys
 from pathlib import Path
 
@@ -46,6 +47,7 @@ def run(options: argparse.Namespace) -> int:
 
     from liverjax.core import status
     from liverjax.jobs import sweep
+    from liverjax.simulation.cautions import cautions_of_mesh
 
     stored, probes, numbers = tuple(options.store), tuple(options.probe), tuple(options.rows)
     table = sweep.read_sweep(options.scene, options.parameters, stored, probes, options.chunk, numbers)
@@ -73,9 +75,22 @@ def run(options: argparse.Namespace) -> int:
     print(f"{len(table.rows)} rows, {done.computed} computed now, {len(done.failed)} failed\nwritten: {done.file}")
     for row, code in list(done.failed.items())[:20]:
         print(f"failed: row {row}: {status.advice(code)}", file=sys.stderr)
+    for said in (*cautions_of_mesh(table.scene.mesh), *_of_crushed(done.crushed)):
+        print(f"caution: {said}", file=sys.stderr)
     if done.failed:
         print(f"again: --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
     return 1 if done.failed else 0
+
+
+def _of_crushed(rows: dict[int, float]) -> list[str]:
+    if not rows:
+        return []
+    worst = max(rows, key=lambda row: abs(math.log(max(rows[row], 1e-300))))
+    named = ", ".join(map(str, list(rows)[:20])) + (", …" if len(rows) > 20 else "")
+    return [
+        f"in {len(rows)} rows elements end below a fifth or above five times their volume ({named}; worst: row "
+        f"{worst}, J = {rows[worst]:.2g}), which no tissue does: take a stiffer bulk modulus or smaller loads"
+    ]
 
 
 def _share(given: list[str]) -> tuple[int, int]:

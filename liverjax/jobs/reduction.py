@@ -50,7 +50,8 @@ def make(
     if modes < 1:
         raise InputError(f"--modes {modes} must be above 0: give e.g. 40")
     if not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
+        wrong = "is a file" if out.parent.exists() else "does not exist; make it first"
+        raise InputError(f"--out {out}: the folder {out.parent} {wrong}")
     if out.is_dir():
         raise InputError(f"--out {out} is a folder: name a file for the model, e.g. {out / 'model.h5'}")
     writable(out.parent, ())

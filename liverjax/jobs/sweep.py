@@ -24,9 +24,11 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 from liverjax.core.versions import versions
+from liverjax.elements.gradients import volume_ratios
 from liverjax.jobs import resumable_parts
 from liverjax.jobs.design import number_of
 from liverjax.mesh.files import meshio_cells
+from liverjax.mesh.tetrahedra import with_points
 from liverjax.scenes.checks.choices import check_choices
 from liverjax.scenes.checks.conflicts import check_motion_in_planes
 from liverjax.scenes.checks.numbers import check_numbers
@@ -36,6 +38,7 @@ from liverjax.scenes.scene_checks import check_physics
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.automatic import with_solver
 from liverjax.simulation.batch import simulate_batch
+from liverjax.simulation.cautions import LEAST_J, MOST_J
 
 #: Outputs that may be stored for every row, from its result and its reference positions (V, 3).
 OUTPUTS: dict[str, Callable] = {
@@ -47,7 +50,7 @@ OUTPUTS: dict[str, Callable] = {
     "final_reactions": lambda result, reference: result.reactions[-1],
     "largest_pressure": lambda result, reference: jnp.max(result.pressure),
 }
-_UNITS = {"final_reactions": "N", "largest_pressure": "Pa"}
+_UNITS = {"final_reactions": "N", "largest_pressure": "Pa", "status": "1", "residual": "1", "volume_ratios": "1"}
 
 
 class Sweep(NamedTuple):
@@ -69,6 +72,7 @@ class Done(NamedTuple):
     file: Path | None  # None: other processes still have chunks to do
     failed: dict[int, int]  # number of the row -> code
     computed: int  # rows, by this process now
+    crushed: dict[int, float]  # number of a row that converged -> its J beyond what a tissue does
 
 
 def read_sweep(
@@ -119,13 +123,13 @@ def read_sweep(
     if only:
         numbers = np.array(sorted(set(only)))
     chunk = min(chunk, len(numbers))
-    own_shapes = ["reference"] if scene.points_are == "loaded" else []
+    more = [*(["reference"] if scene.points_are == "loaded" else []), "volume_ratios"]
     identity = {
         "scene": scene_file.read_text(encoding="utf-8-sig"),
         "numbers": resumable_parts.digest(*jax.tree.leaves(scene)),
         "parameters": resumable_parts.digest(rows) + " " + " ".join(names),
         "rows": resumable_parts.digest(numbers),
-        "outputs": [*outputs, *(f"probe {p}" for p in probes), *own_shapes],
+        "outputs": [*outputs, *(f"probe {p}" for p in probes), *more],
         "chunk": chunk,
         "versions": versions(),
     }
@@ -234,7 +238,16 @@ def _rows(outputs: tuple, probes: tuple, scene: Scene, values: dict[str, jax.Arr
         stored["reference"] = reference
     if probes:
         stored["probes"] = result.positions[:, :, np.array(probes, dtype=int)]
+    ratios = jax.vmap(partial(_volume_ratios, scene), in_axes=(0, 0 if loaded else None, 0))
+    stored["volume_ratios"] = ratios(values, reference, result.positions[:, -1])
     return stored | {"status": result.status, "residual": result.statistics.residual}
+
+
+def _volume_ratios(scene: Scene, values: dict[str, jax.Array], reference: jax.Array | None, x: jax.Array) -> jax.Array:
+    """The least and the greatest J (2,) at positions x (V, 3) [m] of a row."""
+    mesh = with_parameters(scene, values).mesh
+    J = volume_ratios(mesh if reference is None else with_points(mesh, reference), x.astype(mesh.points.dtype))
+    return jnp.stack([jnp.min(J), jnp.max(J)])
 
 
 def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
@@ -252,11 +265,12 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
     try:
         with h5py.File(out) as file:
             identity, codes = json.loads(file.attrs["sweep"]), file["status"][:]
+            J = file["volume_ratios"][:]
     except (OSError, KeyError):
         raise InputError(f"{out} holds no sweep: name another --out, or remove it") from None
     if identity != json.loads(json.dumps(sweep.identity)):
         raise InputError(f"{out} belongs to another sweep: name another --out, or remove it")
-    return Done(out, _failures(sweep, codes), 0)
+    return Done(out, _failures(sweep, codes), 0, _crushed(sweep, codes, J))
 
 
 def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
@@ -267,19 +281,20 @@ def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
             if out.exists():
                 return _already(sweep, out, True)._replace(computed=computed)
             if not all(f.exists() for f in files):
-                return Done(None, {}, computed)
-            codes = _join(sweep, out, files)
+                return Done(None, {}, computed, {})
+            codes, J = _join(sweep, out, files)
     except (InputError, FileNotFoundError):  # another process joins them at this moment
-        return Done(None, {}, computed)
+        return Done(None, {}, computed, {})
     resumable_parts.remove(folder)
-    return Done(out, _failures(sweep, codes), computed)
+    return Done(out, _failures(sweep, codes), computed, _crushed(sweep, codes, J))
 
 
 #: Bytes that HDF5 needs in addition to the datasets.
 _HEADERS = 100_000
 
 
-def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
+def _join(sweep: Sweep, out: Path, files: list[Path]) -> tuple[np.ndarray, np.ndarray]:
+    """Write the whole file; the codes of all rows, and their `volume_ratios`."""
     mesh = sweep.scene.mesh
     needed = (
         sum(f.stat().st_size for f in files) + mesh.points.nbytes + meshio_cells(mesh)[1].nbytes + sweep.rows.nbytes
@@ -293,7 +308,7 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
                 for name, value in part.items():
                     if name not in joined:
                         joined.create_dataset(name, (n, *value.shape[1:]), value.dtype)
-                        joined[name].attrs["unit"] = _UNITS.get(name, "1" if name in ("status", "residual") else "m")
+                        joined[name].attrs["unit"] = _UNITS.get(name, "m")
                     joined[name][_of(sweep, k).start : _of(sweep, k).stop] = value[:]
         joined["row"], joined["parameters"] = sweep.numbers, sweep.rows
         joined["parameters"].attrs["names"] = list(sweep.names)
@@ -304,10 +319,16 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
         joined["reference"].attrs["unit"] = "m"
         joined["tetrahedra"] = meshio_cells(sweep.scene.mesh)[1]
         joined.attrs["sweep"] = json.dumps(sweep.identity)
-        codes = joined["status"][:]
-    return codes
+        return joined["status"][:], joined["volume_ratios"][:]
 
 
 def _failures(sweep: Sweep, codes: np.ndarray) -> dict[int, int]:
     worst = np.where(codes != status.CONVERGED, codes, 0).max(axis=1)
     return {int(sweep.numbers[k]): int(worst[k]) for k in np.flatnonzero(worst != status.CONVERGED)}
+
+
+def _crushed(sweep: Sweep, codes: np.ndarray, J: np.ndarray) -> dict[int, float]:
+    """The J of each row that is beyond `LEAST_J` or `MOST_J` at its end; failed rows are told as such."""
+    J = np.where(J[:, :1] < LEAST_J, J[:, :1], J[:, 1:])[:, 0]
+    beyond = ((J < LEAST_J) | (J > MOST_J)) & np.all(codes == status.CONVERGED, axis=1)
+    return {int(sweep.numbers[k]): float(J[k]) for k in np.flatnonzero(beyond)}

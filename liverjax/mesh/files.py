@@ -51,10 +51,9 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     data = _read_quietly(path)
     order = next((k for k, kind in CELLS.items() if any(block.type == kind for block in data.cells)), None)
     if order is None:
-        kinds = ", ".join(sorted({block.type for block in data.cells})) or "nothing"
-        raise InputError(
-            f"mesh file {path}: it holds {kinds} but no linear or quadratic tetrahedra; export some of 4 or 10 nodes"
-        )
+        kinds = ", ".join(sorted({block.type for block in data.cells}))
+        held = f"{kinds} but no linear or quadratic tetrahedra" if kinds else "no cells"
+        raise InputError(f"mesh file {path}: it holds {held}; export tetrahedra of 4 or 10 nodes")
     cell = CELLS[order]
     blocks = [block.data for block in data.cells if block.type == cell]
     others = sorted({b.type for b in data.cells if b.type != cell and not b.type.startswith(_FLAT_CELLS)})

@@ -10,6 +10,8 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 #: A point counts as inside if its barycentric coordinates are above minus this.
 _INSIDE = 1e-9
+#: Vertices nearer to each other than this part of the body's size are at one place.
+SAME_PLACE = 1e-9
 #: Pieces shorter than this part of the line's length are left out.
 _SHORTEST = 1e-9
 
@@ -21,6 +23,13 @@ class Pieces(NamedTuple):
     line: np.ndarray  # (m,) number of the line
     begin: np.ndarray  # (m,) where on the line, 0 to 1
     end: np.ndarray  # (m,)
+
+
+def doubled_vertices(mesh: TetMesh) -> int:
+    """How many vertices are at the place of another one: parts of a mesh that are not joined there."""
+    points = np.asarray(mesh.points)
+    steps = np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * float(np.ptp(points, axis=0).max())))
+    return mesh.number_of_vertices - len(np.unique(steps, axis=0))
 
 
 def barycentric(mesh: TetMesh, points: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ out. After each term all fields w_m are found anew by least squares. Functions o
 Chebyshev.
 """
 
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,7 +21,8 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, static, struct
 from liverjax.mesh.nodal import nodal_volumes
-from liverjax.scenes.scene import Scene, numbers_at
+from liverjax.scenes.checks.numbers import check_numbers
+from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.simulation.batch import simulate_batch
 
 #: The most parameters, and runs of the grid.
@@ -91,6 +93,8 @@ def separate(
 def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> jax.Array:
     """Displacements (V, 3) [m] at a value of each parameter; may be differentiated, vmapped and jitted.
 
+    A traced value outside of the model's range gives NaN, and so does its derivative.
+
     Raises:
         InputError: a parameter without a value, a value without a parameter, or a value outside of the model's range.
     """
@@ -105,6 +109,8 @@ def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> 
                 f"{name} = {float(value):g} is outside of {float(low):g} to {float(high):g}: make the model with a "
                 "wider range"
             )
+        # Polynomials grow fast outside: both the answer and its derivative must not be taken for one.
+        value = value * jnp.where((low <= value) & (value <= high), 1.0, jnp.nan)
         product = product * (function @ _chebyshev(2 * (value - low) / (high - low) - 1, function.shape[1]))
     return jnp.tensordot(product, model.fields, axes=1)
 
@@ -136,6 +142,13 @@ def _names_and_limits(
             raise InputError(f"{name} is not one number: name one of them, e.g. {name}.0")
         if np.shape(limits) != (2,) or not np.all(np.isfinite(limits)) or not limits[0] < limits[1]:
             raise InputError(f"ranges[{name!r}] = {limits!r} is not a range: give the lowest and the highest value")
+    for corner in itertools.product(*ranges.values()):
+        at = {name: float(value) for name, value in zip(ranges, corner, strict=True)}
+        try:
+            check_numbers(with_parameters(scene, at))
+        except InputError as error:
+            where = ", ".join(f"{name} = {value:g}" for name, value in at.items())
+            raise InputError(f"ranges reach {where}: {error}") from None
     return tuple(ranges), np.array([ranges[name] for name in ranges], float)
 
 

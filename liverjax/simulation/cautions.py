@@ -10,6 +10,7 @@ from liverjax.core import status
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
+from liverjax.mesh.locate import doubled_vertices
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.ligament import Ligament
@@ -33,8 +34,6 @@ LONGEST = 1.0
 SHORTEST = 1e-3
 #: A displacement below this part of the body's size counts as none.
 _ROUNDOFF = 1e-13
-#: Vertices nearer to each other than this part of the body's size are at one place.
-SAME_PLACE = 1e-9
 #: Quality (volume over that of a regular element of the same edges) below which gradients are a hundred times worse.
 SLIVER = 0.01
 #: A soft tissue is about four fifths fluid: below this J its solid alone has no room. MOST_J is the reciprocal.
@@ -49,15 +48,15 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         result: `Result` of its run.
     """
     return [
-        *_of_mesh(scene.mesh),
+        *cautions_of_mesh(scene.mesh),
         *_of_locking(scene),
         *_of_histories(scene, result),
         *_of_stress_at_start(scene, result),
         *_of_growing_motion(scene, result),
         *_of_contacts(scene, result),
-        *_of_friction_alone(scene, result),
         *_of_pressures(scene, result),
         *_of_volumes(scene, result),
+        *_of_friction_alone(scene, result),
     ]
 
 
@@ -68,7 +67,7 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
         scene: `Scene`, not traced.
         about: positions (V, 3) [m] about which it moves; None: the reference shape.
     """
-    said = [*_of_mesh(scene.mesh), *_of_locking(scene)]
+    said = [*cautions_of_mesh(scene.mesh), *_of_locking(scene)]
     if scene.body is None:
         said.append("the scene has no [body], so the motion has no inertia: write density = 1060.0 in [body]")
     inlets = () if scene.porosity is None else scene.porosity.inlet
@@ -118,7 +117,8 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     return f"{said}: take {'order = 2 in [mesh], or a finer mesh' if scene.mesh.order == 1 else 'a finer mesh'}"
 
 
-def _of_mesh(mesh: TetMesh) -> list[str]:
+def cautions_of_mesh(mesh: TetMesh) -> list[str]:
+    """Sentences on the size of the body, nodes that are not joined, and slivers."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     size, quality = float(np.ptp(points, axis=0).max()), qualities(points, tets, np.asarray(mesh.volumes))
     said = []
@@ -126,11 +126,11 @@ def _of_mesh(mesh: TetMesh) -> list[str]:
         said.append(f"the body is {size:.3g} m long: check the mesh's unit, e.g. write unit = 'mm'")
     if size < SHORTEST:
         said.append(f"the body is {size:.3g} m long: check the mesh's unit, e.g. write unit = 'm'")
-    places = np.unique(np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * size)), axis=0)
-    if len(places) < mesh.number_of_vertices:
+    doubled = doubled_vertices(mesh)
+    if doubled:
         said.append(
-            f"{mesh.number_of_vertices - len(places)} nodes are at the place of another node: the body is not joined "
-            "there; merge them if it should be"
+            f"{doubled} nodes are at the place of another node: the body is not joined there; merge them if it should "
+            "be"
         )
     slivers = np.flatnonzero(quality < SLIVER)
     if len(slivers):
@@ -306,8 +306,8 @@ ALTERNATING = 3.0
 def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
     """Whether a static run failed whose body only friction holds: it may have to slide."""
     rough = any(isinstance(physics, RoughObstacle) for physics in scene.physics)
-    failed = np.isin(result.statistics.status, (status.CONVERGED, status.ONE_STEP, status.STALLED), invert=True)
-    if not rough or scene.solve.kind != "static" or not failed.any():
+    fine = (status.CONVERGED, status.ONE_STEP, status.STALLED)
+    if not rough or scene.solve.kind != "static" or np.isin(result.statistics.status, fine).all():
         return []
 
     def without_friction(physics: Physics) -> tuple[np.ndarray, np.ndarray]:
@@ -317,8 +317,8 @@ def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
     if not loose:
         return []
     return [
-        f"the run failed, and only friction holds {loose} against sliding away: if the friction is too small, no state "
-        "of rest exists; take a larger friction, [[fixed]], or kind = 'dynamic'"
+        f"the run failed, and only friction holds {loose} against sliding away: if loads push it sideways and friction "
+        "is too small for them, no state of rest exists; take a larger friction, [[fixed]], or kind = 'dynamic'"
     ]
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Container
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.mesh.locate import doubled_vertices
 from liverjax.physics.base import Physics
 from liverjax.physics.prescribed import free_places
 from liverjax.scenes.scene import Scene, named_physics
@@ -31,7 +32,12 @@ def check_held(scene: Scene) -> None:
     """Refuse a connected piece that nothing holds: a static solution does not exist then."""
     loose = loose_piece(scene, lambda physics: physics.holds(scene.mesh))
     if loose:
-        raise InputError(f"nothing holds {loose} against every rigid motion: add [[fixed]] or kind = 'dynamic'")
+        doubled = doubled_vertices(scene.mesh)
+        split = (
+            f"merge the {doubled} nodes that are at the place of another one, if the mesh should be joined there, or "
+        )
+        remedy = f"{split if doubled else ''}add [[fixed]] or kind = 'dynamic'"
+        raise InputError(f"nothing holds {loose} against every rigid motion: {remedy}")
 
 
 def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.ndarray]]) -> str:
