@@ -249,7 +249,7 @@ def through_torsion(
     at = BestPoint("torsion", found, storage, loss, advice)
     fit = fit_at(sweep, at, kind, (running, compiling + pressing), details)
     if simulation.is_linear and kind.prior is None:
-        fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
+        fit = fit._replace(uncertainty=_with_biases(fit, (rig, law, data[2], scales), simulation))
     return _as_told_before(with_alike_points(fit, sweep) if INDEPENDENT in start.details else fit, start)
 
 
@@ -276,10 +276,10 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     At small strain both follow from moduli without a mesh: by the recursion, and in continuous time. Those of a
     compressed sample come from quadratic elements, whose own error is the share of the mesh (`glued_compression`).
     """
-    law, omega, scales = data
+    rig, law, omega, scales = data
     scaled, prony = law_and_prony(fit.kind.maxwell(fit.solution.u), law, simulation)
     if simulation.precompression:
-        meshless, exact = _of_held(scaled, prony, omega, simulation)
+        meshless, exact = _of_held(rig, (scaled, prony), omega, simulation)
     else:
         program = compiled(partial(_of_no_mesh, steps=simulation.steps), scaled, prony, omega, short=True)
         meshless, exact = (np.asarray(G) for G in program(scaled, prony, omega))
@@ -302,11 +302,13 @@ def _of_no_mesh(law: laws.Law, prony: Prony, omega: jax.Array, steps: int) -> tu
     return torsion.linear_moduli(law, prony, omega, steps), torsion.linear_moduli(law, prony, omega, None)
 
 
-def _of_held(law: laws.Law, prony: Prony, omega: jax.Array, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
+def _of_held(
+    rig: torsion.Rig, material: tuple[laws.Law, Prony], omega: jax.Array, simulation: Simulation
+) -> tuple[np.ndarray, np.ndarray]:
     """Complex moduli (n,) of a compressed sample, with what the meshes of `_without_mesh` may still miss: by the
     recursion, and in continuous time.
     """
-    rig = rig_of(simulation)
+    law, prony = material
     of, moduli = jax.jit(torsion.held)(rig, law), jax.jit(torsion.held_moduli, static_argnums=4)
     recursion, exact = (np.asarray(moduli(of, rig, prony, omega, steps)) for steps in (simulation.steps, None))
     _, missed = _without_mesh(simulation.radius, simulation.height, simulation.law, simulation.precompression)

@@ -475,7 +475,7 @@ def _compression(fits: list[Fit]) -> list[str]:
     return [
         f"numbers describe the sample before it was compressed by {100 * one['strain']:.3g} % from "
         f"{one['height_at_rest_m']:.4g} m (law {one['law']}, K / G {one['bulk_over_shear_modulus']:.3g}{if_kept})",
-        f"axial force after relaxation, to be compared with the instrument's: {forces}",
+        f"axial force after relaxation, with all known errors, to be compared with the instrument's: {forces}",
     ]
 
 

@@ -115,6 +115,19 @@ def _refuse_directions(law: Law) -> None:
         )
 
 
+def load_steps(strain: float) -> int:
+    """Number of load steps of a compression."""
+    return max(1, int(np.ceil(strain / _STEP)))
+
+
+def too_far(strain: float) -> InputError:
+    """The refusal of a strain at which the simulation of glued plates fails."""
+    return InputError(
+        f"--precompression {strain:g}: the simulated sample could not be compressed so far; give less, or --method "
+        "closed-form, whose plates are smooth"
+    )
+
+
 def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
     """The rig with its sample compressed by `strain` and held, before it turns.
 
@@ -142,12 +155,9 @@ def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
         law=law,
         fixed=(lj.Fixed(nodes=jnp.arange(rig.bottom)),),
         displaced=(lj.Displaced(nodes=jnp.arange(n - rig.top, n), by=jnp.array([0.0, 0.0, -strain * rig.height])),),
-        solve=lj.Solve(steps=max(1, int(np.ceil(strain / _STEP))), tolerance=1e-11),
+        solve=lj.Solve(steps=load_steps(strain), tolerance=1e-11),
     )
     result = lj.simulate(scene)
     if np.any(np.asarray(result.status) != 0):
-        raise InputError(
-            f"--precompression {strain:g}: the simulated sample could not be compressed so far; give less, or "
-            "--method closed-form, whose plates are smooth"
-        )
+        raise too_far(strain)
     return replace(rig, held=result.positions[-1], height=gap)

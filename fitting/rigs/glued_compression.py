@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import liverjax as lj
-from liverjax.core.errors import InputError
+from fitting.rigs.compression import load_steps, too_far
 from liverjax.core.struct import replace
 from liverjax.laws import Law
 from liverjax.mesh import cylinders
@@ -32,8 +32,6 @@ ORDER = 0.75
 LARGEST = 0.34
 #: Corners of the polygon in place of the circle.
 CORNERS = 16
-#: Largest strain of one load step.
-_STEP = 0.05
 
 
 class Glued(NamedTuple):
@@ -67,10 +65,7 @@ def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Gl
         if fine is not None and coarse is not None:
             change = [(a - b) / (COARSER**ORDER - 1) for a, b in zip(fine, coarse, strict=True)]
             return Glued(*(a + d for a, d in zip(fine, change, strict=True))), Glued(*change)
-    raise InputError(
-        f"--precompression {strain:g}: the simulated sample could not be compressed so far; give less, or --method "
-        "closed-form, whose plates are smooth"
-    )
+    raise too_far(strain)
 
 
 def _quarter(radius: float, height: float, rim: float, coarser: float) -> lj.TetMesh:
@@ -107,10 +102,8 @@ def _on_mesh(mesh: lj.TetMesh, radius: float, law: Law, strain: float) -> Glued 
             solve=solve,
         )
 
-    steps = max(1, int(np.ceil(strain / _STEP)))
-    pressed = lj.simulate(
-        scene(("y", "x", "xy"), -strain * height, lj.Solve(steps=steps, tolerance=1e-9, volumetric="element"))
-    )
+    solve = lj.Solve(steps=load_steps(strain), tolerance=1e-9, volumetric="element")
+    pressed = lj.simulate(scene(("y", "x", "xy"), -strain * height, solve))
     if np.any(np.asarray(pressed.status) != 0):
         return None
     x, force = pressed.positions[-1], 4 * np.asarray(pressed.reactions[-1])[top]

@@ -87,9 +87,10 @@ def _of_crushed(rows: dict[int, float]) -> list[str]:
         return []
     worst = max(rows, key=lambda row: abs(math.log(max(rows[row], 1e-300))))
     named = ", ".join(map(str, list(rows)[:20])) + (", …" if len(rows) > 20 else "")
+    how_many = f"{len(rows)} row{'s' if len(rows) > 1 else ''} ({named}; worst: row {worst}, J = {rows[worst]:.2g})"
     return [
-        f"in {len(rows)} rows elements end below a fifth or above five times their volume ({named}; worst: row "
-        f"{worst}, J = {rows[worst]:.2g}), which no tissue does: take a stiffer bulk modulus or smaller loads"
+        f"elements end below a fifth or above five times their volume in {how_many}, which no tissue does: take a "
+        "stiffer bulk modulus or smaller loads"
     ]
 
 

@@ -264,12 +264,11 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
         raise InputError(f"{out} is there already: name another --out, or remove it")
     try:
         with h5py.File(out) as file:
-            identity, codes = json.loads(file.attrs["sweep"]), file["status"][:]
-            J = file["volume_ratios"][:]
+            if json.loads(file.attrs["sweep"]) != json.loads(json.dumps(sweep.identity)):
+                raise InputError(f"{out} belongs to another sweep: name another --out, or remove it")
+            codes, J = file["status"][:], file["volume_ratios"][:]
     except (OSError, KeyError):
         raise InputError(f"{out} holds no sweep: name another --out, or remove it") from None
-    if identity != json.loads(json.dumps(sweep.identity)):
-        raise InputError(f"{out} belongs to another sweep: name another --out, or remove it")
     return Done(out, _failures(sweep, codes), 0, _crushed(sweep, codes, J))
 
 

@@ -299,10 +299,6 @@ def _of_contacts(scene: Scene, result: Result) -> list[str]:
     return said
 
 
-#: Times by which changes of the pressure from step to step exceed those over two steps if a scheme is unstable.
-ALTERNATING = 3.0
-
-
 def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
     """Whether a static run failed whose body only friction holds: it may have to slide."""
     rough = any(isinstance(physics, RoughObstacle) for physics in scene.physics)
@@ -320,6 +316,10 @@ def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
         f"the run failed, and only friction holds {loose} against sliding away: if loads push it sideways and friction "
         "is too small for them, no state of rest exists; take a larger friction, [[fixed]], or kind = 'dynamic'"
     ]
+
+
+#: Times by which changes of the pressure from step to step exceed those over two steps if a scheme is unstable.
+ALTERNATING = 3.0
 
 
 def _of_pressures(scene: Scene, result: Result) -> list[str]:
