@@ -2,7 +2,6 @@
 
 import json
 from functools import partial
-from types import SimpleNamespace
 
 import h5py
 import jax
@@ -14,7 +13,6 @@ import liverjax as lj
 from fitting.__main__ import main
 from fitting.fits import field, inclusion, scene_numbers
 from fitting.methods import prior
-from fitting.methods.estimate import Estimate, bias_sentences
 from fitting.readers import displacements
 from fitting.reports import field_report
 from liverjax.core.struct import replace
@@ -387,29 +385,6 @@ def test_few_numbers_of_several_scenes(problem):
     assert found.standard_errors[0] < 20
 
 
-def test_chance_in_the_residuals_of_a_map_is_no_warning():
-    """Of 240 components chi2 is 1 +- 0.09 each."""
-    for chi2, told in ((1.01, False), (1.25, False), (1.3, True)):
-        found = SimpleNamespace(reached=False, chi2=240 * chi2, components=240)
-        assert (field_report.noise_sentence(found) is not None) == told
-
-
-def test_a_fit_that_misses_the_data_says_so():
-    found = Estimate(
-        ("law.mu",), np.ones(1), np.ones((1, 1)), np.ones(1), np.ones((1, 1)), 90.0, 60, 1.0, 59.0, 3, True
-    )
-    assert field_report.misfit_sentence(found._replace(chi2=89.0)) is None
-    said = field_report.misfit_sentence(found._replace(chi2=0.6))  # a noise in millimetres
-    assert said is not None and "scatter 0.1 times as much as the stated noise" in said
-    said = field_report.misfit_sentence(found._replace(chi2=240.0))
-    assert said is not None and "chi2 stays at 4 per component" in said and "by 2 times their noise" in said
-    assert field_report.of_numbers(found._replace(chi2=240.0))["warnings"] == [said] and "the mesh's error" not in said
-    said = field_report.misfit_sentence(found._replace(chi2=240.0, mesh_over_noise=3.0))
-    assert said is not None and "the mesh's error in the data is 3 times the noise: refine the mesh" in said
-    said = field_report.misfit_sentence(found._replace(chi2=240.0, standard_errors=np.array([np.inf])))
-    assert said is not None and said.startswith("no values of law.mu explain the displacements")
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the mesh moves")
 def test_viscosity_from_a_time_series(tmp_path):
@@ -503,30 +478,3 @@ def test_a_sphere_is_found_where_it_is():
     true = [*np.asarray(centre), 0.016, 800.0, 2400.0]
     assert np.all(np.abs(found.values - true) < 5 * found.standard_errors), (values, found.standard_errors)
     assert 0.5 < found.chi2 / found.components < 1.5
-
-
-@pytest.mark.parametrize(
-    ("sd", "bias", "level", "mesh"),
-    [
-        ([3.0, 3.4], [0.46, 0.1], True, None),  # a bar that is only moved: the mesh was blamed, and nothing else said
-        ([0.05, 3.0], [0.04, 0.46], False, None),
-        ([0.05, 0.6], [0.5, 0.1], False, "by a third or more"),
-        ([0.05, 0.6], [0.1, 0.5], False, "by up to 10%"),
-        ([0.05, 0.6], [0.1, 0.1], False, "at 50% of the nodes"),
-    ],
-)
-def test_a_map_whose_level_is_open_says_so_and_the_mesh_is_blamed_for_its_own_share(sd, bias, level, mesh):
-    found = SimpleNamespace(sd=np.array(sd), mesh_bias=np.array(bias))
-    assert (field.level_sentence(found) is not None) == level
-    said = field.bias_sentence(found)
-    assert said is None if mesh is None else mesh in said
-
-
-def test_numbers_that_no_mesh_determines_are_not_blamed_on_the_mesh():
-    """Two moduli in series, only moved: 938 ± 7e9, and the sentence was to refine the mesh."""
-    found = {"names": ("mu", "law.mu"), "values": np.array([938.0, 2900.0]), "mesh_bias": np.array([2e3, 3e3])}
-    (said,) = bias_sentences(SimpleNamespace(**found, standard_errors=np.array([7e9, 1e10])))
-    assert said.startswith("the data do not determine mu, law.mu") and "refine" not in said
-    (said,) = bias_sentences(SimpleNamespace(**found, standard_errors=np.array([10.0, 10.0])))
-    assert "by a third or more" in said
-    assert bias_sentences(SimpleNamespace(**found, standard_errors=np.array([5e3, 5e3]))) == []
