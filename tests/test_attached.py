@@ -264,6 +264,10 @@ def test_a_vessel_stiffens_as_one_of_elements(verified):
             "radius one number",
         ),
         ({"line": [[0, 0, 0], [0, 0, 10**400]], "radius": 1, "law": {"name": "neo_hookean", "mu": 1e5}}, "needs line"),
+        (
+            {"line": [[0, 0, 0], [0, 0, np.nan]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}},
+            "one number or one each, all of them finite",
+        ),
         ({"line": [[0, 0, 0]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}}, "two points or more"),
         (
             {"line": [[0, 0, 0]] * 2, "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}},

@@ -325,8 +325,8 @@ def test_stable_ranges_of_known_laws():
     [
         ("neo_hokean", "did you mean neo_hookean"),
         ("nothing.py:Law", "is not a file"),
-        ("mine.py", "names no law"),
-        ("mine.py:Lew", "use Law"),
+        ("mine.py", "mine.py names a file, and no law in it: use mine.py:Law"),
+        ("mine.py:Lew", "use mine.py:Law"),
         ("mine.py:number", "is not a law"),
         ("mine.py:Bare", "write @liverjax.struct"),
         ("mine.py:NoTypical", "parameter mu has no typical value"),
@@ -352,6 +352,8 @@ def test_plot_draws_laws(tmp_path, capsys):
     assert (tmp_path / "laws.png").stat().st_size > 10_000
     assert main(["plot", "yeoh", "--stretch", "1.2", "1.6", "--out", str(tmp_path)]) == 2
     assert "not a range about 1" in capsys.readouterr().err
+    assert main(["plot", "yeoh", "--step", "2", "--out", str(tmp_path)]) == 2
+    assert "--step is for results, not for yeoh" in capsys.readouterr().err
 
 
 def test_laws_lists_every_law(capsys):

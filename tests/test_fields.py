@@ -171,9 +171,14 @@ def test_a_field_of_a_result_is_drawn(tmp_path, capsys):
         (["--field", "energy"], "has no field 'energy'"),
         (["--step", "3"], "--step 3 is not in"),
         (["yeoh"], "draw it alone"),
+        (["--stretch", "0.9", "1.1"], "--stretch is for laws, not for"),
     ):
         assert main(["plot", str(file), *more, "--out", str(tmp_path)]) == 2
         assert words in capsys.readouterr().err
+    with h5py.File(tmp_path / "reduced.h5", "w") as out:
+        out["modes"] = np.zeros((2, 4, 3))
+    assert main(["plot", str(tmp_path / "reduced.h5")]) == 2
+    assert "holds a reduced model: run it" in capsys.readouterr().err
     (tmp_path / "other.h5").write_text("no")
     assert main(["plot", str(tmp_path / "other.h5")]) == 2
     assert "is not a result of liverjax simulate" in capsys.readouterr().err

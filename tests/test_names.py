@@ -31,7 +31,7 @@ def test_what_is_put_is_got(name, value):
         ("0.volumetric", "no: use one of mu, bulk"),
         ("1.mu.2", "no: '2' leads nowhere: it has places 0 to 1"),
         ("2.mu", "no: '2' leads nowhere: it has places 0 to 1"),
-        ("mu", "no: 'mu' leads nowhere: it has places 0 to 1"),
+        ("mu", "no: did you mean 0.mu or 1.mu?"),
         ("0.mu.0", "no: '0' leads nowhere"),
         ("", "no: '' leads nowhere: it has places 0 to 1"),
     ],

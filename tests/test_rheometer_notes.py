@@ -30,6 +30,18 @@ def test_viscosities_are_named_as_not_read(tmp_path):
         read_sweep(_write(tmp_path, "frequency_Hz,complex viscosity (Pa.s),tan(delta)\n1,9,0.1\n2,8,0.1\n"))
 
 
+def test_two_units_that_tear_the_moduli_apart_are_told(tmp_path):
+    rows = "0.1,900,100\n1,1000,200\n10,1200,300\n"
+    told = {}
+    for storage, loss in (("kPa", "Pa"), ("Pa", "kPa"), ("kPa", "kPa")):
+        notes = read_sweep(_write(tmp_path, f"Frequency (Hz),G' ({storage}),G'' ({loss})\n{rows}")).notes
+        told[storage, loss] = [n for n in notes if "if both are in one unit" in n]
+    assert "is in kPa" in told["kPa", "Pa"][0] and "5e+03 times" in told["kPa", "Pa"][0] and told["Pa", "kPa"]
+    elastic = "".join(f"{row.rpartition(',')[0]},1\n" for row in rows.splitlines())  # a spring: one unit or two
+    assert not told["kPa", "kPa"]
+    assert not read_sweep(_write(tmp_path, f"Frequency (Hz),G' (kPa),G'' (kPa)\n{elastic}")).notes
+
+
 @pytest.mark.parametrize("bad", ["-90", "0", "nan", "1e200"])
 def test_unusable_points_are_left_out_and_named(tmp_path, bad):
     rows = "0.01,200,20\n" + ROWS.replace("90", bad)

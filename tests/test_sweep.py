@@ -370,6 +370,10 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("law.mu\nnan\n", "row 1, law.mu = 'nan' is not a finite number"),
         ("law.mu\n700\n-1\n", "row 2: .*mu = -1"),
         ("law.nu\n700\n", "did you mean mu"),
+        ("mu\n700\n", "did you mean law.mu?"),
+        ("Law.mu\n700\n", "did you mean law.mu?"),
+        ("law.mu [Pa]\n700\n", "did you mean law.mu?"),
+        ("law.mu,\n700,\n", "column 2 has no name"),
         ("mesh.points.0\n700\n", "'mesh.points.0' is a list in the scene file"),
         ("mesh.points.0.1\n700\n", "only all points can change"),
         ("mesh.cells.0\n3\n", "of a mesh only all points can change"),
@@ -417,6 +421,7 @@ def test_designs(files, kind, rows):
     table = files / "design.csv"
     ranges = ["law.mu=500:1000", "body.density=1000:1100"]
     assert main(["design", str(table), *ranges, "--kind", kind, "--rows", str(rows), "--seed", "3"]) == 0
+    assert table.read_text().startswith("# grid\n" if kind == "grid" else f"# {kind}, seed 3\n")
     names, found = sweep.read_table(table)
     assert names == ("law.mu", "body.density") and found.shape == (rows, 2)
     assert (found.min(axis=0) >= [500, 1000]).all() and (found.max(axis=0) <= [1000, 1100]).all()

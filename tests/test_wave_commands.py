@@ -9,7 +9,7 @@ from test_waves import DENSITY, HERTZ, H, modulus, organ, plane_waves
 
 from fitting import __main__ as command
 from fitting.readers import rheometer
-from fitting.reports import waves_report
+from fitting.reports.waves import report
 from fitting.waves import (
     balance,
     elastography,
@@ -168,18 +168,18 @@ def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
     whole = {name: values.tolist() for name, values in part.items()}
     content = {"frequencies_Hz": hertz.tolist(), "whole": whole, "regions": None}
     field = plane_waves((5, 5, 5))._replace(frequencies=hertz)
-    files = waves_report._sweeps(tmp_path, elastography.Organ(field, None, None, None, DENSITY), content)
+    files = report._sweeps(tmp_path, elastography.Organ(field, None, None, None, DENSITY), content)
     sweep = rheometer.read_sweep(files["whole"])
     np.testing.assert_allclose(sweep.angular_frequency, 2 * np.pi * hertz)
     np.testing.assert_allclose(sweep.storage_sd, part["error_storage_Pa"])
-    springpots, told = waves_report._springpots(files)
+    springpots, told = report._springpots(files)
     assert springpots is not None and told == []
     found = springpots["whole"]
     assert found["model"] == "fractional_kelvin_voigt" and found["mean_relative_error"] < 1e-3
     truth = {"equilibrium_modulus": 2000.0, "springpot": 1500 * 400**-0.4, "exponent": 0.4}
     assert found["numbers"] == pytest.approx(truth, rel=1e-5)
     assert set(found["standard_errors"]) == set(truth) and all(e > 0 for e in found["standard_errors"].values())
-    assert waves_report._springpots({}) == (None, [])
+    assert report._springpots({}) == (None, [])
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from experiments.sources import cylinders_in_waves
-from fitting.reports import waves_report
+from fitting.reports.waves import cautions, maps, report
 from fitting.waves import balance, edge_places, edges, elastography, regions, stiffness_map, voxels
 from fitting.waves.wave_field import WaveField
 
@@ -142,7 +142,7 @@ def test_labels_whose_edges_cut_every_element():
 
 
 def test_a_region_without_an_error_has_its_row_in_the_table():
-    assert [waves_report._error_cell(x) for x in (None, 12.345)] == ["unknown", "12"]
+    assert [report._error_cell(x) for x in (None, 12.345)] == ["unknown", "12"]
 
 
 def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
@@ -245,10 +245,7 @@ def test_intervals_of_a_map_hold_the_truth_beside_edges():
     own = organ_of(field)
     found = elastography.regions_of(own._replace(field=field._replace(labels=None)))
     drawn = stiffness_map.map_of(elastography.problem_of_map(own, found, 0.008), draws=0)
-    at = [
-        waves_report.at_voxels(own, value)
-        for value in (drawn.modulus[0], drawn.sd[0], drawn.posterior_sd[0] * (1 + 1j))
-    ]
+    at = [maps.at_voxels(own, value) for value in (drawn.modulus[0], drawn.sd[0], drawn.posterior_sd[0] * (1 + 1j))]
     G, sds, known = at[0], at[1:], np.isfinite(at[0].real)
     off = np.abs(G.real - np.where(field.labels == 2, STIFF, SOFT))[known]
     held = [np.mean(off < 1.645 * stiffness_map.sd_of_modulus(G, sd).real[known]) for sd in sds]
@@ -311,5 +308,5 @@ def test_a_region_that_says_nothing_is_told():
     own = organ_of(field._replace(labels=labels))
     found = elastography.regions_of(own)
     assert np.all(np.isfinite(found.parts.modulus))
-    told = waves_report._cautions(own, found, None)
+    told = cautions.cautions_of_elastography(own, found, None)
     assert any("region 9: its standard error" in one for one in told) and not any("region 2" in one for one in told)

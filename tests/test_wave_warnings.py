@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_waves import DENSITY, HERTZ, H, plane_waves
 
-from fitting.reports import waves_report
+from fitting.reports.waves import cautions, report
 from fitting.waves import (
     elastography,
     wave_field,
@@ -31,7 +31,7 @@ def test_columns_of_the_table_stay_apart_where_nothing_fits():
     own |= {key: [1.0] for key in ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")}
     direct = {"whole": {"storage_Pa": [None], "loss_Pa": [None]}}
     blank = {"regions": None, "springpots": None, "map": None, "frequencies_Hz": [60.0]}
-    assert waves_report.table({"whole": own, "direct_inversion": direct, **blank}).split()[-3:] == [
+    assert report.table({"whole": own, "direct_inversion": direct, **blank}).split()[-3:] == [
         "7.8",
         "2.7e+11",
         "none",
@@ -41,13 +41,13 @@ def test_columns_of_the_table_stay_apart_where_nothing_fits():
 def test_a_frequency_of_noise_alone_is_named_and_a_number_at_its_bound():
     field = plane_waves((9, 9, 9))
     size = float(np.sqrt(np.mean(np.abs(field.displacement[0]) ** 2) / 2))
-    assert not waves_report._of_no_motion(field._replace(noise=np.array([0.05 * size])), 0)
-    (said,) = waves_report._of_no_motion(field._replace(noise=np.array([0.98 * size])), 0)
+    assert not cautions._of_no_motion(field._replace(noise=np.array([0.05 * size])), 0)
+    (said,) = cautions._of_no_motion(field._replace(noise=np.array([0.98 * size])), 0)
     assert "are hardly larger than their noise" in said and said.endswith("leave this frequency out")
     own = {"numbers": {"exponent": 1.0, "springpot": 2.0}, "standard_errors": {"exponent": None, "springpot": 0.1}}
     blank = {"regions": None, "map": None, "frequencies_Hz": [], "whole": {}, "direct_inversion": {"whole": {}}}
     spring = {"whole": own | {"model": "springpot", "frequencies": 3, "mean_relative_error": 0.043}}
-    last = waves_report.table(blank | {"springpots": spring}).splitlines()[-1]
+    last = report.table(blank | {"springpots": spring}).splitlines()[-1]
     assert "4.3 % off on average: exponent = 1 (at its bound), springpot = 2 ± 0.1" in last
 
 
@@ -56,7 +56,7 @@ def test_a_springpot_that_misses_the_moduli_is_told(tmp_path):
     rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
     rows += ["50,3200,600,17,17", "75,2500,1900,17,17", "100,3800,300,17,17"]
     (tmp_path / "s.csv").write_text("\n".join(rows) + "\n")
-    _, told = waves_report._springpots({"whole": tmp_path / "s.csv"})
+    _, told = report._springpots({"whole": tmp_path / "s.csv"})
     assert any("misses the moduli over the frequencies by" in w for w in told)
 
 
@@ -101,7 +101,7 @@ def test_scales_that_no_tissue_has_are_told(moduli, words):
     G = np.array(moduli)[:, None]
     own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array([50.0, 75.0])), density=DENSITY)
     found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
-    said = waves_report._of_scales(own, found)
+    said = cautions._of_scales(own, found)
     assert len(said) == bool(words) and all(words in s for s in said)
 
 
@@ -120,7 +120,7 @@ def test_frequencies_in_radians_are_told(hertz, told):
     G = np.array([123e3 + 27e3j, 129e3 + 29e3j])[:, None]
     own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array(hertz)), density=DENSITY)
     found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
-    said = waves_report._of_scales(own, found)
+    said = cautions._of_scales(own, found)
     assert [s.startswith("the frequencies") and "if they are in rad/s" in s for s in said] == [True] * told
 
 
@@ -131,7 +131,7 @@ def test_moduli_that_no_springpot_has_are_written_all_the_same(tmp_path):
         "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa\n"
         "40,3000,-30,24,22\n60,3000,4,9,8\n80,3000,1,5,4\n"
     )
-    found, told = waves_report._springpots({"whole": file})
+    found, told = report._springpots({"whole": file})
     assert found == {} and len(told) == 1 and told[0].startswith("whole: no springpot is fitted over the frequencies")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
-from fitting.reports import waves_report
+from fitting.reports.waves import cautions
 from fitting.waves import (
     balance,
     direct_inversion,
@@ -292,7 +292,7 @@ def test_errors_of_smoothed_noise_hold_the_truth(width):
         G, error = found.whole.modulus[0, 0], found.whole.standard_errors[0, 0]
         z = G * (1 - found.mesh_bias[0]) - (3000 + 900j)
         off += [z.real / error.real, z.imag / error.imag]
-        told = any("share their residuals" in s for s in waves_report._cautions(own, found, None))
+        told = any("share their residuals" in s for s in cautions.cautions_of_elastography(own, found, None))
         factor = found.whole.noise_factor[0, 0]
         assert told == bool(width) and (factor > 3 if width else factor < 1.2)
     assert np.sqrt(np.mean(np.square(off))) < 1.8  # six numbers: 1 with a deviation of 0.29
@@ -327,7 +327,7 @@ def test_moduli_that_long_waves_leave_open_have_an_interval_of_their_own(small):
             modulus=np.full((2, 1), G + 0j), covariance=np.tile(error**2 * np.eye(2), (2, 1, 1)), correlations=()
         )
         own = own._replace(chi2=np.full(2, float(own.components)))
-        return waves_report._of_long_waves(60.0, found._replace(whole=own), 0)
+        return cautions._of_long_waves(60.0, found._replace(whole=own), 0)
 
     (sentence,) = told(e)
     low, high = 1 / (1 / G + 2 * e / G**2), 1 / (1 / G - 2 * e / G**2)
@@ -339,10 +339,10 @@ def test_waves_of_the_other_sign_are_told(small):
     """Conjugate waves, of exp(-i omega t), have the modulus of a solid that gains energy."""
     field = small.field._replace(displacement=np.conj(small.field.displacement))
     other = elastography.organ_of(field, elastography.body_of(field), DENSITY)
-    assert not waves_report._sign(small, elastography.regions_of(small))
-    (told,) = waves_report._sign(other, elastography.regions_of(other))
+    assert not cautions._sign(small, elastography.regions_of(small))
+    (told,) = cautions._sign(other, elastography.regions_of(other))
     assert "loss modulus is negative at 60 Hz, 100 Hz" in told and "complex conjugate" in told
     # One modulus for two materials may have any loss: those of the regions count.
     found = elastography.regions_of(small)
     uniform = found.whole._replace(modulus=np.conj(found.whole.modulus))
-    assert not waves_report._sign(small, found._replace(whole=uniform, parts=found.whole, labels=np.array([1])))
+    assert not cautions._sign(small, found._replace(whole=uniform, parts=found.whole, labels=np.array([1])))

@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.common import either, plt, save
 from experiments.sources import cylinders_in_waves
-from fitting.reports import waves_report
+from fitting.reports.waves import maps
 from fitting.waves import direct_inversion, elastography, stiffness_map
 from fitting.waves.wave_field import WaveField, noise_of
 
@@ -77,10 +77,10 @@ def measured() -> tuple[WaveField, np.ndarray]:
 def held(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Whether the true storage and loss modulus are in the 90 % interval (2, F, known voxels), and those voxels' (n, 2)
     places [m]."""
-    sds, out = [waves_report.at_voxels(organ, own) for own in drawn.sd], []
+    sds, out = [maps.at_voxels(organ, own) for own in drawn.sd], []
     known = np.isfinite(sds[0])
     for f, hertz in enumerate(HERTZ):
-        G = waves_report.at_voxels(organ, drawn.modulus[f])
+        G = maps.at_voxels(organ, drawn.modulus[f])
         exact = SOFT + (STIFF - SOFT) * part + 2j * np.pi * hertz * VISCOSITY
         off, allowed = (G - exact)[known], 1.645 * stiffness_map.sd_of_modulus(G, sds[f])[known]
         out.append((np.abs(off.real) < allowed.real, np.abs(off.imag) < allowed.imag))
@@ -104,13 +104,13 @@ def covered(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.nd
 
 def rows_of(organ, found, drawn, usual) -> list[dict]:
     """A row a cylinder and one for the plate: by regions, by the map, by direct inversion."""
-    rows, every = [], [waves_report.at_voxels(organ, own) for own in drawn.sd]
+    rows, every = [], [maps.at_voxels(organ, own) for own in drawn.sd]
     for k, label in enumerate(found.labels):
         place = organ.field.labels == label
         place[:, :, [0, -1]] = False
         core = place & np.isfinite(every[0])
-        maps = [waves_report.at_voxels(organ, G)[core] for G in drawn.modulus]
-        sds = [stiffness_map.sd_of_modulus(G, sd[core]).real for G, sd in zip(maps, every, strict=True)]
+        moduli = [maps.at_voxels(organ, G)[core] for G in drawn.modulus]
+        sds = [stiffness_map.sd_of_modulus(G, sd[core]).real for G, sd in zip(moduli, every, strict=True)]
         rows.append(
             {
                 "radius_m": None if label == 1 else CYLINDERS[label - 2][1],
@@ -119,7 +119,7 @@ def rows_of(organ, found, drawn, usual) -> list[dict]:
                 "loss_Pa": found.parts.modulus[:, k].imag.tolist(),
                 "standard_error_Pa": found.parts.standard_errors[:, k].real.tolist(),
                 "edges_farther_out_voxels": found.parts.farther[:, k].tolist(),
-                "map_median_Pa": [float(np.median(G.real)) for G in maps],
+                "map_median_Pa": [float(np.median(G.real)) for G in moduli],
                 "map_sd_Pa": [float(np.median(sd)) for sd in sds],
                 "direct_median_Pa": [float(np.nanmedian(G.real[place])) for G in usual],
             }
@@ -154,7 +154,7 @@ def main() -> None:
         "covered_90": covered(organ, drawn, part),
         "rows": rows,
     }
-    figure = waves_report.maps_picture(organ, drawn, usual)
+    figure = maps.maps_picture(organ, drawn, usual)
     for axes in figure.axes[:4]:
         for c, r in CYLINDERS:
             place = 1e3 * (np.array(c) - field.origin[:2] + VOXEL / 2)

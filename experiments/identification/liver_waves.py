@@ -15,7 +15,7 @@ import numpy as np
 
 import liverjax as lj
 from experiments.common import ROOT, either, save
-from fitting.reports import waves_report
+from fitting.reports.waves import maps
 from fitting.waves import direct_inversion, elastography, stiffness_map
 from fitting.waves.wave_field import WaveField, noise_of
 from liverjax.mesh import locate
@@ -130,7 +130,7 @@ def main() -> None:
     by_regions = time.perf_counter() - begin
     drawn = stiffness_map.map_of(elastography.problem_of_map(organ, found, 4 * VOXEL))
     usual = direct_inversion.invert(organ.field, DENSITY)
-    G, known = waves_report.at_voxels(organ, drawn.modulus[0]), np.isfinite(waves_report.at_voxels(organ, drawn.sd[0]))
+    G, known = maps.at_voxels(organ, drawn.modulus[0]), np.isfinite(maps.at_voxels(organ, drawn.sd[0]))
     core, liver = known & (part == 1), known & (part == 0) & organ.field.mask
     data = {
         "hertz": HERTZ,
@@ -158,7 +158,7 @@ def main() -> None:
         ],
     }
     print(data, flush=True)
-    figure = waves_report.maps_picture(organ, drawn, usual)
+    figure = maps.maps_picture(organ, drawn, usual)
     save("liver_waves", data, figure)
 
 

@@ -39,7 +39,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     Raises:
         InputError: no table with a strain, moduli of tension, several frequencies, too few points.
     """
-    found = [t for t in tables_of(str(path), text_of(path).splitlines()) if "strain" in t.raw]
+    found = [t for t in tables_of(str(path), text_of(path, "a strain sweep").splitlines()) if "strain" in t.raw]
     if not found:
         raise InputError(f"{path}: no table has a column strain in % or 1: add it")
     place, notes = choose_table(str(path), found, table, "strains", lambda t: len(np.unique(t.raw["strain"])))

@@ -61,7 +61,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 def run(options: argparse.Namespace) -> int:
     """Find moduli; exit code 1 if a fit did not converge."""
     _check_waves(options)
-    from fitting.reports import waves_report
+    from fitting.reports.waves import report
     from fitting.waves import direct_inversion, elastography, stiffness_map, wave_field
 
     field = wave_field.read_waves(
@@ -84,8 +84,8 @@ def run(options: argparse.Namespace) -> int:
             problem = elastography.problem_of_map(organ, found, length)
             drawn = stiffness_map.map_of(problem, file, options.resume, options.samples, told)
     usual = direct_inversion.invert(organ.field, options.density)
-    content = waves_report.write(options.out, organ, found, drawn, usual)
-    print(waves_report.table(content))
+    content = report.write(options.out, organ, found, drawn, usual)
+    print(report.table(content))
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     files = FILES[:4] if drawn is not None else FILES[:2]

@@ -23,7 +23,7 @@ from fitting.readers.tables.sweep_tables import Table, choose_table, tables_of
 from fitting.readers.tables.text_tables import split_line as split_line
 from fitting.readers.tables.text_tables import text_of
 from fitting.readers.tables.text_tables import to_number as to_number
-from fitting.readers.units import celsius
+from fitting.readers.units import MODULUS_UNITS, celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
@@ -98,6 +98,25 @@ def _below_zero(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -
     ]
 
 
+#: Ratio of G' and G'' [1], or its inverse, that no tissue and few materials reach.
+FAR_APART = 100.0
+
+
+def _unlike_units(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -> list[str]:
+    """A note if G' and G'' have different units, and are far apart only for that reason."""
+    if not {"storage", "loss"} <= set(first):
+        return []
+    (one, storage), (other, loss) = first["storage"], first["loss"]
+    scale = MODULUS_UNITS[one.unit or "Pa"] / MODULUS_UNITS[other.unit or "Pa"]
+    ratio = float(np.median(storage[good] / loss[good]))
+    if max(ratio, 1 / ratio) < FAR_APART or max(ratio / scale, scale / ratio) > FAR_APART:
+        return []
+    return [
+        f"column {one.name!r} is in {one.unit or 'Pa'} and {other.name!r} in {other.unit or 'Pa'}, which makes G' "
+        f"{ratio:.2g} times G'': if both are in one unit, correct the header"
+    ]
+
+
 def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     written = np.asarray(table.rows)
     notes += table.notes
@@ -112,7 +131,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     for j, column in enumerate(table.columns):
         if j not in columns and known_unit(column.quantity.removesuffix("_sd"), column.unit):
             _check_agreement(path, first, column, written[:, j], good)
-    notes += [*left_out, *_below_zero(first, good)]
+    notes += [*left_out, *_below_zero(first, good), *_unlike_units(first, good)]
     values = {q: v[good] for q, (_, v) in first.items()}
     omega = values["frequency"]
     if len(np.unique(omega)) < 2:

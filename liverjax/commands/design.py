@@ -23,6 +23,11 @@ def run(options: argparse.Namespace) -> int:
 
     ranges = design.read_ranges(options.range)
     rows = design.design(ranges, options.rows, options.kind, options.seed)
-    design.write_table(options.table, list(ranges), rows, f"{options.kind}, seed {options.seed}")
+    design.write_table(
+        options.table,
+        list(ranges),
+        rows,
+        options.kind if options.kind == "grid" else f"{options.kind}, seed {options.seed}",
+    )
     print(f"{len(rows)} rows\nwritten: {options.table}")
     return 0

@@ -22,11 +22,9 @@ def add(parsers: argparse._SubParsersAction) -> None:
         metavar="NAME|FILE.py:LAW|RESULT.h5",
         help=f"{LAW}; all for every shipped one; or a result of liverjax simulate",
     )
-    command.add_argument("--field", default="displacement", metavar="NAME", help="of a result: cauchy_stress, …")
+    command.add_argument("--field", metavar="NAME", help="of a result: cauchy_stress, …; default displacement")
     command.add_argument("--step", type=int, metavar="N", help="of a result, from 1; default the last")
-    command.add_argument(
-        "--stretch", nargs=2, type=float, default=(0.6, 1.6), metavar=("LOW", "HIGH"), help="of a law (0.6 1.6)"
-    )
+    command.add_argument("--stretch", nargs=2, type=float, metavar=("LOW", "HIGH"), help="of a law; default 0.6 1.6")
     add_out(command)
     command.set_defaults(run=run)
 
@@ -37,13 +35,18 @@ def run(options: argparse.Namespace) -> int:
     for name in options.law:
         if name.endswith(".toml"):
             raise InputError(f"{name} is a scene: run it by liverjax simulate, and draw its result.h5")
+    for option, of_results in (("field", True), ("step", True), ("stretch", False)):
+        if getattr(options, option) is not None and bool(results) != of_results:
+            raise InputError(
+                f"--{option} is for {'results' if of_results else 'laws'}, not for {options.law[0]}: leave it out"
+            )
     if results:
         if len(options.law) > 1:
             raise InputError(f"{results[0]} is a result: draw it alone")
         return _draw_field(results[0], options)
     from liverjax.laws import figures, gradient_check
 
-    low, high = options.stretch
+    low, high = options.stretch or (0.6, 1.6)
     if not 0 < low < 1 < high <= 20:
         raise InputError(f"--stretch {low:g} {high:g} is not a range about 1: give e.g. --stretch 0.6 1.6")
     names = [n for name in options.law for n in (laws.LAWS if name == "all" else [name])]
@@ -59,7 +62,8 @@ def run(options: argparse.Namespace) -> int:
 def _draw_field(result: Path, options: argparse.Namespace) -> int:
     from liverjax.jobs import pictures
 
-    surface, file = pictures.of_result(result, options.field, options.step), options.out / f"{options.field}.png"
+    field = options.field or "displacement"
+    surface, file = pictures.of_result(result, field, options.step), options.out / f"{field}.png"
     writable(options.out, (file.name,))
     pictures.draw_surface(file, surface)
     low, high = (float(f(surface.values)) for f in (min, max))

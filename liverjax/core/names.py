@@ -1,6 +1,8 @@
 """Dotted names, as scene files use them: `law.1.mu` leads to a number."""
 
 import dataclasses
+import itertools
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -64,13 +66,41 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
         InputError: a name that leads nowhere, with a hint.
     """
     steps: list[PathStep] = []
-    path = name.split(".")
+    path, inside = name.split("."), thing
     while path:
-        keys, path = _keys(thing, path, refusal)
+        try:
+            keys, path = _keys(inside, path, refusal)
+        except InputError:
+            near = _names_that_end_in(thing, name)
+            if near:
+                raise InputError(f"{refusal}: did you mean {' or '.join(near)}?") from None
+            raise
         for key in keys:
-            steps.append(PathStep(thing, key))
-            thing = steps[-1].inside()
+            steps.append(PathStep(inside, key))
+            inside = steps[-1].inside()
     return steps
+
+
+def _names_that_end_in(thing: object, name: str) -> list[str]:
+    """At most three dotted names of numbers with this end: capital letters and a unit in brackets do not count."""
+    end = name.partition("[")[0].strip().lower()
+    every = _names_of_numbers(thing) if end else ()
+    return list(itertools.islice((own for own in every if f".{own}".lower().endswith(f".{end}")), 3))
+
+
+def _names_of_numbers(struct: object, before: str = "") -> Iterator[str]:
+    """Dotted names of all fields of a struct that hold numbers, those of structs inside it too."""
+    for field in dataclasses.fields(struct) if dataclasses.is_dataclass(struct) else ():
+        value = getattr(struct, field.name)
+        own = before if field.metadata.get("unnamed") else f"{before}{field.name}."
+        if dataclasses.is_dataclass(value):
+            yield from _names_of_numbers(value, own)
+        elif isinstance(value, tuple) and any(dataclasses.is_dataclass(one) for one in value):
+            if not isinstance(field.metadata.get("unnamed"), str):
+                for k, one in enumerate(value):
+                    yield from _names_of_numbers(one, f"{own}{k}.")
+        elif value is not None and field.metadata and not field.metadata.get("static"):
+            yield own.removesuffix(".")
 
 
 def _keys(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:

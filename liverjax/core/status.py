@@ -17,12 +17,12 @@ ADVICE = {
     NOT_FINITE: "a residual was not finite, usually an inverted element: take smaller loads or steps, or a law with "
     "continued_below; if it is a law of your own, look at it with `python -m liverjax check`",
     INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (it buckles, collapses, or is "
-    "stiff in bulk): take linear_solver = 'direct' or volumetric = 'mixed' if bulk is far above mu, else "
-    "kind = 'dynamic', smaller steps or robust = 'projected'",
+    "stiff in bulk): take linear_solver = 'direct' or volumetric = 'mixed' if bulk is far above mu, else smaller "
+    "steps, robust = 'projected' or, for a static scene, kind = 'dynamic'",
     INVERTED: "in equilibrium, but with inverted elements, which no body has: take smaller loads, a stiffer volumetric "
     "energy or a finer mesh",
     STEP_CUT: "the step was halved as often as allowed and still failed: take smaller steps, robust = 'projected', "
-    "kind = 'dynamic' where the body buckles or topples, or a lower stiffness of an obstacle that sets its own",
+    "kind = 'dynamic' where a static body buckles or topples, or a lower stiffness of an obstacle that sets its own",
     GRADIENT_UNCONVERGED: "the derivative passes through a step that did not converge, so it is not the one of a "
     "solution: mend the run first (Result.status)",
     ADJOINT_FAILED: "the linear solves of the derivative did not converge and it is not finite: take "

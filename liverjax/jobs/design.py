@@ -9,7 +9,7 @@ from liverjax.core.files import whole
 
 KINDS = ("grid", "latin", "sobol")
 #: First bytes of a table of `design`.
-_BEGINNINGS = tuple(f"# {kind}, seed".encode() for kind in KINDS)
+_BEGINNINGS = tuple(f"# {kind}".encode() for kind in KINDS)
 
 
 def number_of(text: str) -> float:

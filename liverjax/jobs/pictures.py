@@ -77,6 +77,8 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
         with h5py.File(file) as data:
             if "sweep" in data.attrs:
                 raise InputError(f"{file} holds the runs of a sweep: give the result.h5 of one run")
+            if "modes" in data:
+                raise InputError(f"{file} holds a reduced model: run it, and draw the result.h5 of that run")
             if "frequencies_Hz" in data:
                 raise InputError(f"{file} holds harmonic motion: write it for ParaView by simulate --vtu")
             tets, before, after = data["tetrahedra"][()][:, :4], data["reference"][()], data["positions"]

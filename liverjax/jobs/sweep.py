@@ -157,6 +157,8 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     if len(table) < 2:
         raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row per run")
     names = tuple(table[0])
+    if "" in names:
+        raise InputError(f"{file}: column {names.index('') + 1} has no name: give it one, or remove its comma")
     if len(set(names)) < len(names):
         raise InputError(f"{file} names {max(names, key=names.count)} twice: leave one column out")
     rows = []

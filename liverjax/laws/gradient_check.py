@@ -61,8 +61,6 @@ def load(name: str) -> Law:
     if ":" not in name and not name.endswith(".py"):
         return laws.typical(name)
     file, _, attribute = name.rpartition(":") if ":" in name else (name, "", "")
-    if not attribute:
-        raise InputError(f"{name} names no law: give FILE.py:LAW")
     if not Path(file).is_file():
         raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
     # The module is registered, as dataclasses look it up, under a private name: the file may be called jax.py.
@@ -79,11 +77,14 @@ def load(name: str) -> Law:
         raise InputError(f"{file} does not run ({_reason(error)}): mend it first") from None
     finally:
         sys.path.pop(0)
-    found: Any = getattr(module, attribute, None)
+    found: Any = getattr(module, attribute, None) if attribute else None
     if found is None:
         own = {n: v if inspect.isclass(v) else type(v) for n, v in vars(module).items() if _is_law(v)}
         offered = [n for n, c in own.items() if c.__module__ == module.__name__ or not inspect.isclass(vars(module)[n])]
-        raise InputError(f"{file} has no {attribute}: {'use ' + ' or '.join(offered) if offered else 'define a law'}")
+        wrong = f"{file} has no {attribute}" if attribute else f"{name} names a file, and no law in it"
+        raise InputError(
+            f"{wrong}: {'use ' + ' or '.join(f'{file}:{n}' for n in offered) if offered else 'define a law'}"
+        )
     if not _is_law(found):
         raise InputError(f"{name} is not a law: derive it from liverjax.Law and decorate it with liverjax.core.struct")
     law = _typical_law(found, name) if inspect.isclass(found) else found
@@ -122,8 +123,9 @@ def _try_parts(law: Law, name: str) -> None:
                 jax.eval_shape(part.energy, jnp.eye(3))
         except Exception as error:
             raise InputError(
-                f"{name}: its {what} cannot be evaluated ({_reason(error)}): a strain_energy of your own must do with "
-                "bulk = None, or define both parts"
+                f"{name}: its {what} cannot be evaluated ({_reason(error)}): a field bulk needs a field volumetric "
+                "(volumetric: str = lj.static('quadratic')), and a strain_energy of your own must do with bulk = None, "
+                "or define both parts"
             ) from None
 
 

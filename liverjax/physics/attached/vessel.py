@@ -63,7 +63,10 @@ class Vessel(Physics):
         line, radius = (bounds.array_of(table[key]) for key in ("line", "radius"))
         line, radius = (np.empty(0) if v is None else v for v in (line, radius))
         if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2 or radius.shape not in ((), (len(line),)):
-            raise InputError(f"{name} needs line = [[x, y, z], …] of two points or more, radius one number or one each")
+            raise InputError(
+                f"{name} needs line = [[x, y, z], …] of two points or more, radius one number or one each, all of them "
+                "finite"
+            )
         if not np.all(np.any(np.diff(line, axis=0) != 0, axis=1)):
             raise InputError(f"{name} line has a point twice in a row: mend the line")
         return along(mesh, line, radius, law, name=name, **given)

@@ -1,0 +1,81 @@
+"""The map of a fit to waves: waves.h5 at the voxels, waves.vtu for ParaView, and the picture waves.png."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import h5py
+import meshio
+import numpy as np
+
+from fitting.waves import voxels
+from fitting.waves.elastography import Organ
+from fitting.waves.stiffness_map import WaveMap, sd_of_modulus
+from liverjax.core.plotting import pyplot
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
+    """Values at the voxels (nx, ny, nz), NaN outside, from values at the corners (P,)."""
+    nothing = complex(np.nan, np.nan) if np.iscomplexobj(corners) else np.nan
+    out = np.full(organ.field.mask.shape, nothing, corners.dtype)
+    out[tuple(organ.body.voxel.T)] = voxels.on_all_nodes(organ.body, corners)
+    return out
+
+
+def write_at_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.ndarray) -> None:
+    """Write waves.h5: the mask, the direct inversion (F, nx, ny, nz) [Pa], and the map with its deviations."""
+    with h5py.File(path, "w") as file:
+        for name in ("frequencies", "spacing", "origin", "mask"):
+            file[name] = getattr(organ.field, name)
+        file["direct_inversion"] = usual
+        if drawn is None:
+            return
+        whole = np.stack([at_voxels(organ, G) for G in drawn.modulus])
+        sd = np.stack([at_voxels(organ, own) for own in drawn.sd])
+        file["modulus"], file["sd_of_logarithm"], file["sd_of_loss_angle"] = whole, sd.real, sd.imag
+        file["sd"] = sd_of_modulus(whole, sd)
+        file["draws_of_exponent"] = (
+            np.stack([[at_voxels(organ, c) for c in own] for own in drawn.draws]) if len(drawn.draws) else []
+        )
+        file["modulus"].attrs["unit"] = file["sd"].attrs["unit"] = "Pa"
+
+
+def write_for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
+    """Write the map at the corners of the mesh for ParaView."""
+    data: dict[str, np.ndarray] = {}
+    for hertz, G, sd in zip(organ.field.frequencies, drawn.modulus, drawn.sd, strict=True):
+        data |= {f"storage_{hertz:g}_Hz": G.real, f"loss_{hertz:g}_Hz": G.imag}
+        data |= {f"sd_of_logarithm_{hertz:g}_Hz": sd.real, f"sd_of_loss_angle_{hertz:g}_Hz": sd.imag}
+    mesh = organ.body.linear
+    meshio.write_points_cells(path, np.asarray(mesh.points), {"tetra": np.asarray(mesh.tetrahedra)}, data)
+
+
+def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
+    """Middle slice across the shortest side at the highest frequency: map, its deviation, the direct inversion."""
+    f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
+    k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))
+    G, sd = at_voxels(organ, drawn.modulus[f]), at_voxels(organ, drawn.sd[f].real)
+    panels = (
+        ("storage modulus [kPa]", G.real / 1e3, "viridis"),
+        ("loss modulus [kPa]", G.imag / 1e3, "viridis"),
+        ("sd of ln|G|", sd, "magma"),
+        ("direct inversion, storage [kPa]", usual[f].real / 1e3, "viridis"),
+    )
+    size = 1e3 * organ.field.spacing * np.array(organ.field.mask.shape)
+    across = [a for a in range(3) if a != axis]
+    fig, axes = pyplot().subplots(1, 4, figsize=(13, 4.2), layout="constrained")
+    top = np.nanquantile(panels[0][1], 0.995)  # one voxel shall not set the scale
+    for ax, (title, values, colours) in zip(axes, panels, strict=True):
+        limits = {"vmin": 0.0, "vmax": top} if "storage" in title else {"vmin": 0.0}
+        shown = np.take(values, k, axis).T
+        picture = ax.imshow(
+            shown, origin="lower", cmap=colours, extent=(0, size[across[0]], 0, size[across[1]]), **limits
+        )
+        ax.set(title=title, xlabel=f"{'xyz'[across[0]]} [mm]", ylabel=f"{'xyz'[across[1]]} [mm]")
+        ax.title.set_fontsize(9)
+        if not np.isfinite(shown).any():  # the organ is thinner than the differences of the direct inversion are wide
+            ax.text(0.5, 0.5, "no voxel is far enough\nfrom an edge", ha="center", transform=ax.transAxes, fontsize=8)
+        fig.colorbar(picture, ax=ax, shrink=0.8)
+    return fig

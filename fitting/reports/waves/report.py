@@ -1,0 +1,224 @@
+"""Results of a fit to waves: waves.json, the sweeps of the regions, and the table that is printed."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from fitting.reports.sweep_report import numbers
+from fitting.reports.waves.cautions import cautions_of_elastography, chi2_text
+from fitting.reports.waves.maps import maps_picture, write_at_voxels, write_for_paraview
+from fitting.waves.elastography import Found, Organ
+from fitting.waves.regions import Regions
+from fitting.waves.shear_waves import velocity_and_attenuation
+from fitting.waves.stiffness_map import WaveMap
+from liverjax.core.errors import InputError
+from liverjax.core.plotting import save
+from liverjax.core.struct import Content
+from liverjax.core.versions import versions
+
+#: Fewest frequencies of a sweep.
+FEWEST = 3
+#: A node of the map counts as different from the organ's mean beyond this many standard deviations.
+TOLD = 3.0
+#: Mean relative distance of the springpot from the moduli of the frequencies that is told.
+MISSED = 0.03
+
+
+def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: np.ndarray) -> Content:
+    """Write all files into the folder `out`; returns the content of waves.json.
+
+    Args:
+        out: folder.
+        organ, found, drawn: the organ, its fitted regions, and its map (None: no map).
+        usual: direct inversion (F, nx, ny, nz) [Pa].
+    """
+    content = {
+        "data": organ.field.source,
+        "notes": list(organ.field.notes),
+        "frequencies_Hz": organ.field.frequencies.tolist(),
+        "noise_m": organ.field.noise.tolist(),
+        "density_kg_m3": organ.density,
+        "spacing_m": organ.field.spacing.tolist(),
+        "voxels": int(organ.body.mesh.number_of_nodes),
+        "elements": int(organ.body.mesh.number_of_elements),
+        "whole": _of_regions(organ, found.whole, found.mesh_bias[:, None], found.bias_left[:, None])[0],
+        "regions": _by_label(organ, found),
+        "direct_inversion": _direct(organ, found, usual),
+        "map": None if drawn is None else _of_map(drawn),
+        "warnings": cautions_of_elastography(organ, found, drawn),
+        "versions": versions(),
+    }
+    content = numbers(content)
+    content["springpots"], told = _springpots(_sweeps(out, organ, content))
+    content["warnings"] += told
+    (out / "waves.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_at_voxels(out / "waves.h5", organ, drawn, usual)
+    if drawn is not None:
+        write_for_paraview(out / "waves.vtu", organ, drawn)
+        save(maps_picture(organ, drawn, usual), out / "waves.png")
+    return content
+
+
+def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) -> list[Content]:
+    """One dictionary per region, with lists over the frequencies. Errors contain noise, the uncertainty of the edges'
+    places, and the error of the elements: its mean `bias` (F, R) over the directions of waves, and what is `left` of
+    it (F, R, D) for each direction.
+    """
+    omega, rows = organ.waves.omega, []
+    for r in range(own.modulus.shape[1]):
+        G, e = own.modulus[:, r], own.standard_errors[:, r]
+        c, alpha = velocity_and_attenuation(G.real, G.imag, omega, organ.density)
+        missed, along = G * bias[:, r], G[:, None] * left[:, r]
+        rows.append(
+            {
+                "storage_Pa": G.real.tolist(),
+                "loss_Pa": G.imag.tolist(),
+                "error_storage_Pa": np.sqrt(e.real**2 + missed.real**2 + np.sum(along.real**2, axis=1)).tolist(),
+                "error_loss_Pa": np.sqrt(e.imag**2 + missed.imag**2 + np.sum(along.imag**2, axis=1)).tolist(),
+                "standard_error_storage_Pa": e.real.tolist(),
+                "standard_error_loss_Pa": e.imag.tolist(),
+                "edges_farther_out_voxels": own.farther[:, r].tolist(),
+                "mesh_bias_storage_Pa": missed.real.tolist(),
+                "mesh_bias_loss_Pa": missed.imag.tolist(),
+                "phase_velocity_m_s": c.tolist(),
+                "attenuation_1_m": alpha.tolist(),
+                "voxels_a_wave": (2 * np.pi * c / omega / organ.field.spacing.max()).tolist(),
+                "chi2_per_component": (own.chi2 / own.components).tolist(),
+                "noise_factor": own.noise_factor[:, r].tolist(),
+                "iterations": own.iterations.tolist(),
+                "converged": own.converged.tolist(),
+            }
+        )
+    return rows
+
+
+def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
+    """The springpot model that `models.best_of_models` chooses per sweep, with its numbers, None without sweeps; then
+    warnings.
+    """
+    if not sweeps:
+        return None, []
+    from fitting.fits.families import models
+    from fitting.readers import rheometer
+
+    found, told = {}, []
+    for name, file in sweeps.items():
+        try:
+            sweep = rheometer.read_sweep(file)
+        except InputError as error:
+            told.append(f"{name}: no springpot is fitted over the frequencies: {error}")
+            continue
+        told += [f"{name}: the springpot is fitted without some frequencies: {note}" for note in sweep.notes]
+        fit, _ = models.best_of_models(models.fractional(sweep), sweep)
+        u, off = fit.parameters, float(np.mean(fit.relative_errors(sweep)))
+        assert u is not None
+        if off > MISSED:
+            told.append(
+                f"{name}: the {fit.kind.name} misses the moduli over the frequencies by {100 * off:.2g} % on average: "
+                "use the moduli of each frequency"
+            )
+        found[name] = {
+            "model": fit.kind.name,
+            "numbers": {k: float(v) for k, v in zip(u.names, u.values, strict=True)},
+            "standard_errors": numbers({k: float(v) for k, v in zip(u.names, u.standard_errors, strict=True)}),
+            "mean_relative_error": off,
+            "frequencies": len(sweep.angular_frequency),
+        }
+    return found, told
+
+
+def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
+    """A frequency sweep of the whole and of every region, for ``python -m fitting``, if frequencies are enough."""
+    if len(organ.field.frequencies) < FEWEST:
+        return {}
+    files = {}
+    for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
+        columns = [
+            content["frequencies_Hz"],
+            own["storage_Pa"],
+            own["loss_Pa"],
+            own["error_storage_Pa"],
+            own["error_loss_Pa"],
+        ]
+        if any(v is None for column in columns for v in column):  # a region that the data do not determine
+            continue
+        rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
+        rows += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
+        files[name] = out / f"sweep_{name}.csv"
+        files[name].write_text("\n".join(rows) + "\n")
+    return files
+
+
+def _by_label(organ: Organ, found: Found) -> Content | None:
+    if found.parts is None or found.labels is None or found.parts_bias is None or found.parts_bias_left is None:
+        return None
+    rows = _of_regions(organ, found.parts, found.parts_bias, found.parts_bias_left)
+    return {str(label): row for label, row in zip(found.labels, rows, strict=True)}
+
+
+def _direct(organ: Organ, found: Found, usual: np.ndarray) -> Content:
+    """Medians of the direct inversion over the whole and over the regions; None if no voxel has a value."""
+    labels = organ.field.labels
+    places = {"whole": organ.field.mask}
+    if found.labels is not None and labels is not None:
+        places |= {str(k): organ.field.mask & (labels == k) for k in found.labels}
+    out = {}
+    for name, place in places.items():
+        known = [G[place & np.isfinite(G)] for G in usual]
+        out[name] = {
+            "storage_Pa": [float(np.median(g.real)) if g.size else None for g in known],
+            "loss_Pa": [float(np.median(g.imag)) if g.size else None for g in known],
+        }
+    return out
+
+
+def _of_map(drawn: WaveMap) -> Content:
+    return {
+        "prior_deviation": drawn.deviation,
+        "correlation_length_m": drawn.length,
+        "chi2_per_component": drawn.chi2 / drawn.components,
+        "discrepancy_reached": drawn.reached,
+        "distance_to_minimum_in_standard_deviations": drawn.distance,
+        "part_of_variance_left": float(np.mean((drawn.posterior_sd / drawn.prior_sd) ** 2)),
+        "told_from_the_mean": float(np.mean(np.abs(drawn.exponent.real) > TOLD * drawn.sd.real)),
+        "history": drawn.history,
+        "run_time_s": drawn.seconds,
+    }
+
+
+def _error_cell(x: float | None) -> str:
+    return "unknown" if x is None else f"{x:.2g}"
+
+
+def table(content: Content) -> str:
+    """Moduli of the whole and of the regions at every frequency, and the direct inversion for comparison."""
+    rows = [f"{'':12s}{'Hz':>8s}{'G_storage [Pa]':>22s}{'G_loss [Pa]':>22s}{'c [m/s]':>9s}{'chi2':>9s}   direct [Pa]"]
+    for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
+        direct = content["direct_inversion"][name]
+        for f, hertz in enumerate(content["frequencies_Hz"]):
+            usual = [direct[part][f] for part in ("storage_Pa", "loss_Pa")]
+            pair = "none" if usual[0] is None else f"{usual[0]:.4g} + {usual[1]:.3g}i"
+            cells = [
+                f"{own[f'{part}_Pa'][f]:.5g} ± {_error_cell(own[f'error_{part}_Pa'][f])}"
+                for part in ("storage", "loss")
+            ]
+            rows.append(
+                f"{name:12s}{hertz:8g}{cells[0]:>22s}{cells[1]:>22s}{own['phase_velocity_m_s'][f]:9.3g}"
+                f"{chi2_text(own['chi2_per_component'][f]):>9s}   {pair}"
+            )
+    for name, own in (content["springpots"] or {}).items():
+        said = ", ".join(
+            f"{k} = {v:.4g} {f'± {error:.2g}' if (error := own['standard_errors'][k]) else '(at its bound)'}"
+            for k, v in own["numbers"].items()
+        )
+        off = f"{100 * own['mean_relative_error']:.2g} % off on average"
+        rows.append(f"{name:12s}{own['model']} over {own['frequencies']} frequencies, {off}: {said}")
+    if content["map"]:
+        m = content["map"]
+        rows.append(
+            f"map: chi2 {m['chi2_per_component']:.3g} per equation, "
+            f"{100 * m['part_of_variance_left']:.2g} % of the prior's variance left, "
+            f"{100 * m['told_from_the_mean']:.2g} % of the nodes differ from the mean, {m['run_time_s']:.3g} s"
+        )
+    return "\n".join(rows)
