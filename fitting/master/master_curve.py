@@ -9,13 +9,14 @@ from fitting.master import shifts, temperature_laws
 from fitting.master.shifts import Shifts
 from fitting.master.temperature_laws import TemperatureLaw
 from fitting.master.temperature_sweeps import AtTemperatures, joined
-from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.frequency_sweep import Sweep, merged, scatter
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Distance of a sweep from the common curve, and error [decades] of a factor, above which there is a sentence.
-FAR_OFF, LOOSE = 0.05, 0.3
+#: Distance of a sweep from the common curve, the same over the scatter of the points, and error [decades] of a factor,
+#: above which there is a sentence.
+FAR_OFF, SCATTERS, LOOSE = 0.05, 2.0, 0.3
 #: Distance from the curve that its spline may cause by itself.
 SMOOTH = 1e-3
 #: Probability of a better match by chance below which factors of the moduli are named.
@@ -50,28 +51,17 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
         )
     untold: list[str] = []
     if data.shift_factors is not None:
-        log_a, none = np.log10(data.shift_factors), np.zeros(len(T))
+        log_a = np.log10(data.shift_factors)
         if reference is None:  # the reference temperature of the given factors
             place = int(np.argmin(np.abs(log_a)))
-        log_a = log_a - log_a[place]
-        found = Shifts(
-            T,
-            place,
-            log_a,
-            none,
-            none,
-            none,
-            shifts.distances_from_curve(data.sweeps, log_a, none),
-            np.zeros((len(T), len(T))),
-            given=True,
-        )
+        found = shifts.known_shifts(data.sweeps, T, place, log_a - log_a[place])
     else:
         found = shifts.found(data.sweeps, T, place, vertical)
         untold = [] if vertical else _factors_of_moduli(data.sweeps, found)
     parts = [_shifted_sweep(s, a, b) for s, a, b in zip(data.sweeps, found.log_a, found.log_b, strict=True)]
     laws = temperature_laws.temperature_laws_of(found)
     whole = joined(parts)
-    notes = [*whole.notes, *_sentences(found), *untold]
+    notes = [*whole.notes, *_sentences(found, _scatter_of_points(data.sweeps)), *untold]
     if vertical and found.given:
         notes.append(
             "--vertical finds no factors of the moduli here, since the file has those of the frequencies: leave out "
@@ -87,14 +77,23 @@ def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
     return sweep._replace(angular_frequency=a * sweep.angular_frequency, **moduli)
 
 
-def _sentences(found: Shifts) -> list[str]:
-    """Notes on how the sweeps were shifted, and warnings if superposition is not valid."""
+def _scatter_of_points(sweeps: list[Sweep]) -> float:
+    """Relative scatter of the points of a sweep about a smooth curve, the median of all; 0 if it cannot be seen."""
+    each = [scatter(*merged(s.angular_frequency, G)) for s in sweeps for G in (s.storage, s.loss)]
+    known = [own for own in each if np.isfinite(own)]
+    return float(np.median(known)) if known else 0.0
+
+
+def _sentences(found: Shifts, noise: float) -> list[str]:
+    """Notes on how the sweeps were shifted, and warnings if superposition is not valid; `noise` is the scatter of the
+    points.
+    """
     T = celsius(found.temperatures)
     out = [
         f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; they lie "
         f"{100 * found.apart:.2g} % from one smooth curve"
     ]
-    far = [k for k in np.argsort(-found.misfit) if found.misfit[k] > FAR_OFF]
+    far = [k for k in np.argsort(-found.misfit) if found.misfit[k] > max(FAR_OFF, SCATTERS * noise)]
     if far:
         listed = ", ".join(f"{T[k]:.4g} °C {100 * found.misfit[k]:.2g} %" for k in far[:4])
         more = f" and {len(far) - 4} more" if len(far) > 4 else ""
@@ -113,16 +112,21 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     """A sentence if the sweeps lie over each other much better once their moduli have factors too (F-test)."""
     try:
         other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
+        # One kind of curve for both, which is fine enough for each.
+        knots = min(found.knots, other.knots)
+        alone, both = (
+            shifts.found(sweeps, found.temperatures, found.reference, vertical, (knots,)) for vertical in (False, True)
+        )
     except InputError:
         return []
-    counts, more = np.array([2 * len(s.storage) for s in sweeps]), len(sweeps) - 1
-    alone, both = (float(counts @ s.misfit**2) for s in (found, other))
-    freedom = counts.sum() - 2 * more - 2 * shifts.size_of_curve(sweeps, other.log_a)
+    more, data = len(sweeps) - 1, sum(2 * len(s.storage) for s in sweeps)
+    ratio = shifts.sum_of_squares(sweeps, alone) / max(shifts.sum_of_squares(sweeps, both), np.finfo(float).tiny)
+    freedom = data - 2 * more - 2 * shifts.size_of_curve(sweeps, both.log_a, knots)
     if (
         freedom < 1
         or found.apart < SMOOTH
         or not other.apart < BETTER * found.apart
-        or scipy.special.fdtrc(more, freedom, (alone / both - 1) * freedom / more) > CHANCE
+        or scipy.special.fdtrc(more, freedom, (ratio - 1) * freedom / more) > CHANCE
     ):
         return []
     b, T = 10.0**other.log_b, celsius(found.temperatures)

@@ -2,8 +2,9 @@
 
 The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
 a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency, found together with all factors by
-least squares: no model of the material is needed, and every factor has a standard error. Source: Ferry (1980),
-Viscoelastic properties of polymers, chapter 11.
+least squares: no model of the material is needed, and every factor has a standard error. The data decide how far apart
+the knots of the spline are: a curve that follows the noise is steeper than the true one, and the errors of factors that
+rest on its slope would be too small. Source: Ferry (1980), Viscoelastic properties of polymers, chapter 11.
 """
 
 from collections.abc import Sequence
@@ -12,16 +13,18 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import BSpline
 
-from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.frequency_sweep import Sweep, merged, scatter
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
-#: Decades between two knots of the spline, and weight of its third differences, for knots without data.
-KNOTS, SMOOTH = 0.4, 1e-3
+#: Decades between two knots of the spline that are tried, and weight of its third differences, for knots without data.
+KNOTS, SMOOTH = (0.4, 0.6, 0.9, 1.35, 2.0, 3.0), 1e-3
 #: Longest step of a factor in one iteration [decades], and the step below which the iteration ends.
 LONGEST, CONVERGED = 0.3, 1e-6
 #: Part of a sweep that must overlap its neighbour at its first shift, and the shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
+#: Mean square distance of two sweeps over the variance of their noise, up to which they lie over each other.
+WITHIN = 2.0
 
 
 class Shifts(NamedTuple):
@@ -35,6 +38,7 @@ class Shifts(NamedTuple):
     log_b_errors: np.ndarray
     misfit: np.ndarray  # (K,) root mean square distance from the curve, relative
     covariance: np.ndarray  # (K, K) of `log_a`: neighbours are matched to each other, so their errors are correlated
+    knots: float  # decades between two knots of the curve
     given: bool = False
 
     @property
@@ -43,25 +47,82 @@ class Shifts(NamedTuple):
         return float(np.sqrt(np.mean(self.misfit**2)))
 
 
-def found(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, vertical: bool = False) -> Shifts:
-    """Shift factors by least squares.
+def found(
+    sweeps: Sequence[Sweep],
+    temperatures: np.ndarray,
+    reference: int,
+    vertical: bool = False,
+    tried: Sequence[float] = KNOTS,
+) -> Shifts:
+    """Shift factors by least squares, with the curve of the best corrected information criterion (Akaike's).
 
     Args:
         sweeps: K sweeps.
         temperatures: (K,) [K], ascending.
         reference: index of the sweep that is not shifted.
         vertical: moduli have factors b_T too.
+        tried: decades between two knots of the curve.
 
     Raises:
         InputError: a sweep does not match its neighbour at any shift.
     """
-    columns = [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
-    log_a, log_b = _first_shifts(columns, temperatures, reference), np.zeros(len(sweeps))
+    columns = _in_decades(sweeps)
+    first = _first_shifts(columns, temperatures, reference), np.zeros(len(sweeps))
     free = np.ones((2, len(sweeps)), bool)
     free[:, reference] = False
     free[1] &= vertical
+    every = [_at_knots(sweeps, (temperatures, reference), first, free, knots) for knots in tried]
+    joined = [own for own in every if _gap(columns, own.log_a) is None]
+    if not joined:
+        _refuse_gap(columns, _best(sweeps, every, int(free.sum())))
+    return _best(sweeps, joined, int(free.sum()))
+
+
+def _in_decades(sweeps: Sequence[Sweep]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """log10 of the frequencies, of G' and of G'' of every sweep."""
+    return [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
+
+
+def sum_of_squares(sweeps: Sequence[Sweep], shifts: Shifts) -> float:
+    """Sum of the squares of the relative distances of all G' and G'' from the curve."""
+    return float(np.array([2 * len(s.storage) for s in sweeps]) @ shifts.misfit**2)
+
+
+def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
+    """The curve with the least corrected information criterion, when so many factors were found; the coarsest of
+    curves that the data do not determine.
+    """
+    data = 2 * sum(len(s.storage) for s in sweeps)
+
+    def criterion(own: Shifts) -> float:
+        numbers = 2 * size_of_curve(sweeps, own.log_a, own.knots) + factors + 1
+        if data < numbers + 2:
+            return np.inf
+        square = max(sum_of_squares(sweeps, own) / data, np.finfo(float).tiny)
+        return data * np.log(square) + 2 * numbers * (1 + (numbers + 1) / (data - numbers - 1))
+
+    return min(reversed(every), key=criterion)
+
+
+def _at_knots(
+    sweeps: Sequence[Sweep],
+    at: tuple[np.ndarray, int],
+    first: tuple[np.ndarray, np.ndarray],
+    free: np.ndarray,
+    knots: float,
+) -> Shifts:
+    """The factors with a curve whose knots are so many decades apart.
+
+    Args:
+        sweeps: K sweeps.
+        at: temperatures (K,) [K], and the index of the sweep that is not shifted.
+        first: log a (K,) and log b (K,) to begin with.
+        free: (2, K) which of them are found.
+        knots: decades between two knots.
+    """
+    columns, (log_a, log_b) = _in_decades(sweeps), first
     for _ in range(60):
-        A, b = _linear_problem(columns, log_a, log_b)
+        A, b = _linear_problem(columns, log_a, log_b, knots)
         step = np.zeros((2, len(sweeps)))
         kept = np.concatenate([free.ravel(), np.ones(A.shape[1] - free.size, bool)])
         step[free] = np.linalg.lstsq(A[:, kept], b, rcond=None)[0][: free.sum()]
@@ -69,39 +130,53 @@ def found(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, ver
         log_a, log_b = log_a + moved[0], log_b + moved[1]
         if np.abs(moved).max() < CONVERGED:
             break
-    _check_overlap(columns, log_a, temperatures)
     covariance = np.zeros((2 * len(sweeps),) * 2)
     own = _covariance(A[:, kept], b, 2 * sum(len(c[0]) for c in columns))[: free.sum(), : free.sum()]
     covariance[np.ix_(free.ravel(), free.ravel())] = own
     spread = np.sqrt(np.diag(covariance)).reshape(2, -1)
-    misfit = distances_from_curve(sweeps, log_a, log_b)
-    return Shifts(
-        temperatures, reference, log_a, spread[0], log_b, spread[1], misfit, covariance[: len(sweeps), : len(sweeps)]
-    )
+    misfit = distances_from_curve(sweeps, log_a, log_b, knots)
+    of_a = covariance[: len(sweeps), : len(sweeps)]
+    return Shifts(*at, log_a, spread[0], log_b, spread[1], misfit, of_a, knots)
 
 
-def _check_overlap(columns: list, log_a: np.ndarray, temperatures: np.ndarray) -> None:
-    """Refuse sweeps between which the shifts leave a gap: only the smoothness of the curve would place them."""
+def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, log_a: np.ndarray) -> Shifts:
+    """Factors that are known, log10 of a_T (K,), without errors; the other arguments are those of `found`."""
+    none, exact = np.zeros(len(sweeps)), np.zeros((len(sweeps),) * 2)
+    every = [
+        Shifts(temperatures, reference, log_a, none, none, none, misfit, exact, knots, given=True)
+        for knots in KNOTS
+        for misfit in (distances_from_curve(sweeps, log_a, none, knots),)
+    ]
+    return _best(sweeps, every, 0)
+
+
+def _gap(columns: list, log_a: np.ndarray) -> list[int] | None:
+    """The two sweeps on both sides of a gap that the shifts leave: only the curve's smoothness would place them."""
     ends = [(c[0][0] + a, c[0][-1] + a) for c, a in zip(columns, log_a, strict=True)]
     order = sorted(range(len(ends)), key=lambda k: ends[k][0])
     last = order[0]
     for k in order[1:]:
         if ends[k][0] > ends[last][1]:
-            T, other = sorted(celsius(temperatures[[last, k]]))
-            raise InputError(
-                f"the sweeps at {T:.4g} and {other:.4g} °C do not overlap where they lie best: the data do not say how "
-                "far apart they are; measure between these temperatures or at more frequencies, or give the factors "
-                "in a column shift_factor"
-            )
+            return [last, k]
         last = k if ends[k][1] > ends[last][1] else last
+    return None
 
 
-def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray) -> np.ndarray:
+def _refuse_gap(columns: list, shifts: Shifts) -> None:
+    T, other = sorted(celsius(shifts.temperatures[_gap(columns, shifts.log_a) or [0, 1]]))
+    raise InputError(
+        f"the sweeps at {T:.4g} and {other:.4g} °C do not overlap where they lie best: the data do not say how "
+        "far apart they are; measure between these temperatures or at more frequencies, or give the factors "
+        "in a column shift_factor"
+    )
+
+
+def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray, knots: float) -> np.ndarray:
     """Root mean square distance (K,) of the shifted sweeps from their common curve, relative."""
-    columns = [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
+    columns = _in_decades(sweeps)
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     place = np.repeat(np.arange(len(columns)), [len(c[0]) for c in columns])
-    B = _basis(x, x)[0]
+    B = _basis(x, knots)[0]
     square = np.zeros(len(x))
     for j in (1, 2):
         y = np.concatenate([c[j] + b for c, b in zip(columns, log_b, strict=True)])
@@ -109,16 +184,16 @@ def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.n
     return np.sqrt(np.bincount(place, square) / np.bincount(place)) * np.log(10)
 
 
-def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray) -> int:
+def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, knots: float) -> int:
     """Number of coefficients of the curve of G' (and of that of G'') for shifted sweeps."""
     x = np.concatenate([np.log10(s.angular_frequency) + a for s, a in zip(sweeps, log_a, strict=True)])
-    return _basis(x, x)[0].shape[1]
+    return _basis(x, knots)[0].shape[1]
 
 
-def _basis(x: np.ndarray, over: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values and slopes (n, C) of the cubic splines over the range of `over`, at x."""
-    low, high = over.min() - 1e-6, over.max() + 1e-6
-    count = max(2, int(np.ceil((high - low) / KNOTS)) + 1)
+def _basis(x: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
+    """Values and slopes (n, C) of the cubic splines at x; their knots are at most `apart` from each other."""
+    low, high = x.min() - 1e-6, x.max() + 1e-6
+    count = max(2, int(np.ceil((high - low) / apart)) + 1)
     inner = np.linspace(low, high, count)
     step = inner[1] - inner[0]
     knots = np.concatenate([low - step * np.arange(3, 0, -1), inner, high + step * np.arange(1, 4)])
@@ -136,12 +211,12 @@ def _smoothness(size: int) -> np.ndarray:
     return SMOOTH * np.diff(np.eye(size), min(3, size - 1), axis=0)
 
 
-def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: float) -> tuple[np.ndarray, np.ndarray]:
     """Rows and right-hand side of a Gauss-Newton step for log a (K), log b (K) and the coefficients of both curves."""
     K, counts = len(columns), [len(c[0]) for c in columns]
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     own = np.repeat(np.eye(K), counts, axis=0)
-    B, slope = _basis(x, x)
+    B, slope = _basis(x, knots)
     size, rows, right = B.shape[1], [], []
     for j in (1, 2):
         y = np.concatenate([c[j] + b for c, b in zip(columns, log_b, strict=True)])
@@ -179,15 +254,26 @@ def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np
 
 
 def _over(fixed: tuple, moving: tuple) -> float | None:
-    """The shift [decades] that brings one sweep nearest to its neighbour; None if no shift matches."""
-    best, where = np.inf, None
+    """The shift [decades] that brings one sweep nearest to its neighbour; None if no shift matches.
+
+    Of shifts within the noise of the points, that with the longest overlap is taken: few points lie near each other by
+    chance at a wrong one.
+    """
+    best, where = (np.inf, 0), None
+    noise = WITHIN * sum(_variance(c) for c in (fixed, moving))
     for s in REACH:
         x = moving[0] + s
         inside = (x >= fixed[0][0] - 1e-9) & (x <= fixed[0][-1] + 1e-9)
         if inside.sum() < max(2, OVERLAP * len(x)):
             continue
         apart = [moving[j][inside] - np.interp(x[inside], fixed[0], fixed[j]) for j in (1, 2)]
-        score = float(np.mean(np.square(apart)))
+        score = max(float(np.mean(np.square(apart))), noise), -int(inside.sum())
         if score < best:
             best, where = score, float(s)
-    return where if best < 0.25 else None  # half a decade apart: no match
+    return where if best[0] < 0.25 else None  # half a decade apart: no match
+
+
+def _variance(columns: tuple) -> float:
+    """Variance of the noise of log10 G' and log10 G'', in the mean; 0 if there are too few points to see it."""
+    each = [scatter(*merged(10.0 ** columns[0], 10.0 ** columns[j])) / np.log(10) for j in (1, 2)]
+    return float(np.mean(np.square(each))) if np.all(np.isfinite(each)) else 0.0
