@@ -292,6 +292,24 @@ def test_standard_errors_are_those_of_the_scatter(name, tmp_path):
     assert not any("factor of its own" in sentence for sentence in found["warnings"])
 
 
+def test_a_coefficient_that_is_large_at_small_strains_is_no_limit(tmp_path):
+    """c3 in Pa grows with 1 over the fourth power of the strain: at 3 % it was named as infinite, and held."""
+    errors = []
+    for most in (0.03, 0.3):
+        strain, rng = np.geomspace(most / 50, most, 14), np.random.default_rng(0)
+        G = 1000 * (1 + (strain / most) ** 2 + 0.8 * (strain / most) ** 4) * (1 + 0.002 * rng.standard_normal((2, 14)))
+        rows = [f"1,{100 * x},{a},{0.1 * b}" for x, a, b in zip(strain, *G, strict=True)]
+        file = tmp_path / "a.csv"
+        file.write_text("frequency_Hz,strain_%,storage_modulus_Pa,loss_modulus_Pa\n" + "\n".join(rows) + "\n")
+        (candidate,) = stress_stretch.candidates("yeoh")
+        law = law_fit.fit_law(candidate, strain_sweep.read_strain_sweep(file), law_fit.Memory(), "cone").law
+        assert not law.limits and not any("limit" in said for said in law.warnings)
+        errors.append(law.standard_errors / law.values)
+        truth = np.array([500.0, 1000 / 3 / most**2, 237.0 / most**4])  # c1, c2; c3 from 0.8 by the cone's fifth power
+        assert np.all(np.abs(law.values[:2] - truth[:2]) < 4 * law.standard_errors[:2])
+    assert np.allclose(*errors, rtol=0.3)  # the same curve: only the strain has another unit
+
+
 def test_noise_in_percent_does_not_make_the_moduli_too_small():
     """Relative to each measured modulus, points that are low by chance weighed most: 2 % low of 10 % noise."""
     (candidate,), found = stress_stretch.candidates("neo_hookean"), []

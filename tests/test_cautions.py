@@ -87,7 +87,7 @@ def test_long_bodies_and_slivers():
 def test_short_bodies_and_nodes_in_one_place():
     short = lj.shapes.box((2e-4, 1e-4, 1e-4), (1, 1, 1))
     assert cautions_of_run(scene(short), run(short, [np.eye(3)], [1.0])) == [
-        "the body is 0.0002 m long: check the mesh's unit, e.g. write unit = 'm'"
+        "the body is 0.0002 m long: check its size; if its numbers are metres, leave unit out"
     ]
     x, tets = np.asarray(BOX.points), np.asarray(BOX.tetrahedra)
     two = lj.tet_mesh(np.concatenate([x, x + np.array([0.1, 0, 0])]), np.concatenate([tets, tets + len(x)]))

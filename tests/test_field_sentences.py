@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from fitting.__main__ import main
 from fitting.fits import field
 from fitting.methods.estimate import Estimate, bias_sentences
 from fitting.reports import field_report
@@ -50,6 +51,18 @@ def test_a_map_whose_level_is_open_says_so_and_the_mesh_is_blamed_for_its_own_sh
     assert (field.level_sentence(found) is not None) == level
     said = field.bias_sentence(found)
     assert said is None if mesh is None else mesh in said
+
+
+def test_a_number_is_named_once(tmp_path, capsys):
+    """The second fit got a start value as result, with an infinite error."""
+    (tmp_path / "scene.toml").write_text(
+        '[mesh]\nshape = "box"\nsize = [1, 1, 1]\ncells = [1, 1, 1]\n[law]\nname = "neo_hookean"\nmu = 1\nbulk = 9\n'
+        '[[fixed]]\nset = "z_min"\n[[traction]]\nset = "z_max"\nvalue = [0, 0, 0.1]\n'
+    )
+    (tmp_path / "seen.csv").write_text("node,ux,uy,uz\n7,0,0,0.01\n")
+    command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "seen.csv"), "--noise", "1e-3"]
+    assert main([*command, "--parameters", "law.mu,law.mu", "--out", str(tmp_path / "out")]) == 2
+    assert "--parameters names law.mu twice: leave one out" in capsys.readouterr().err
 
 
 def test_numbers_that_no_mesh_determines_are_not_blamed_on_the_mesh():

@@ -136,3 +136,15 @@ def test_other_noise_is_weighed_as_before():
     G = modulus(np.array([0.03, 0.4]), np.array([0.1, 0.01]))
     s = Sweep(OMEGA, G.real * (1 + 0.01 * rng.standard_normal(31)), G.imag * np.exp(0.1 * rng.standard_normal(31)))
     assert weighed_by_scatter(s) is s
+
+
+@pytest.mark.parametrize("points", [12, 16, 30])
+def test_few_points_of_equal_noise_seldom_look_like_an_error_of_the_phase(points):
+    """With one bound for all numbers of points 3 to 8 of 100 sweeps of a power law got the note."""
+    omega, rng = np.geomspace(0.3, 0.3 * 10 ** (points / 6), points), np.random.default_rng(0)
+    G, told = 1e3 * (1j * omega) ** 0.15, 0
+    for _ in range(200):
+        spread = 1 + 0.05 * rng.standard_normal((2, points))
+        s = Sweep(omega, G.real * spread[0], G.imag * spread[1])
+        told += weighed_by_scatter(s) is not s
+    assert told <= 200 * 0.02 + 2 * np.sqrt(200 * 0.02)

@@ -310,3 +310,13 @@ def test_a_region_that_says_nothing_is_told():
     assert np.all(np.isfinite(found.parts.modulus))
     told = cautions.cautions_of_elastography(own, found, None)
     assert any("region 9: its standard error" in one for one in told) and not any("region 2" in one for one in told)
+
+
+@pytest.mark.parametrize("radius, told", [(1, ["2 (7 voxels)"]), (2.5, [])])
+def test_regions_smaller_than_their_error_says_are_told(radius, told):
+    at = np.stack(np.meshgrid(*[np.arange(13) - 6] * 3, indexing="ij"))
+    labels = 1 + (np.linalg.norm(at, axis=0) <= radius)
+    nothing = np.zeros((1, 13, 13, 13, 3), complex)
+    field = WaveField(np.ones(1), nothing, np.ones(3), np.zeros(3), labels > 0, labels, np.ones(1), "none")
+    said = cautions._of_small_regions(field, np.array([1, 2]))
+    assert [one.partition("regions ")[2].partition(":")[0] for one in said] == told

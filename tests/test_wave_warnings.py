@@ -26,6 +26,12 @@ def test_gaps_within_the_organ_are_told():
     assert f"3 voxels within the organ have no displacement or are not in the mask, and {100 * left:.2g} % of" in note
 
 
+def test_voxels_in_no_element_are_told():
+    assert not elastography.notes_on_layers(plane_waves((9, 9, 13)))
+    (note,) = elastography.notes_on_layers(plane_waves((10, 9, 8)))
+    assert f"{720 - 9 * 9 * 7} of 720 voxels are in no element" in note and "along x (10 voxels), z (8 voxels)" in note
+
+
 def test_columns_of_the_table_stay_apart_where_nothing_fits():
     own = {"phase_velocity_m_s": [7.8], "chi2_per_component": [2.67e11]}
     own |= {key: [1.0] for key in ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")}

@@ -82,6 +82,8 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
     names = options.parameters.split(",")
     for name in names:
         numbers_at(problem.scenes[0], name)
+        if names.count(name) > 1:
+            raise InputError(f"--parameters names {name} twice: leave one out")
     writable(options.out, ("field.json",))
     bar, told = cost_bar("iterations")
     with bar:

@@ -149,7 +149,7 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
         stride += 1
     if stride > 1:
         print(f"note: means of {stride} x {stride} x {stride} voxels are taken", file=sys.stderr)
-    for note in elastography.notes_on_gaps(coarse):
+    for note in (*elastography.notes_on_gaps(coarse), *elastography.notes_on_layers(coarse)):
         print(f"note: {note}", file=sys.stderr)
     return elastography.organ_of(coarse, body, options.density)
 

@@ -14,7 +14,7 @@ from fitting.fits.families.hyperelastic import Candidate, ground_state_modulus
 from fitting.fits.families.hyperelastic import candidates as candidates  # where users have it
 from fitting.fits.honesty.other_minima import of_other_minima
 from fitting.fits.viscoelastic import EXACT
-from fitting.methods.estimate import errors_and_correlation, noise_factor, spread
+from fitting.methods.estimate import LOST, errors_and_correlation, noise_factor, spread
 from fitting.methods.generalised_maxwell import HOPELESS
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.methods.noise.alike_noise import Alike, along_rows
@@ -59,8 +59,12 @@ class LawFit(NamedTuple):
 #: Factors of the tests that the residuals do not show are told if they move a number by so many standard errors, and by
 #: this part of it.
 _HIDDEN, _MOVED = 2.0, 0.05
-#: A parameter that ends by more than this factor above or below its typical size ran into a limit of its law.
-RUNAWAY = 1e6
+#: A parameter that ends by more than this factor above or below its typical size ran into a limit of its law, if its
+#: error is so many times itself or more. Typical sizes are those of large strains: at small ones coefficients of higher
+#: terms are far above them, and are determined.
+RUNAWAY, FREE = 1e6, 30.0
+#: Least relative noise that is taken there: no test is better.
+_LEAST_NOISE = 1e-3
 #: Ratio of an error of uneven noise and that of equal noise from which the correlation is that of uneven noise.
 _UNEVEN = 1.2
 _tangents = jax.jit(lambda law, F: law.tangent(F))
@@ -123,11 +127,12 @@ def assessed(
     lowest = costs[best] * (1 + 1e-6) + 1e-20  # of all starts that reached the minimum
     u, J, r = (np.asarray(v[best]) for v in (found.u, found.jacobian, found.residuals))
     n, p = sum(len(c.stress) for c in curves), len(u)
-    misfit = r[:n]
+    misfit, k = r[:n], p + 1
     values = np.asarray(candidate.values(jnp.asarray(u), scale))
     noise = noise_factor(misfit, n - p, deviations_given=False)
-    limits = _run_away(candidate, values, scale)
     slope = np.asarray(jax.jacfwd(candidate.values)(jnp.asarray(u), scale))
+    every, _ = errors_and_correlation(spread(J[:n], max(noise, _LEAST_NOISE), slope)[0])
+    limits = _run_away(candidate, values, every, scale)
     # A parameter at its limit has no error; the errors of the others are those of the law at that limit.
     known = np.array([name not in limits for name in candidate.names])
     own_slope = slope[np.ix_(known, known)]
@@ -142,7 +147,6 @@ def assessed(
     law = candidate.law(jnp.asarray(values))
     split = np.split(misfit, np.cumsum([len(c.stress) for c in curves])[:-1])
     criterion = n * np.log(max(np.sum(misfit**2) / n, 1e-300))
-    k = p + 1
     result = LawFit(
         label=candidate.label,
         names=candidate.names,
@@ -291,13 +295,16 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
     return told
 
 
-def _run_away(candidate: Candidate, values: np.ndarray, scale: float) -> dict[str, str]:
-    """Parameters that ended far from every start. The starts spread over a few times the typical size."""
+def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scale: float) -> dict[str, str]:
+    """Parameters that ended far from every start, and that the data leave free: `errors` (p,) are those of all of them
+    together. The starts spread over a few times the typical size.
+    """
     starts = jnp.asarray(candidate.random(np.random.default_rng(0), STARTS))
     typical = np.median(np.abs(jax.vmap(lambda u: candidate.values(u, scale))(starts)), axis=0)
     ends = {}
-    for name, ratio in zip(candidate.names, np.abs(values) / typical, strict=True):
-        if not 1 / RUNAWAY < ratio < RUNAWAY:
+    free = ~(errors < np.minimum(FREE * np.abs(values), LOST))
+    for name, ratio, lost in zip(candidate.names, np.abs(values) / typical, free, strict=True):
+        if lost and not 1 / RUNAWAY < ratio < RUNAWAY:
             ends[name] = "0" if ratio < 1 else "infinity"
     return ends
 

@@ -4,8 +4,9 @@ import numpy as np
 
 from fitting.readers.frequency_sweep import Sweep, distance_from_smooth, distances_from_polynomials
 
-#: The phase may be the cause where G'' scatters by more than this part of itself, and by this factor more than G'.
-_SCATTERS, _MORE = 0.03, 3.0
+#: The phase may be the cause where G'' scatters by more than this part of itself, and by this factor more than G'; with
+#: few points (n) chance makes larger factors: 1 % of sweeps with equal noise are above 6 at 12 points, 3 at 40.
+_SCATTERS, _MORE, _BY_CHANCE = 0.03, 3.0, 9.0
 #: Fewest points whose scatter is looked at, and fewest per decade: fewer show the curvature of the material as scatter.
 _FEWEST, _PER_DECADE = 8, 5.0
 #: Noise in proportion to G'' must be more likely than this (logarithm): G'' alone has few causes of such noise.
@@ -28,7 +29,7 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
         return sweep
     storage, phase = (distance_from_smooth(x, y) for y in (np.log(sweep.storage), sine))
     scatters = float(np.median(phase * size / sweep.loss))
-    if not (scatters > _SCATTERS and scatters > _MORE * storage):
+    if not (scatters > _SCATTERS and scatters > _MORE * (1 + _BY_CHANCE / len(x)) * storage):
         return sweep
     if _likelier_in_proportion(x, sine) > _BETTER:
         return sweep

@@ -81,6 +81,25 @@ def notes_on_gaps(field: WaveField) -> list[str]:
     ]
 
 
+#: Part of the voxels that may lie in a last layer without elements before it is told.
+LEFT_OUT = 0.1
+
+
+def notes_on_layers(field: WaveField) -> list[str]:
+    """A note if many voxels lie beyond the last brick along an axis: a brick takes two steps of a voxel."""
+    inside = field.mask & np.isfinite(field.displacement).all(axis=(0, 4))
+    box = scipy.ndimage.find_objects(inside.astype(int))[0]
+    odd = tuple(slice(0, n - 1 + n % 2) for n in inside[box].shape)
+    every, kept = int(inside.sum()), int(inside[box][odd].sum())
+    axes = [f"{axis} ({n} voxels)" for axis, n in zip("xyz", inside[box].shape, strict=True) if n % 2 == 0]
+    if every - kept < LEFT_OUT * every:
+        return []
+    return [
+        f"{every - kept} of {every} voxels are in no element, which takes 3 voxels along an axis and shares the last "
+        f"with the next: the last layer along {', '.join(axes)} is left out; measure an odd number of voxels"
+    ]
+
+
 def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
     """The organ of a field, with the equations of its body; density in kg/m^3."""
     motion = field.displacement[(slice(None), *body.voxel.T)]

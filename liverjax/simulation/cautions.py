@@ -125,7 +125,7 @@ def cautions_of_mesh(mesh: TetMesh) -> list[str]:
     if size > LONGEST:
         said.append(f"the body is {size:.3g} m long: check the mesh's unit, e.g. write unit = 'mm'")
     if size < SHORTEST:
-        said.append(f"the body is {size:.3g} m long: check the mesh's unit, e.g. write unit = 'm'")
+        said.append(f"the body is {size:.3g} m long: check its size; if its numbers are metres, leave unit out")
     doubled = doubled_vertices(mesh)
     if doubled:
         said.append(
