@@ -121,7 +121,7 @@ def pytest_configure(config):
         config.compiled = tempfile.mkdtemp()
         os.environ["LIVERJAX_CACHE"] = "off"  # the user's own stays as it is
         os.environ["JAX_COMPILATION_CACHE_DIR"] = config.compiled
-        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.02"  # found again in a few milliseconds
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # found again in a few milliseconds
     # Tracing makes millions of objects that live on: Python would look through all of them again and again.
     gc.freeze()
     gc.set_threshold(100_000, 20, 20)

@@ -46,6 +46,7 @@ def test_errors_of_a_drift_hold_the_truth():
     assert fit.warnings[-1].startswith(alike_points.SHARED) and fit.details[alike_points.INDEPENDENT] < 30
 
 
+@pytest.mark.slow
 def test_independent_noise_and_exact_data_change_nothing():
     for seed in range(20):
         s = drifting(seed, 0.0)

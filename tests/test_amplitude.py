@@ -310,6 +310,7 @@ def test_a_coefficient_that_is_large_at_small_strains_is_no_limit(tmp_path):
     assert np.allclose(*errors, rtol=0.3)  # the same curve: only the strain has another unit
 
 
+@pytest.mark.slow
 def test_noise_in_percent_does_not_make_the_moduli_too_small():
     """Relative to each measured modulus, points that are low by chance weighed most: 2 % low of 10 % noise."""
     (candidate,), found = stress_stretch.candidates("neo_hookean"), []

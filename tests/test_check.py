@@ -143,7 +143,13 @@ def test_planted_mistakes_are_caught(mistake, tmp_path, capsys, monkeypatch):
     assert "FAILED" in output.out
 
 
-@pytest.mark.parametrize("steep", ["jnp.maximum(1 - (I1 - 3) / 0.5, 1e-6)", "jnp.maximum(1 - (I1 - 3) / 9.0, 1e-3)"])
+@pytest.mark.parametrize(
+    "steep",
+    [
+        "jnp.maximum(1 - (I1 - 3) / 0.5, 1e-6)",
+        pytest.param("jnp.maximum(1 - (I1 - 3) / 9.0, 1e-3)", marks=pytest.mark.slow),
+    ],
+)
 def test_a_steep_energy_is_no_jump(steep, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(figures, "gradient_check", lambda *_: None)
     file = tmp_path / "mine.py"

@@ -61,6 +61,7 @@ def test_errors_of_a_law_contain_uneven_noise():
     assert np.sqrt(np.mean(np.square(z))) < 2.0, z
 
 
+@pytest.mark.slow
 def test_factors_of_two_tests_are_in_the_errors_or_told():
     """Mooney's law in tension and equibiaxial tension, a factor of 10 % on each test, 2 % of noise: errors of the noise
     alone held 45 % of the intervals, and nothing was said.

@@ -65,7 +65,8 @@ def _shared(rng: np.random.Generator, n: int, part: float = 0.7) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("kind", ["shared", pytest.param("larger with the force", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["shared", "larger with the force"])
 def test_intervals_hold_with_noise_that_is_not_independent_or_equal(kind):
     """Errors of equal, independent noise held 57 and 84 % of the 95 % intervals of the modulus."""
     depth = np.linspace(0.0, 7e-4, 160)
@@ -234,7 +235,7 @@ def test_an_offset_of_the_sensor_is_taken_off_and_decimals_follow_the_table(tmp_
     assert np.allclose(read_indentation(tmp_path / "c.csv").force, force[40:], rtol=1e-7)
 
 
-@pytest.mark.parametrize("offset", [0.05, 0.3, *(pytest.param(v, marks=pytest.mark.slow) for v in (0.0, -0.05))])
+@pytest.mark.parametrize("offset", [0.05, *(pytest.param(v, marks=pytest.mark.slow) for v in (0.3, 0.0, -0.05))])
 def test_the_zero_of_the_force_is_fitted_with_its_error(offset):
     """5 % of the largest force as an offset moved the modulus by 11 %, and 3 to 17 errors of noise at 5 %."""
     force, layer = hertz(DEPTH - START), Layer(Indenter("sphere", 1e3 * H, 0.5, R))

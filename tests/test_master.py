@@ -98,7 +98,7 @@ def test_factors_of_the_moduli_are_told_where_only_frequencies_are_shifted(verti
     assert not any("factors too" in n for n in master_curve.master_curve(data, None, vertical=True).sweep.notes)
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.05])
+@pytest.mark.parametrize("noise", [pytest.param(0.02, marks=pytest.mark.slow), 0.05])
 def test_no_factors_are_told_of_a_power_law(noise):
     """Every a has its own b there: the note moved log a by more than a decade in 8 to 12 of 40 data sets."""
     true, omega = np.array([1.2, 0.6, 0.0, -0.55, -1.1]), np.geomspace(0.1, 100.0, 16)

@@ -86,6 +86,7 @@ def test_a_body_that_is_let_go_swings_and_the_time_goes_on(moving):
     np.testing.assert_allclose(none.positions, moving.positions, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_leaves_the_body_as_it_was(still):
     far = pulling.pulled(still, CORNER, still.positions[CORNER] - np.array([0, 0, 0.5]), 1e6)
     assert far.code not in (status.CONVERGED, status.ONE_STEP)

@@ -295,6 +295,7 @@ def test_sealed_fluid_in_float32_at_steps_far_beyond_diffusion():
         assert off < 1e-3  # ten times the tolerance of Newton
 
 
+@pytest.mark.slow
 def test_a_drained_layer_thinner_than_the_elements_is_told():
     """Without flow nothing leaves the column; its drained element of six loses its fluid all the same."""
     scene = column(6, 3, 1e-9 * DIFFUSION_TIME)

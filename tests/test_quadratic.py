@@ -341,7 +341,7 @@ def test_every_feature_runs_on_both_orders(feature):
         "pressure",
         pytest.param("isochoric", marks=pytest.mark.slow),
         pytest.param("sliding", marks=pytest.mark.slow),
-        "membrane",
+        pytest.param("membrane", marks=pytest.mark.slow),
     ],
 )
 def test_the_tangent_is_the_derivative_of_the_forces(feature):

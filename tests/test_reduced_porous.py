@@ -179,6 +179,7 @@ def test_points_serve_motion_and_pressure_and_the_errors_are_stated(trained):
             assert np.all((off < 2 * found.pressure_error) & (found.pressure_error < 2 * off + 2e-3))
 
 
+@pytest.mark.slow
 def test_a_scene_that_names_a_porous_model_is_run_by_it(trained, tmp_path):
     lj.save_reduced(trained.model, tmp_path / "model.h5")
     own, full = trained.unseen[0], trained.full[0]

@@ -178,8 +178,11 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
-def test_the_residual_is_the_gradient_of_the_energy(scene):
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if "chapter" in name else name for name in SCENES]
+)
+def test_the_residual_is_the_gradient_of_the_energy(name):
+    scene = SCENES[name]
     rng = np.random.default_rng(0)
     shaken = [MESH.points + 0.003 * rng.standard_normal(MESH.points.shape) for _ in range(2)]
     begin = equations.initial_state(scene)

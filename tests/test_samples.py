@@ -27,7 +27,10 @@ def test_exact_samples_have_the_interval_of_student():
     assert np.allclose(p.pooled, values, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("count", "spread", "error"), [(3, 0.2, 1e-3), (6, 0.2, 1e-3), (8, 0.2, 0.2), (8, 0.1, 0.2)])
+@pytest.mark.parametrize(
+    ("count", "spread", "error"),
+    [(3, 0.2, 1e-3), (6, 0.2, 1e-3), (8, 0.2, 0.2), pytest.param(8, 0.1, 0.2, marks=pytest.mark.slow)],
+)
 def test_a_new_sample_lies_in_its_interval(count, spread, error):
     """400 populations: 95 % or more, also where the errors hide the spread; exact ones as Student's t says."""
     rng, inside, lengths = np.random.default_rng(7), [], []
@@ -95,7 +98,14 @@ def test_intervals_cover_the_mean_and_a_new_sample():
 
 @pytest.mark.parametrize(
     ("spread", "errors"),
-    [(0.1, [0.1] * 5), (0.0, [0.1] * 5), (0.05, [0.3] * 10), (0.3, [0.01, 1.0]), (0.3, [0.01, 0.1, 1.0])],
+    [
+        (0.1, [0.1] * 5),
+        (0.3, [0.01, 1.0]),
+        *(
+            pytest.param(*own, marks=pytest.mark.slow)
+            for own in ((0.0, [0.1] * 5), (0.05, [0.3] * 10), (0.3, [0.01, 0.1, 1.0]))
+        ),
+    ],
 )
 def test_few_samples_have_errors_that_hold_them(spread, errors):
     """With the likeliest spread alone, which is often 0, the moved values were held in 34 to 68 % of the draws."""

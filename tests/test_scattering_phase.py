@@ -62,7 +62,7 @@ def test_the_reader_weighs_by_the_scatter_and_says_so(tmp_path):
     assert not any("misses the data" in w or "no noise" in w for w in fit.warnings)
 
 
-@pytest.mark.parametrize("repeats", [3, 50])
+@pytest.mark.parametrize("repeats", [3, pytest.param(50, marks=pytest.mark.slow)])
 def test_deviations_of_few_repeats_do_not_choose_the_points(repeats):
     """Means of three with their errors: 63 to 82 % of 95 % intervals held, and numbers were off twice as far."""
     G, hits, told, kept = modulus(np.array([0.3, 0.3])), [], 0, 0

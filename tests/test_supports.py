@@ -75,6 +75,7 @@ def test_springs_stiffer_than_the_digits_allow_are_told_as_roundoff():
     assert np.abs(result.positions[-1] - held).max() < 1e-5 * np.abs(held - mesh.points).max()
 
 
+@pytest.mark.slow
 def test_springs_along_the_normal_carry_the_whole_pull():
     """p on top, k below, sides that slide: uniform stress, so the bottom moves by p/k exactly, whatever the mesh."""
     mesh = box()

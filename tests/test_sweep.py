@@ -231,6 +231,7 @@ def test_failed_rows_are_told_by_the_process_that_comes_last(files, monkeypatch)
     assert done.file == out and list(done.failed) == [2] and done.computed == 3
 
 
+@pytest.mark.slow
 def test_rows_that_end_crushed_are_told(files, capsys):
     """They converged, and only `simulate` said that no tissue does it: a cube between walls, pressed to a tenth."""
     walls = '[[fixed]]\nwhere = {z_min = -1.0, z_max = 0.099}\naxes = "xy"\n'

@@ -162,7 +162,8 @@ def test_a_wrong_unit_of_one_test_is_named(scale):
     assert not any("try another --model" in w for w in fit.warnings)
 
 
-@pytest.mark.parametrize(("relative", "explained"), [pytest.param(0.0, False, marks=pytest.mark.slow), (0.03, True)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("relative", "explained"), [(0.0, False), (0.03, True)])
 def test_a_factor_that_sizes_of_samples_explain_is_no_alarm(relative, explained):
     fit = springpots_in_time.choose_together(wide_and_long(1.05, 0), "prony", relative=relative)
     (told,) = [w for w in fit.warnings if "the tests agree if" in w]

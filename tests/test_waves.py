@@ -278,7 +278,8 @@ def _found_in(U):
     return own, elastography.regions_of(own)
 
 
-@pytest.mark.parametrize("width", [pytest.param(0.0, marks=pytest.mark.slow), 0.7])
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [0.0, 0.7])
 def test_errors_of_smoothed_noise_hold_the_truth(width):
     """Noise of 2 % behind a Gaussian filter of 0.7 voxels: stated errors were a third of the true ones, without a
     word; two thirds of the moduli were more than two of them off."""

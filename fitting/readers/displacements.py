@@ -214,7 +214,7 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.
     outside = np.maximum(0.0, -weights.min(axis=-1))
     if mesh.order == 1:
         return tets[element], weights, outside
-    nodes = np.stack([np.asarray(n) for n in mesh.element_nodes], axis=1)
+    nodes = mesh.element_nodes_on_host.T
     return nodes[element], functions(2, weights.T)[0].T, outside
 
 

@@ -114,7 +114,7 @@ def region_matrices(
 
 def _nodes_of_elements(body: VoxelBody) -> np.ndarray:
     """Numbers (10, E) of the nodes of the elements."""
-    return np.stack([np.asarray(n) for n in body.mesh.element_nodes])
+    return body.mesh.element_nodes_on_host
 
 
 def _numbers_of_rows(body: VoxelBody, kinked: np.ndarray) -> np.ndarray:

@@ -108,7 +108,7 @@ def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
 
     values = np.empty(body.mesh.number_of_nodes, corners.dtype)
     values[: len(corners)] = corners
-    nodes = [np.asarray(n) for n in body.mesh.element_nodes]
+    nodes = body.mesh.element_nodes_on_host
     for middle, (i, j) in zip(nodes[4:], PAIRS, strict=True):
         values[middle] = 0.5 * (values[nodes[i]] + values[nodes[j]])
     return values

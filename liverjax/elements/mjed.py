@@ -153,7 +153,7 @@ def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
     """Global matrix (3V, 3V) of element matrices (E, 9 n^2) of n nodes, degree of freedom 3 * node + component."""
     import scipy.sparse  # here, since it takes a fifth of the package's import time
 
-    nodes = np.stack([np.asarray(n) for n in mesh.element_nodes], axis=1)
+    nodes = mesh.element_nodes_on_host.T
     dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
     rows, columns = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, (1, dofs.shape[1]))
     n = 3 * mesh.number_of_nodes

@@ -59,7 +59,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
     number_of_nodes = points.shape[0]
     traced = isinstance(points, jax.core.Tracer)
     near = np.zeros(number_of_nodes, dtype=np.int32) if traced else patches(np.asarray(points))
-    functions, widest = _patch_functions(jax.lax.stop_gradient(points), near)
+    functions, widest = _patch_functions(jax.lax.stop_gradient(points) if traced else points, near)
     tets = np.asarray(tetrahedra, dtype=int).reshape(-1, 4)
     if tets.size and (tets.min() < 0 or tets.max() >= number_of_nodes):
         tets = tets[:0]  # a mesh that `check_mesh` refuses

@@ -95,7 +95,7 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     linear = tet_mesh(points[used], new[tets[:, :4]], {}, element_sets)
     check_mesh(linear, name)
     mesh = quadratic(linear)
-    middles = np.stack([np.asarray(n) for n in mesh.element_nodes[4:]], axis=1)
+    middles = mesh.element_nodes_on_host[4:].T
     of_file = tets[:, [4 + _VTK.index(pair) for pair in PAIRS]]
     if np.any(np.isin(of_file, used)):
         raise InputError(f"{name}: a node is a vertex of one element and a middle in another; export the mesh anew")
@@ -324,5 +324,5 @@ def meshio_cells(mesh: TetMesh) -> tuple[str, np.ndarray]:
     """meshio's name of the cells, and the cells (E, 4) or (E, 10) in the order of VTK."""
     if mesh.order == 1:
         return "tetra", np.asarray(mesh.tetrahedra)
-    nodes = np.stack([np.asarray(n) for n in mesh.element_nodes], axis=1)
+    nodes = mesh.element_nodes_on_host.T
     return "tetra10", nodes[:, [*range(4), *(4 + PAIRS.index(pair) for pair in _VTK)]]

@@ -86,7 +86,7 @@ def straight_corners(mesh: TetMesh, x: np.ndarray) -> np.ndarray:
     """Corners (E, 4, 3), or (8 E, 4, 3) of elements with curved edges, at positions x (V, 3) [m]."""
     if mesh.order == 1:
         return x[np.asarray(mesh.tetrahedra)]
-    nodes = np.stack([np.asarray(a) for a in mesh.element_nodes[:10]], axis=1)
+    nodes = mesh.element_nodes_on_host[:10].T
     return x[nodes[:, _EIGHTHS].reshape(-1, 4)]
 
 
@@ -98,7 +98,7 @@ def _all_alike(parts: np.ndarray) -> np.ndarray:
 
 def weights(mesh: TetMesh, element: np.ndarray, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Nodes (n, m) of elements (m,), and the values of their functions at barycentric coordinates L (4, m)."""
-    nodes = np.stack([np.asarray(a) for a in mesh.element_nodes[: 4 if mesh.order == 1 else 10]])[:, element]
+    nodes = mesh.element_nodes_on_host[: 4 if mesh.order == 1 else 10, element]
     return nodes, L if mesh.order == 1 else functions(2, L)[0]
 
 

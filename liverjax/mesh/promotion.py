@@ -18,11 +18,16 @@ def quadratic(mesh: TetMesh) -> TetMesh:
     """
     if mesh.order > 1:
         return mesh
-    low, high = mesh.pattern.edges
-    points = jnp.concatenate([mesh.points, 0.5 * (mesh.points[low] + mesh.points[high])])
+    points = _with_middles(mesh.points, mesh.pattern.edges)
     sets = {name: node_numbers(of_faces(mesh, np.asarray(nodes))) for name, nodes in mesh.node_sets.items()}
     made = replace(mesh, points=points, node_sets=sets, order=2)
     return replace(made, clusters=_all_clusters(made))
+
+
+@jax.jit  # one program for each mesh, not one for each operation
+def _with_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
+    low, high = edges
+    return jnp.concatenate([points, 0.5 * (points[low] + points[high])])
 
 
 def of_faces(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
@@ -55,7 +60,7 @@ def _all_clusters(mesh: TetMesh) -> Clusters | None:
     if mesh.pattern.clusters is None or isinstance(mesh.points, jax.core.Tracer):
         return None
     points, tets, (low, high) = (np.asarray(a) for a in (mesh.points, mesh.tetrahedra, mesh.pattern.edges))
-    nodes = np.stack([np.asarray(n) for n in mesh.element_nodes])
+    nodes = mesh.element_nodes_on_host
     signs, places = np.ones(nodes.shape), points
     if mesh.order == 3:
         first, V = 4 + len(PAIRS), mesh.number_of_vertices
@@ -98,7 +103,7 @@ def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     V, N = mesh.number_of_vertices, mesh.pattern.edges.shape[1]
     low, high = np.asarray(mesh.pattern.edges)
     edges = np.flatnonzero(inside[low] & inside[high] & inside[V : V + N])
-    element = [np.asarray(n) for n in mesh.element_nodes[:10]]
+    element = mesh.element_nodes_on_host[:10]
     faces = [
         np.asarray(mesh.faces[k])[np.all([inside[element[n]] for n in _nodes_of_face(face)], axis=0)]
         for k, face in enumerate(FACES)

@@ -82,14 +82,24 @@ class TetMesh:
     @property
     def element_nodes(self) -> list[jax.Array]:
         """Numbers (E,) of the nodes of every element: 4, or 10 with the middles of `liverjax.mesh.adjacency.PAIRS`."""
-        vertices = [self.tetrahedra[:, a] for a in range(4)]
+        return self._nodes(self.tetrahedra, self.pattern.element_edges, self.faces)
+
+    @property
+    def element_nodes_on_host(self) -> np.ndarray:
+        """`element_nodes` in NumPy, (n, E): JAX would compile a program for each of them."""
+        faces = None if self.faces is None else np.asarray(self.faces)
+        return np.stack(self._nodes(np.asarray(self.tetrahedra), np.asarray(self.pattern.element_edges), faces))
+
+    def _nodes(self, tetrahedra: Indices, edges: Indices, faces: Indices | None) -> list:
+        vertices = [tetrahedra[:, a] for a in range(4)]
         if self.order == 1:
             return vertices
         V, N = self.number_of_vertices, self.pattern.edges.shape[1]
-        middles = [V + edge for edge in self.pattern.element_edges]
+        middles = [V + edge for edge in edges]
         if self.order == 2:
             return vertices + middles
-        return vertices + middles + [N + m for m in middles] + [V + 2 * N + face for face in self.faces]
+        more = () if faces is None else faces
+        return vertices + middles + [N + m for m in middles] + [V + 2 * N + face for face in more]
 
     def edges(self, columns: Sequence[jax.Array]) -> list[tuple[jax.Array, ...]]:
         """y_k - y_0 of a nodal field with columns (V,): for k = 1, 2, 3 one array per column, (E,) or (Q, E).
@@ -149,8 +159,8 @@ def tet_mesh(
     """
     if isinstance(tetrahedra, jax.core.Tracer):
         raise InputError("tet_mesh: the node numbers are traced: make the mesh outside jit, grad and vmap")
-    # Copies: asarray may alias the caller's NumPy arrays, and the mesh would change with them.
-    points = jnp.array(points, dtype=float)
+    # Copies: asarray may alias the caller's NumPy arrays, and the mesh would change with them. NumPy compiles nothing.
+    points = jnp.array(points, float) if isinstance(points, jax.core.Tracer) else _float_copy(points)
     neighbours = pattern(tetrahedra, points)
     tetrahedra = node_numbers(tetrahedra)
     shape_vectors, volumes = _geometry(points, tetrahedra)
@@ -164,6 +174,10 @@ def tet_mesh(
         element_sets=elements,
         pattern=neighbours,
     )
+
+
+def _float_copy(points: Numbers) -> jax.Array:
+    return jnp.asarray(np.array(points, jnp.result_type(float)))
 
 
 def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:

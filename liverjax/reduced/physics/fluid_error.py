@@ -87,7 +87,7 @@ def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list
 
     def matrix(entries: np.ndarray, count: int) -> "scipy.sparse.csr_array":
         """The matrix from entries (n, Q, E) of the n nodes of every element."""
-        nodes = np.stack([np.broadcast_to(np.asarray(n), (Q, E)) for n in mesh.element_nodes[: len(entries)]])
+        nodes = np.broadcast_to(mesh.element_nodes_on_host[: len(entries), None], entries.shape)
         at = (np.broadcast_to(rows, entries.shape).ravel(), nodes.ravel())
         return scipy.sparse.csr_matrix((entries.ravel(), at), shape=(Q * E, count))
 

@@ -50,7 +50,7 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    each, n = [np.asarray(a) for a in scene.mesh.element_nodes], scene.mesh.number_of_nodes
+    each, n = scene.mesh.element_nodes_on_host, scene.mesh.number_of_nodes
     rows, columns = np.tile(each[0], len(each)), np.concatenate(each)
     pieces, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
     fixed = np.argwhere(~free_places(scene.mesh, scene.fixed, scene.displaced))
