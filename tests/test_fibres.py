@@ -133,3 +133,15 @@ def test_directions_of_another_shape_are_refused(fibre, distorted_box):
     mesh, x = distorted_box
     with pytest.raises(lj.InputError, match="a direction has shape"):
         mjed.internal_force(mesh, Holzapfel(mu=500.0, k1=100.0, k2=2.0, bulk=5000.0, fibre=jnp.array(fibre)), x)
+
+
+def test_a_fibre_without_length_is_refused():
+    """The run ended with the sentence on inverted elements."""
+    mesh = lj.shapes.box((0.01, 0.01, 0.01), (1, 1, 1))
+    directions = np.tile([1.0, 0.0, 0.0], (mesh.number_of_elements, 1))
+    directions[2] = 0.0
+    for fibre in ((0.0, 0.0, 0.0), directions):
+        law = Holzapfel(mu=500.0, k1=100.0, k2=2.0, bulk=5000.0, fibre=fibre)
+        for own in (law, law + lj.laws.NeoHookean(mu=100.0, bulk=None)):
+            with pytest.raises(lj.InputError, match="law Holzapfel: a fibre has no length"):
+                lj.simulate(lj.Scene(mesh=mesh, law=own, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),)))

@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, replace, static, struct, unnamed
@@ -48,6 +49,14 @@ class Law(Energies):
 
     def check(self) -> None:
         """Raise `InputError` if the values of two fields contradict each other."""
+        self.check_directions()
+
+    def check_directions(self) -> None:
+        """Raise `InputError` if a fibre has no length; traced ones pass."""
+        if self.fibre is None or any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(self.fibre)):
+            return
+        if not np.all(np.linalg.norm(np.asarray(self.fibre, float), axis=-1) > 0):
+            raise InputError(f"law {type(self).__name__}: a fibre has no length: give a direction that is not zero")
 
     # -- what a law is made of ----------------------------------------------------------------------------------------
 

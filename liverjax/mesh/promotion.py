@@ -18,14 +18,14 @@ def quadratic(mesh: TetMesh) -> TetMesh:
     """
     if mesh.order > 1:
         return mesh
-    points = _with_middles(mesh.points, mesh.pattern.edges)
+    points = _points_and_middles(mesh.points, mesh.pattern.edges)
     sets = {name: node_numbers(of_faces(mesh, np.asarray(nodes))) for name, nodes in mesh.node_sets.items()}
     made = replace(mesh, points=points, node_sets=sets, order=2)
     return replace(made, clusters=_all_clusters(made))
 
 
 @jax.jit  # one program for each mesh, not one for each operation
-def _with_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
+def _points_and_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
     low, high = edges
     return jnp.concatenate([points, 0.5 * (points[low] + points[high])])
 

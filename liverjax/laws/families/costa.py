@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -63,8 +64,10 @@ class Costa(Law):
         """Voigt's mean: bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
         return (0.0 if self.bulk is None else self.bulk) + self.c * sum(self._weights()[:3]) / 9
 
-    def check(self):
-        """Raise `InputError` if a direction has no length or the sheet lies along the fibre."""
+    def check_directions(self):
+        """Raise `InputError` if a direction has no length or the sheet lies along the fibre; traced ones pass."""
+        if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves((self.fibre, self.sheet))):
+            return
         f, s = np.asarray(self.fibre, float), np.asarray(self.sheet, float)
         if f.shape[-1:] != (3,) or s.shape[-1:] != (3,):
             raise InputError(

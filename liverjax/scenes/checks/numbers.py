@@ -9,7 +9,9 @@ from liverjax.scenes.springpots import check_springpots
 
 
 def check_bounds(scene: Scene) -> None:
-    """Refuse numbers out of bounds. Traced ones pass; `check_mesh` checks the mesh. Compiles nothing.
+    """Refuse numbers out of bounds, and directions without length; compiles nothing.
+
+    Traced ones pass; `check_mesh` checks the mesh.
 
     Raises:
         InputError: one sentence with the number's dotted name, value, bound and remedy.
@@ -17,6 +19,9 @@ def check_bounds(scene: Scene) -> None:
     bounds.check_fields(scene, leave=("mesh", "physics"))
     for name, physics in named_physics(scene):
         bounds.check_fields(physics, name)
+    for law in laws_of(scene.law, scene.region):
+        for one in law.summands():
+            one.check_directions()
     if scene.viscosity is not None:
         viscosity.check_series(scene.viscosity)
     if scene.porosity is not None:
