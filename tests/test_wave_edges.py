@@ -301,7 +301,7 @@ def test_the_errors_of_a_cylinder_are_those_of_repeated_noise():
     assert 0.5 < np.std(np.real(moduli), ddof=1) / e.real < 1.6 and 0.5 < np.std(np.imag(moduli), ddof=1) / e.imag < 1.6
 
 
-def test_a_region_that_says_nothing_is_told():
+def test_a_region_that_says_nothing_is_told(monkeypatch):
     field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, voxels_across=13)
     labels = field.labels.copy()
     labels[0, 0, 0] = 9  # at a corner, where no force is known
@@ -310,6 +310,9 @@ def test_a_region_that_says_nothing_is_told():
     assert np.all(np.isfinite(found.parts.modulus))
     told = cautions.cautions_of_elastography(own, found, None)
     assert any("region 9: its standard error" in one for one in told) and not any("region 2" in one for one in told)
+    monkeypatch.setattr(cautions, "LEAST_RADIUS", 100.0)
+    told = cautions.cautions_of_elastography(own, found, None)
+    assert any("a modulus is a guess" in one and "2 (" in one and "9 (" not in one for one in told)
 
 
 @pytest.mark.parametrize("radius, told", [(1, ["2 (7 voxels)"]), (2.5, [])])

@@ -125,12 +125,12 @@ def assessed(
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))
     lowest = costs[best] * (1 + 1e-6) + 1e-20  # of all starts that reached the minimum
-    u, J, r = (np.asarray(v[best]) for v in (found.u, found.jacobian, found.residuals))
+    u, J, r = (np.asarray(v)[best] for v in (found.u, found.jacobian, found.residuals))
     n, p = sum(len(c.stress) for c in curves), len(u)
     misfit, k = r[:n], p + 1
-    values = np.asarray(candidate.values(jnp.asarray(u), scale))
+    values = np.asarray(jax.jit(candidate.values)(u, scale))
     noise = noise_factor(misfit, n - p, deviations_given=False)
-    slope = np.asarray(jax.jacfwd(candidate.values)(jnp.asarray(u), scale))
+    slope = np.asarray(jax.jit(jax.jacfwd(candidate.values))(u, scale))
     every, _ = errors_and_correlation(spread(J[:n], max(noise, _LEAST_NOISE), slope)[0])
     limits = _run_away(candidate, values, every, scale)
     # A parameter at its limit has no error; the errors of the others are those of the law at that limit.

@@ -86,7 +86,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
         row_nodes=node_numbers(row_nodes),
         row_edges=node_numbers(row_edges),
         edge_slots=node_numbers(slots),
-        patches=jnp.asarray(near),
+        patches=jax.device_put(near),
         patch_functions=functions,
         patch_width=widest,
         clusters=None if traced else vertex_clusters(np.asarray(points), np.stack([low, high])),
@@ -123,7 +123,8 @@ def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, j
     widest = xp.max(high - low, axis=1)
     half = xp.where(widest > 0, widest / 2, 1.0)
     place = (given - (low + high)[patch] / 2) / half[patch][:, None]
-    return jnp.asarray(xp.concatenate([xp.ones_like(place[:, :1]), place], axis=1)), jnp.asarray(xp.mean(widest))
+    functions = xp.concatenate([xp.ones_like(place[:, :1]), place], axis=1), xp.mean(widest)
+    return functions if xp is jnp else jax.device_put(functions)
 
 
 def vertex_clusters(points: np.ndarray, edges: np.ndarray) -> Clusters | None:
@@ -197,7 +198,7 @@ def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, 
     places = (number[group[one]] * M + place[one]) * M + place[other]
     return Clusters(
         nodes=node_numbers(nodes),
-        there=jnp.asarray(there, float),
+        there=jax.device_put(np.asarray(there, jnp.result_type(float))),
         places=node_numbers(places),
         sources=tuple(node_numbers(s[inside]) for s in sources),
     )

@@ -1,6 +1,6 @@
 """Integrals of fields times nodal functions, and values of nodal fields at the points of elements."""
 
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from math import factorial
 
@@ -61,11 +61,13 @@ _LUMPED = {1: (1 / 4,), 2: (1 / 36, 4 / 27)}
 _INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
 
 
+@partial(jax.jit, inline=True)
 def nodal_volumes(mesh: TetMesh) -> jax.Array:
     """Lumped mass over density (V,) [m^3]: a quarter of every linear element at each of its nodes."""
     return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)])
 
 
+@partial(jax.jit, inline=True)
 def load_volumes(mesh: TetMesh) -> jax.Array:
     """Integrals of the shape functions (V,) [m^3]: the nodal forces of a uniform weight of 1 N/m^3."""
     total = _weighted_parts(mesh, _INTEGRALS[mesh.order])

@@ -1,5 +1,7 @@
 """Integrals over triangles of the surface: nodal shares of tractions, pressures and springs."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +39,7 @@ def _middle(mesh: TetMesh, a: Indices, b: Indices) -> jax.Array:
     return mesh.number_of_vertices + jnp.sum(edge, axis=0)
 
 
+@partial(jax.jit, inline=True)  # outside of programs one program, not one for each operation
 def areas(points: jax.Array, triangles: Indices) -> jax.Array:
     """Areas times normals (m, 3) [m^2] of flat triangles."""
     corner = points[triangles]

@@ -177,7 +177,7 @@ def tet_mesh(
 
 
 def _float_copy(points: Numbers) -> jax.Array:
-    return jnp.asarray(np.array(points, jnp.result_type(float)))
+    return jax.device_put(np.array(points, jnp.result_type(float)))
 
 
 def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:

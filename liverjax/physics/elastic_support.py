@@ -7,6 +7,7 @@ stiffness. In other elements the springs are integrated over the triangle.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -115,6 +116,7 @@ def _refuse_idle(support: ElasticSupport, keys: tuple[str, ...], name: str, inst
             raise InputError(f"{name}.{key} = {getattr(support, key)} changes nothing: {instead}")
 
 
+@partial(jax.jit, inline=True)
 def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
     """Stiffness of the nodes: 3 x 3 blocks of arrays (V,) [N/m]."""
     zero = jnp.zeros(mesh.points.shape[0], mesh.points.dtype)

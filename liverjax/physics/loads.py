@@ -1,5 +1,6 @@
 """Loads: weight, dead tractions, and pressures that follow the body."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -32,6 +33,7 @@ class Traction:
         return replace(self, times=None, history=None, **{key: now})
 
 
+@partial(jax.jit, inline=True)
 def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
     """Dead nodal forces (V, 3) [N]: the nodes' shares of reference area times traction."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)

@@ -12,6 +12,7 @@ Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalt
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import jax
@@ -291,6 +292,7 @@ def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
     return distance(obstacle.shape, y, [axis[0], axis[1], axis[2]], obstacle.radius, angle)
 
 
+@partial(jax.jit, inline=True)
 def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> Distance:
     """Distances of the points of the triangles (Q, m)."""
     return distances(obstacle, contact_points(obstacle, mesh, x), moved)
@@ -345,6 +347,7 @@ def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) ->
     return bool(just_touching(obstacle, mesh, d).any() & nothing.all())
 
 
+@partial(jax.jit, inline=True)
 def _triangle_areas(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     """Areas (m,) [m^2] of the triangles in the reference shape."""
     normal = surface.areas(mesh.points, obstacle.triangles)
