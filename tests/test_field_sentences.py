@@ -27,6 +27,7 @@ def test_a_fit_that_misses_the_data_says_so():
     assert field_report.misfit_sentence(found._replace(chi2=89.0)) is None
     said = field_report.misfit_sentence(found._replace(chi2=0.6))  # a noise in millimetres
     assert said is not None and "scatter 0.1 times as much as the stated noise" in said
+    assert field_report.misfit_sentence(found._replace(chi2=0.6), with_mesh=True) is None
     said = field_report.misfit_sentence(found._replace(chi2=240.0))
     assert said is not None and "chi2 stays at 4 per component" in said and "by 2 times their noise" in said
     assert field_report.of_numbers(found._replace(chi2=240.0))["warnings"] == [said] and "the mesh's error" not in said

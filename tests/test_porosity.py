@@ -9,7 +9,7 @@ import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.physics import darcy, porosity
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation.cautions import cautions_of_run, mesh_sentence
+from liverjax.simulation.cautions import cautions_of_run, cautions_of_waves, mesh_sentence
 from liverjax.simulation.equations import initial_state
 from liverjax.simulation.run import _cast
 from liverjax.tensors.matrices import deformation_gradient
@@ -293,6 +293,16 @@ def test_sealed_fluid_in_float32_at_steps_far_beyond_diffusion():
         single = lj.simulate(replace(scene, body=weight, solve=replace(solve, precision="float32"))).check()
         off = np.abs(np.asarray(single.pressure, float) - exact.pressure).max() / np.abs(exact.pressure).max()
         assert off < 1e-3  # ten times the tolerance of Newton
+
+
+def test_a_drained_layer_of_harmonic_motion_is_told():
+    """At 100 Hz the loss of a column with 24 elements was a quarter of the true one, with a stated error of 5e-5."""
+    scene, told = column(6, 3, 1.0), []
+    for hertz in (0.1 / DIFFUSION_TIME, 100 / DIFFUSION_TIME):
+        solve = replace(scene.solve, kind="harmonic", frequencies=jnp.array([1e-3 * hertz, hertz]))
+        every = cautions_of_waves(replace(scene, body=lj.Body(density=1e-3), solve=solve))
+        told.append([said for said in every if "the fluid leaves a layer" in said])
+    assert not told[0] and told[1][0].startswith(f"at {hertz:.3g} Hz, within 1/omega = {1 / (2 * np.pi * hertz):.2g} s")
 
 
 @pytest.mark.slow

@@ -121,8 +121,9 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     if options.sphere:
         sphere = inclusion.estimate(problem, options.name, inclusion.start_from(problem, found))
         print(field_report.table_of_numbers(sphere))
-        _warn(field_report.misfit_sentence(sphere))
-        content["sphere"] = field_report.of_numbers(sphere)
+        with_mesh = max(beside) > _TOLD
+        _warn(field_report.misfit_sentence(sphere, with_mesh))
+        content["sphere"] = field_report.of_numbers(sphere, with_mesh)
         good = good and sphere.converged
     field_report.write(options.out, mesh, content, found)
     print(f"written: {options.out}/field.json, field.vtu, field.h5, field.png")

@@ -31,10 +31,13 @@ TOO_FAR, TOO_NEAR, FEW = 1.5, 0.4, 50
 MESH = 1.0
 
 
-def misfit_sentence(found: Estimate) -> str | None:
-    """A warning if the fit misses the displacements by more than their noise, or by far less; else None."""
+def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
+    """A warning if the fit misses the displacements by more than their noise, or by far less; else None.
+
+    If an estimate of the mesh's error counts as noise (`with_mesh`), less is no sign of a wrong noise.
+    """
     ratio = found.chi2 / found.components
-    if ratio < TOO_NEAR and found.components >= FEW:
+    if ratio < TOO_NEAR and found.components >= FEW and not with_mesh:
         return (
             f"chi2 is {ratio:.3g} per component, so the displacements scatter {np.sqrt(ratio):.2g} times as much as "
             "the stated noise, and the errors are too large by as much: give the noise in metres (--noise), whatever "
@@ -74,8 +77,8 @@ def noise_sentence(found: Field) -> str | None:
     )
 
 
-def of_numbers(found: Estimate) -> Content:
-    """The content of field.json for a few numbers."""
+def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
+    """The content of field.json for a few numbers; `with_mesh` is that of `misfit_sentence`."""
     return {
         "values": dict(zip(found.names, found.values.tolist(), strict=True)),
         "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
@@ -87,7 +90,7 @@ def of_numbers(found: Estimate) -> Content:
         "iterations": found.iterations,
         "converged": found.converged,
         "status": [NAMES[c] for c in found.codes],
-        "warnings": [sentence for sentence in (misfit_sentence(found), *bias_sentences(found)) if sentence],
+        "warnings": [sentence for sentence in (misfit_sentence(found, with_mesh), *bias_sentences(found)) if sentence],
         "run_time_s": found.seconds,
     }
 

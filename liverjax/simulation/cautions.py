@@ -83,6 +83,9 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
             said.append(
                 f"{name} touches the body without pressure: it cannot pull, and here it holds in both directions"
             )
+    if scene.porosity is not None and scene.solve.frequencies is not None:
+        hertz = float(np.max(np.asarray(scene.solve.frequencies)))
+        said += _of_drained_layer(scene, 1 / (2 * np.pi * hertz), f"at {hertz:.3g} Hz, within 1/omega = {{:.2g}} s,")
     return said
 
 
@@ -328,7 +331,10 @@ def _of_pressures(scene: Scene, result: Result) -> list[str]:
         return []
     P = np.asarray(result.pressure)
     if scene.porosity.scheme != "lagged":
-        return _of_overshoot(scene, P[:, : scene.mesh.number_of_vertices]) + _of_drained_layer(scene, len(P))
+        return [
+            *_of_overshoot(scene, P[:, : scene.mesh.number_of_vertices]),
+            *_of_drained_layer(scene, float(scene.solve.dt or 0.0) * len(P), "in {:.3g} s"),
+        ]
     if len(P) < 4:
         return []
     once, twice = np.abs(np.diff(P, axis=0)).sum(), np.abs(P[2:] - P[:-2]).sum()
@@ -350,15 +356,15 @@ def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
     return float(np.median(3 * np.abs(np.asarray(scene.mesh.volumes)[at]) / area))
 
 
-def _of_drained_layer(scene: Scene, steps: int) -> list[str]:
-    """A sentence if the layer that drains in the whole run is thinner than the elements there.
+def _of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
+    """A sentence if the layer that drains in a time is thinner than the elements there; `when` names the time.
 
     After a time t the fluid has left a layer of about sqrt(c t), with the diffusivity c = kappa / (1/K_lim + 1/M) (Biot
     1941). The pressure is linear in an element, so a thinner layer is drained too much.
     """
     sponge = scene.porosity
     assert sponge is not None
-    if sponge.drained is None or scene.solve.dt is None:
+    if sponge.drained is None or not seconds > 0:
         return []
     given = np.isin(np.asarray(scene.mesh.tetrahedra), np.asarray(sponge.drained))
     at = np.flatnonzero(given.sum(axis=1) == 3)
@@ -372,11 +378,11 @@ def _of_drained_layer(scene: Scene, steps: int) -> list[str]:
         float(np.median(np.asarray(own))) for own in (sponge.bulk, sponge.limit_bulk, sponge.permeability)
     )
     height = _height_beside(scene, at, given)
-    layer = float(np.sqrt(kappa / (1 / limit + 1 / (K0 + 4 / 3 * shear)) * float(scene.solve.dt) * steps))
+    layer = float(np.sqrt(kappa / (1 / limit + 1 / (K0 + 4 / 3 * shear)) * seconds))
     if layer >= height:
         return []
     return [
-        f"in {float(scene.solve.dt) * steps:.3g} s the fluid leaves a layer of about {layer:.2g} m at the drained "
+        f"{when.format(seconds)} the fluid leaves a layer of about {layer:.2g} m at the drained "
         f"places, and the elements there are {height:.2g} m high: they drain too much, so that pressures and "
         "displacements are wrong there, and the mesh error does not contain it: take thinner elements there, or hold "
         "the fluid (no drained places) if nothing should flow"
