@@ -96,6 +96,7 @@ def test_the_error_of_the_gap_is_added_as_before():
     np.testing.assert_allclose(wide.standard_errors[1:], plain.standard_errors[1:], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_posterior_says_that_it_takes_noise_as_independent(tmp_path):
     s = drifting(3, 5.0)
     head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"

@@ -45,6 +45,7 @@ def test_explicit_dynamics_agrees_with_newmark(prony):
     assert np.log2(apart[0] / apart[1]) == pytest.approx(2, abs=0.3)
 
 
+@pytest.mark.slow
 def test_explicit_dynamics_is_stable_just_below_its_critical_step():
     """Ten per cent above it the displacement explodes."""
     scene = _bar(dt=1.0)

@@ -155,6 +155,7 @@ def test_the_closed_form_takes_the_inertia_of_the_sample_off(tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_points_that_the_inertia_of_the_sample_bends_are_kept_if_it_is_known(tmp_path, capsys):
     """They were left out as the mark of the instrument before the inertia of the sample was taken off."""
     hertz = np.logspace(-1.7, 1.5, 33)

@@ -70,6 +70,7 @@ def test_springpots_about_a_stretched_state(part):
         assert np.abs(moved - exact).max() > 1e-2 * np.abs(exact).max()
 
 
+@pytest.mark.slow
 def test_springpots_of_a_scene_file(tmp_path):
     """A springpot, and one in a row with a spring, beside 0.3 of the law: factors by the formula in mpmath."""
     mpmath = pytest.importorskip("mpmath")

@@ -114,7 +114,8 @@ def test_the_error_of_friction_is_that_of_scipy():
     assert "the instrument's friction is 1" in better.notes[-1] and "larger than what it subtracted" in better.notes[-1]
 
 
-@pytest.mark.parametrize("size", [pytest.param(2.0, marks=pytest.mark.slow), 40.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [2.0, 40.0])
 def test_a_friction_above_the_loss_modulus_is_found(size):
     """The first linear step is far too long; and the noise is that of all that was measured, 0.4 % of it."""
     z = []

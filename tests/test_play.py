@@ -72,6 +72,7 @@ def test_a_pulled_body_rests_where_a_ligament_holds_it(still):
     np.testing.assert_allclose(back.positions, still.positions, atol=1e-7 * moved)
 
 
+@pytest.mark.slow
 def test_a_body_that_is_let_go_swings_and_the_time_goes_on(moving):
     found = moving
     for _ in range(5):

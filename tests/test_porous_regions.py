@@ -59,7 +59,8 @@ def test_a_region_of_all_elements_is_the_body(order, scheme):
     np.testing.assert_allclose(found.positions, alone.positions, atol=1e-9)
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
 def test_flow_through_two_layers(order, verified):
     """Between two pressures the same flux passes both layers: slopes are as the inverse permeabilities."""
     mesh = column(order).mesh

@@ -33,6 +33,7 @@ def relaxation(factor: float = 1.0) -> TimeTest:
     return TimeTest("relaxation", at, np.ones(len(at)), answer, at > 0, source="relaxation.csv")
 
 
+@pytest.mark.slow
 def test_errors_of_the_prediction_cover_the_truth():
     """Relaxation without noise of its own, predicted from 20 sweeps with 2 %: 95 % of the points lie within."""
     covered = []

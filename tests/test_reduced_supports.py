@@ -42,6 +42,7 @@ def _on_springs(order: int = 1, cells: tuple = (1, 1, 1), **changes) -> lj.Scene
 MOVING = lj.Solve(kind="dynamic", integrator="newmark", dt=0.05, steps=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "changes"),
     [

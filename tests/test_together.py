@@ -150,7 +150,8 @@ def test_a_small_factor_between_the_tests_is_named_too():
     assert not any("the tests agree if" in w for w in same.warnings)
 
 
-@pytest.mark.parametrize("scale", [10.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (50.0, 1e-3))])
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [10.0, 50.0, 1e-3])
 def test_a_wrong_unit_of_one_test_is_named(scale):
     """The common fit of such tests may have too few modes for either, and lies far from both."""
     fit = springpots_in_time.choose_together(wide_and_long(scale, 0), "prony")
