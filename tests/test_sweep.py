@@ -17,7 +17,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.commands.sweep import OUTPUTS
 from liverjax.core import status
-from liverjax.jobs import design, resumable_parts, sweep
+from liverjax.jobs import resumable_parts, sweep
 from liverjax.simulation.batch import strategy_for
 
 pytestmark = pytest.mark.quick_to_compile
@@ -415,40 +415,6 @@ def test_no_room_for_the_joined_file_keeps_the_parts(files, monkeypatch, capsys)
     assert "No space left on device: finished chunks are kept, go on with --resume" in capsys.readouterr().err
     monkeypatch.undo()
     assert main(command(files, "--resume")) == 0
-
-
-@pytest.mark.parametrize("kind, rows", [("grid", 9), ("latin", 10), ("sobol", 8)])
-def test_designs(files, kind, rows):
-    table = files / "design.csv"
-    ranges = ["law.mu=500:1000", "body.density=1000:1100"]
-    assert main(["design", str(table), *ranges, "--kind", kind, "--rows", str(rows), "--seed", "3"]) == 0
-    assert table.read_text().startswith("# grid\n" if kind == "grid" else f"# {kind}, seed 3\n")
-    names, found = sweep.read_table(table)
-    assert names == ("law.mu", "body.density") and found.shape == (rows, 2)
-    assert (found.min(axis=0) >= [500, 1000]).all() and (found.max(axis=0) <= [1000, 1100]).all()
-    again = design.design(design.read_ranges(ranges), rows, kind, 3)
-    assert np.array_equal(found, again)
-
-
-def test_unusable_designs_are_refused(files, capsys):
-    for given, sentence in (
-        (["law.mu=5"], "is not a range"),
-        (["law.mu=5:1"], "does not rise"),
-        (["a=1:2", "a=1:2"], "two"),
-        (["a=1:2", "b=1:2", "--kind", "grid", "--rows", "3"], "too few for a grid of 2 parameters: give 4"),
-    ):
-        assert main(["design", str(files / "d.csv"), *given]) == 2
-        assert sentence in capsys.readouterr().err
-
-
-def test_a_table_is_not_written_over_other_files(files, capsys):
-    scene = (files / "scene.toml").read_text()
-    assert main(["design", str(files / "scene.toml"), "law.mu=500:600"]) == 2
-    assert "is no table of design" in capsys.readouterr().err and (files / "scene.toml").read_text() == scene
-    (files / "d.csv").touch()  # an empty file is no other table
-    for rows in ("2", "4"):
-        assert main(["design", str(files / "d.csv"), "law.mu=500:600", "--rows", rows]) == 0
-        assert len(sweep.read_table(files / "d.csv")[1]) == int(rows)
 
 
 @pytest.mark.slow

@@ -70,15 +70,15 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
 
 
 def _of_small_regions(field: WaveField, labels: np.ndarray) -> list[str]:
-    """A sentence on regions in whose voxels no ball of `LEAST_RADIUS` has room."""
+    """A sentence on regions without a voxel that is `LEAST_RADIUS` from other regions; the organ's own end is none."""
     assert field.labels is not None
-    places = [(label, (field.labels == label) & field.mask) for label in labels]
-    small = [
-        f"{label} ({int(place.sum())} voxels)"
-        for label, place in places
-        if scipy.ndimage.distance_transform_edt(place).max() < LEAST_RADIUS
-    ]
-    if not small or len(labels) < 2:
+    small = []
+    for label in labels:
+        own, others = field.mask & (field.labels == label), field.mask & (field.labels != label)
+        away = scipy.ndimage.distance_transform_edt(~others)[own].max(initial=0.0)
+        if others.any() and away < LEAST_RADIUS:
+            small.append(f"{label} ({int(own.sum())} voxels)")
+    if not small:
         return []
     return [
         f"regions {', '.join(small)}: below {LEAST_RADIUS:g} voxels of radius a modulus is a guess, and its error does "
