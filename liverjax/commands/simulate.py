@@ -126,7 +126,7 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
     from liverjax.simulation.run import prepared
 
     scene = prepared(scene)
-    arguments = (scene, richer(scene), result.positions, result.reactions)
+    arguments = (scene, richer(scene), result.positions, result.reactions, result.pressure)
     return replace(result, mesh_error=compiled(estimated_error, *arguments)(*arguments))
 
 

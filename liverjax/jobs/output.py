@@ -50,7 +50,10 @@ def write_hdf5(
             out["pressure"] = np.asarray(result.pressure)
             out["pressure"].attrs["unit"] = "Pa"
         if result.mesh_error is not None:
-            for name, unit in (("positions", "m"), ("reactions", "N"), ("found", "1")):
+            units = {"positions": "m", "reactions": "N", "found": "1", "pressure": "Pa"}
+            for name, unit in units.items():
+                if getattr(result.mesh_error, name) is None:
+                    continue
                 out[f"mesh_error/{name}"] = np.asarray(getattr(result.mesh_error, name))
                 out[f"mesh_error/{name}"].attrs["unit"] = unit
         for name, values in (fields or {}).items():

@@ -136,6 +136,8 @@ def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str,
     if waves.mesh_error is not None:
         arrays["mesh_error/displacement"] = (waves.mesh_error.displacement, "m")
         arrays["mesh_error/reactions"] = (waves.mesh_error.reactions, "N")
+        if waves.mesh_error.pressure is not None:
+            arrays["mesh_error/pressure"] = (waves.mesh_error.pressure, "Pa")
     with whole(file) as new, h5py.File(new, "w") as out:
         for name, (values, unit) in arrays.items():
             out[name] = np.asarray(values)

@@ -1,9 +1,10 @@
 """A finer mesh: every tetrahedron cut into eight of half its size, or those near some nodes cut in two."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import Indices, replace
+from liverjax.core.struct import Array, Indices, replace
 from liverjax.mesh.adjacency import PAIRS, node_numbers
 from liverjax.mesh.promotion import of_faces, quadratic
 from liverjax.mesh.selection import boundary_triangles
@@ -16,7 +17,9 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
 
     The old vertices keep their numbers, and the middles of the edges follow in the order of `pattern.edges`. So the new
     vertices are the nodes of `quadratic(mesh)`. A node set also gets the new nodes on all faces whose three vertices it
-    contains. The surface keeps its flat triangles: refinement does not bring it nearer to the organ.
+    contains. The parts of element e are the elements 8 e … 8 e + 7, and an element set contains the parts of its
+    elements. The surface keeps its flat triangles: refinement does not bring it nearer to the organ. Positions may be
+    traced if `near` is not given and the mesh has no triangle sets.
 
     Args:
         near: node numbers (n,). If given, only the edges at these nodes are halved, and the further edges that keep the
@@ -24,7 +27,8 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
             flatter. `rim` gives the nodes around a clamp, where most of a mesh's error is.
     """
     V = mesh.number_of_vertices
-    points, (low, high) = np.asarray(mesh.points)[:V], np.asarray(mesh.pattern.edges)
+    points: Array = mesh.points if isinstance(mesh.points, jax.core.Tracer) else np.asarray(mesh.points)
+    points, (low, high) = points[:V], np.asarray(mesh.pattern.edges)
     halved = np.ones(len(low), bool) if near is None else _halved(mesh, np.asarray(near))
     middle = np.where(halved, V - 1 + np.cumsum(halved), -1)
     tets = _eighths(mesh, middle) if near is None else _bisected(mesh, middle)
@@ -33,16 +37,45 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
         own = np.asarray(nodes)[np.asarray(nodes) < V]
         new = middle[of_faces(mesh, own)[len(own) :] - V]
         sets[name] = np.concatenate([own, new[new >= 0]])
-    made = tet_mesh(np.vstack([points, 0.5 * (points[low] + points[high])[halved]]), tets, sets)
+    elements = {} if near is not None else {name: parts_of(own) for name, own in mesh.element_sets.items()}
+    stack = jnp.vstack if isinstance(points, jax.core.Tracer) else np.vstack
+    made = tet_mesh(stack([points, 0.5 * (points[low] + points[high])[halved]]), tets, sets, elements)
     if mesh.triangle_sets:
         ends = np.hstack([np.tile(np.arange(V), (2, 1)), np.stack([low, high])[:, halved]])
         surface = boundary_triangles(made)
-        groups = {name: _parts_of(np.asarray(old), surface, ends) for name, old in mesh.triangle_sets.items()}
+        groups = {name: _triangles_in(np.asarray(old), surface, ends) for name, old in mesh.triangle_sets.items()}
         made = replace(made, triangle_sets=groups)
     return quadratic(made) if mesh.order > 1 else made
 
 
-def _parts_of(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) -> jax.Array:
+def parts_of(elements: Indices) -> np.ndarray:
+    """Numbers (8 n,) of the parts of elements (n,) in the mesh of `refined`."""
+    return (8 * np.asarray(elements)[:, None] + np.arange(8)).ravel()
+
+
+def quarters(mesh: TetMesh, triangles: Indices) -> jax.Array:
+    """The four parts of each triangle (m, 3) of the mesh, (4 m, 3) nodes of the mesh of `refined`; host side."""
+    low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
+    V, (a, b, c) = mesh.number_of_vertices, np.asarray(triangles).astype(np.int64).T
+    ends = np.sort(np.stack([[a, b], [b, c], [c, a]]), axis=1)
+    ab, bc, ca = V + np.searchsorted(low * V + high, ends[:, 0] * V + ends[:, 1])
+    return node_numbers(
+        np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]).transpose(2, 0, 1).reshape(-1, 3)
+    )
+
+
+def places_in(mesh: TetMesh, fine: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+    """For each node of `fine` = `refined(mesh)`: an element (V',) of the mesh, and the place in it, barycentric
+    (4, V'); host side."""
+    corners = _corners_of_parts(*np.eye(4), *(np.eye(4)[[i, j]].mean(axis=0) for i, j in PAIRS))  # (8, 4, 4)
+    inside = np.concatenate([corners, corners[:, [i for i, _ in PAIRS]] / 2 + corners[:, [j for _, j in PAIRS]] / 2], 1)
+    own = fine.element_nodes_on_host  # (n, 8 E)
+    _, first = np.unique(own, return_index=True)
+    slot, part = np.unravel_index(first, own.shape)
+    return part // 8, inside[part % 8, slot].T
+
+
+def _triangles_in(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) -> jax.Array:
     """Triangles of the new surface that lie in old ones (m, 3); `ends` (2, V) are the old vertices of each new one."""
     old = {tuple(corners) for corners in np.sort(triangles, axis=1).tolist()}
     of_each = np.moveaxis(ends[:, surface], 0, 1).reshape(len(surface), -1).tolist()
@@ -60,13 +93,19 @@ def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
 
 def _eighths(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
     """Elements (8 E, 4), from the node numbers (N,) of the edges' middles."""
-    a, b, c, d = np.asarray(mesh.tetrahedra).T
-    ab, ac, ad, bc, bd, cd = middle[np.asarray(mesh.pattern.element_edges)]
-    children = [
-        *([a, ab, ac, ad], [ab, b, bc, bd], [ac, bc, c, cd], [ad, bd, cd, d]),
-        *([ab, ac, ad, bd], [ab, bc, ac, bd], [ac, ad, bd, cd], [ac, bc, cd, bd]),
-    ]
-    return np.stack(children).transpose(2, 0, 1).reshape(-1, 4)
+    parts = _corners_of_parts(*np.asarray(mesh.tetrahedra).T, *middle[np.asarray(mesh.pattern.element_edges)])
+    return parts.transpose(2, 0, 1).reshape(-1, 4)
+
+
+def _corners_of_parts(a: Array, b: Array, c: Array, d: Array, *middles: Array) -> np.ndarray:
+    """Corners (8, 4, …) of the parts of an element, from those of the element and the middles of its edges."""
+    ab, ac, ad, bc, bd, cd = middles
+    return np.array(
+        [
+            *([a, ab, ac, ad], [ab, b, bc, bd], [ac, bc, c, cd], [ad, bd, cd, d]),
+            *([ab, ac, ad, bd], [ab, bc, ac, bd], [ac, ad, bd, cd], [ac, bc, cd, bd]),
+        ]
+    )
 
 
 def _by_length(mesh: TetMesh) -> np.ndarray:

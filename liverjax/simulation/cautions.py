@@ -109,8 +109,8 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
         if size > nothing
         else "and do not move"
     )
-    without = "" if result.pressure is None else ", without the error of the fluid's pressures"
-    said = f"mesh error (estimate, last step{without}): nodes are up to {error:.2g} m off, {part}"
+    said = f"mesh error (estimate, last step{{}}): nodes are up to {error:.2g} m off, {part}{{}}"
+    said = said.format(*_pressure_errors(result))
     if not np.all(np.asarray(result.mesh_error.found)):
         return (
             f"{said}; at some steps it is not found, or turns elements inside out: the mesh is too coarse to say more"
@@ -118,6 +118,16 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     if error <= _SMALL * size:
         return said
     return f"{said}: take {'order = 2 in [mesh], or a finer mesh' if scene.mesh.order == 1 else 'a finer mesh'}"
+
+
+def _pressure_errors(result: Result) -> tuple[str, str]:
+    """Two parts of the sentence on the mesh error: what it leaves out, and the error of the fluid's pressures."""
+    if result.pressure is None or result.mesh_error is None:
+        return "", ""
+    if result.mesh_error.pressure is None:
+        return ", without the error of the fluid's pressures", ""
+    error, size = (float(np.abs(np.asarray(own[-1])).max()) for own in (result.mesh_error.pressure, result.pressure))
+    return "", f"; pressures up to {error:.2g} Pa, the largest is {size:.3g} Pa"
 
 
 def cautions_of_mesh(mesh: TetMesh) -> list[str]:
@@ -384,8 +394,8 @@ def _of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
     return [
         f"{when.format(seconds)} the fluid leaves a layer of about {layer:.2g} m at the drained "
         f"places, and the elements there are {height:.2g} m high: they drain too much, so that pressures and "
-        "displacements are wrong there, and the mesh error does not contain it: take thinner elements there, or hold "
-        "the fluid (no drained places) if nothing should flow"
+        "displacements are wrong there (the mesh error says by how much): take thinner elements there, or hold the "
+        "fluid (no drained places) if nothing should flow"
     ]
 
 

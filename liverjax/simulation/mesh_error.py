@@ -9,8 +9,11 @@ error of a flat punch's force was 1/4; the true error was 1/100.
 
 The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 of the error in small and in
 moderate strain; with du added, about a tenth is left. For quadratic elements the cubic functions show about two thirds
-of the error, so du is multiplied by 1.5. It leaves out the errors of the body's shape, of the time steps and of the
-fluid's pressures.
+of the error, so du is multiplied by 1.5. It leaves out the errors of the body's shape and of the time steps.
+
+The pressures of a fluid are linear in both kinds of elements. With a fluid, the richer space is therefore that of the
+same elements on a mesh with every element cut into eight (`liverjax.scenes.refined`), and du is multiplied by 4/3: an
+error that falls with the square of the elements' size leaves a quarter there.
 
 In motion the errors of steps add up. The richer run has consistent masses, so that the functions which it adds fall
 like the others; the inertia of the richer motion acts on all of them. Each of its steps is linearised at its own
@@ -30,10 +33,10 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, struct
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.promotion import on_middles
-from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
 from liverjax.scenes.by_element import sponge_at_points
 from liverjax.scenes.enriched import enriched
+from liverjax.scenes.refined import REFINED, Within, can_be_refined, on_refined_mesh
 from liverjax.scenes.regions import changed_numbers, laws_of, refused_name
 from liverjax.scenes.scene import Scene
 from liverjax.simulation import automatic, tangent
@@ -65,6 +68,7 @@ BAR = 1.25
 _LOCKS = 10.0
 #: With contact: most linear solves of a step, and the residual, over the forces at work, that ends them.
 _ROUNDS, _SETTLED = 24, 1e-3
+_WITH_FLUID = 1e-5
 #: Most halvings of such a solve, if it makes the residual larger.
 _HALVINGS = 4
 
@@ -76,6 +80,9 @@ class MeshError:
     positions: jax.Array = param("m", "(T, V, 3)")
     reactions: jax.Array = param("N", "(T, V, 3)")
     found: jax.Array = param("1", "(T,) whether the linear solve of the step ended, with finite numbers")
+    pressure: jax.Array | None = param(
+        "Pa", "(T, V), of a fluid; None: no fluid, or its pressures' error is not known", default=None
+    )
 
     def change(self, of: Callable[[jax.Array, jax.Array], Any], result: Any) -> tuple[Any, Any]:
         """A number of interest and its estimated change: add it to correct, `BAR` times its size is the error bar.
@@ -87,12 +94,15 @@ class MeshError:
         return jax.jvp(of, (result.positions, result.reactions), (self.positions, self.reactions))
 
 
-def mesh_error_of(scene: Scene, positions: jax.Array, reactions: jax.Array) -> MeshError:
+def mesh_error_of(
+    scene: Scene, positions: jax.Array, reactions: jax.Array, pressure: jax.Array | None = None
+) -> MeshError:
     """The estimate for a run from the reference positions; its node numbers may not be traced.
 
     Args:
         scene: the scene that was run (`liverjax.simulation.run.prepared`).
         positions, reactions: of the run (T, V, 3).
+        pressure: of the run (T, V), if it has a fluid.
 
     Raises:
         InputError: a scene of another mesh; the one-step scheme, whose error is not only the mesh's.
@@ -102,16 +112,50 @@ def mesh_error_of(scene: Scene, positions: jax.Array, reactions: jax.Array) -> M
             f"result.positions has {positions.shape[1]} nodes, the scene {scene.mesh.number_of_nodes}: give the scene "
             "of the run"
         )
-    return estimated_error(scene, richer(scene), positions, reactions)
+    return estimated_error(scene, richer(scene), positions, reactions, pressure)
 
 
-def richer(scene: Scene) -> Scene:
-    """The scene with the next richer elements, as its error is estimated.
+@struct
+class Richer:
+    """A scene in the next richer space of functions."""
+
+    scene: Scene = param("1", "the scene with richer elements, or on the refined mesh")
+    within: Within | None = param("1", "where the nodes of a refined mesh lie; None: richer elements", default=None)
+
+    def padded(self, x: jax.Array) -> jax.Array:
+        """Positions (V, 3) of a run in the richer space: the same field."""
+        rich = self.scene.mesh
+        if self.within is not None:
+            return self.within.field(x)
+        if rich.order == 2:
+            return on_middles(rich, x.T).T
+        return jnp.concatenate([x, jnp.zeros((rich.number_of_nodes - len(x), 3), x.dtype)])
+
+    def on_nodes(self, force: jax.Array, number_of_nodes: int) -> jax.Array:
+        """Forces (V, 3) on the nodes of the run, from forces on the richer functions."""
+        rich = self.scene.mesh
+        if self.within is not None:
+            return self.within.forces(force, number_of_nodes)
+        if rich.order == 3:
+            return force[:number_of_nodes]
+        return jnp.stack([restricted(rich, column) for column in force.T], axis=-1)
+
+
+def richer(scene: Scene) -> Richer:
+    """The scene in the next richer space, as its error is estimated.
 
     Raises:
         InputError: as in `mesh_error_of`.
     """
     refuse(scene)
+    if scene.porosity is not None and can_be_refined(scene):
+        finer, within = on_refined_mesh(scene)
+        solve = replace(finer.solve, linear_solver="cg", robust="off")
+        return Richer(scene=replace(finer, solve=solve), within=within)
+    return Richer(scene=_with_richer_elements(scene))
+
+
+def _with_richer_elements(scene: Scene) -> Scene:
     rich = enriched(scene)
     # Linear elements lock: their error is measured against elements that do not. Quadratic ones do not at a low bulk
     # modulus, and have no pressures, which would have to be continuous where the material changes.
@@ -156,40 +200,46 @@ def refuse(scene: Scene) -> None:
 
 
 @jax.jit
-def estimated_error(scene: Scene, rich: Scene, x: jax.Array, reactions: jax.Array) -> MeshError:
-    """The estimate from positions and reactions (T, V, 3) of the run, with the scene of `richer`."""
-    sizes = force_sizes(rich)
+def estimated_error(
+    scene: Scene, rich: Richer, x: jax.Array, reactions: jax.Array, pressure: jax.Array | None = None
+) -> MeshError:
+    """The estimate from positions and reactions (T, V, 3) and pressures (T, V) of the run, with the result of
+    `richer`.
+    """
+    sizes = force_sizes(rich.scene)
     numbers = jnp.arange(1, len(x) + 1, dtype=x.dtype)
     before = jnp.concatenate([scene.mesh.points[None], x[:-1]])
     advance = partial(_step, scene, rich, sizes)
-    _, (du, dR, found) = jax.lax.scan(advance, initial_state(rich), (numbers, before, x, reactions))
-    factor = _FACTOR[scene.mesh.order]
-    return MeshError(positions=factor * du, reactions=factor * dR, found=found)
+    rows = (numbers, before, x, reactions, pressure if rich.within is not None else None)
+    _, (change, found) = jax.lax.scan(advance, initial_state(rich.scene), rows)
+    factor = _FACTOR[scene.mesh.order] if rich.within is None else REFINED
+    return MeshError(**jax.tree.map(lambda a: factor * a, change), found=found)
 
 
-def _step(scene: Scene, rich: Scene, sizes: Sizes, state: State, given: Any) -> tuple[State, Any]:
-    k, before, x, reactions = given
-    e, one = equations(rich, state, k, sizes), jnp.ones((), x.dtype)
-    q = unknowns(e, padded(rich.mesh, x))
+def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) -> tuple[State, Any]:
+    k, before, x, reactions, pressure = given
+    e, one = equations(rich.scene, state, k, sizes), jnp.ones((), x.dtype)
+    q = unknowns(e, rich.padded(x))
     begin = q
     if scene.solve.kind == "dynamic":
         # Errors of a motion add up: the richer run goes on from its own positions, by the run's motion in the step.
-        begin = q + unknowns(e, state.x) - unknowns(e, padded(rich.mesh, before))
+        begin = q + unknowns(e, state.x) - unknowns(e, rich.padded(before))
     near, (dq, iterations, positive) = _found_near(scene, e, begin)
     f, along = jax.linearize(lambda q: forces(e, q, one), near)
     whole = f.total + along(dq).total
     reaction = whole - e.free.vectors(whole)
     dq = near + dq - q
     # If du inverts elements, the richer run goes on from the positions of the run.
-    sound = jnp.all(volume_ratios(rich.mesh, positions(e, q + dq, one)) > 0) & jnp.all(jnp.isfinite(dq))
+    sound = jnp.all(volume_ratios(e.mesh, positions(e, q + dq, one)) > 0) & jnp.all(jnp.isfinite(dq))
     end = forces(e, jnp.where(sound, q + dq, q), one)
     found = sound & positive & (iterations < MOST_LINEAR_ITERATIONS)
-    moved = positions(e, q + dq, one)[: len(x)] - x
-    return advanced(e, End(end.x, end.F, end.pressure)), (
-        moved,
-        _on_nodes(scene.mesh, rich.mesh, reaction) - reactions,
-        found,
-    )
+    change = {
+        "positions": positions(e, q + dq, one)[: len(x)] - x,
+        "reactions": rich.on_nodes(reaction, len(x)) - reactions,
+        # The old nodes are vertices of the refined mesh.
+        "pressure": None if pressure is None else end.pressure[: len(x)] - pressure,
+    }
+    return advanced(e, End(end.x, end.F, end.pressure)), (change, found)
 
 
 #: A change, the iterations it took, whether the matrix was positive.
@@ -216,8 +266,11 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
         ended = true_residual(tangent.product(e, K), load, dq) <= 10 * tolerance
         return dq, iterations, positive & ended
 
-    if not any(a.kinked for a in e.nodal):
+    flows = e.volume is not None and e.volume.flow is not None
+    if not any(a.kinked for a in e.nodal) and not flows:
         return q, solved(q)
+
+    settled = _WITH_FLUID if flows else _SETTLED
 
     def size(q: jax.Array) -> jax.Array:
         r, force, _ = residual(e, q, one)
@@ -226,7 +279,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
     def go_on(c: tuple) -> jax.Array:
         q, (dq, iterations, positive), k = c
         well = positive & (iterations < MOST_LINEAR_ITERATIONS) & jnp.all(jnp.isfinite(dq))
-        return (k == 0) | (well & (k < _ROUNDS) & (size(q + dq) > _SETTLED))
+        return (k == 0) | (well & (k < _ROUNDS) & (size(q + dq) > settled))
 
     def again(c: tuple) -> tuple:
         q, (dq, _, _), k = c
@@ -247,17 +300,3 @@ def _shortened(size: Callable[[jax.Array], jax.Array], q: jax.Array, dq: jax.Arr
         return ~(size(q + t * dq) < before) & (t > 0.5**_HALVINGS)
 
     return jax.lax.while_loop(go_on, lambda t: 0.5 * t, jnp.ones((), q.dtype))
-
-
-def padded(rich: TetMesh, x: jax.Array) -> jax.Array:
-    """Positions (V, 3) of a run in the richer space: the same field."""
-    if rich.order == 2:
-        return on_middles(rich, x.T).T
-    return jnp.concatenate([x, jnp.zeros((rich.number_of_nodes - len(x), 3), x.dtype)])
-
-
-def _on_nodes(mesh: TetMesh, rich: TetMesh, force: jax.Array) -> jax.Array:
-    """Forces (V, 3) on the nodes of the run, from forces on the richer functions."""
-    if mesh.order == 2:
-        return force[: mesh.number_of_nodes]
-    return jnp.stack([restricted(rich, column) for column in force.T], axis=-1)

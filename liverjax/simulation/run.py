@@ -149,7 +149,7 @@ def simulate(
     result = _run(scene, start, report, gradient_checkpoints.number_kept(store, scene.solve.steps))
     if not mesh_error:
         return result
-    return replace(result, mesh_error=mesh_error_of(scene, result.positions, result.reactions))
+    return replace(result, mesh_error=mesh_error_of(scene, result.positions, result.reactions, result.pressure))
 
 
 def simulate_part(

@@ -1,5 +1,7 @@
 """Error of harmonic motion by its mesh: the same problem is solved in the next richer space of functions."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -8,6 +10,7 @@ from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes.enriched import enriched
+from liverjax.scenes.refined import REFINED, Within, can_be_refined, on_refined_mesh
 from liverjax.scenes.scene import Scene
 from liverjax.solvers.point_matrix import restricted
 from liverjax.waves.harmonic import Harmonic, harmonic
@@ -20,6 +23,9 @@ class HarmonicError:
 
     displacement: jax.Array = param("m", "complex (F, V, 3)")
     reactions: jax.Array = param("N", "complex (F, V, 3); sums over the nodes of a support count")
+    pressure: jax.Array | None = param(
+        "Pa", "complex (F, V), of a fluid; None: no fluid, or its pressures' error is not known", default=None
+    )
 
 
 def harmonic_mesh_error(
@@ -44,7 +50,9 @@ def harmonic_errors(
 
     A result of linear elements is solved again with quadratic ones, and one of quadratic elements with cubic ones. With
     too few elements per wave the phase is wrong, and the error is as large as the motion. The cost is that of a mesh
-    with eight (quadratic: three) times the unknowns. Pressures of a fluid stay linear: their own error is left out.
+    with eight (quadratic: three) times the unknowns. With a fluid, the scene is solved again on a mesh with every
+    element cut into eight, because its pressures are linear in both kinds of elements, and 4/3 of the change is the
+    estimate.
 
     Args:
         scene, factors, about, motion: as in `harmonic`.
@@ -59,29 +67,50 @@ def harmonic_errors(
             f"the result has {found.displacement.shape[1]} nodes, the scene {nodes}: give the scene of the result"
         )
     about = under_its_weight(scene) if about is None else about
-    rich = enriched(scene)
-    if rich.mesh.order == 3:
-        # Cubic elements do not lock.
-        rich = replace(rich, solve=replace(rich.solve, volumetric="element"))
-    elif scene.solve.volumetric == "nodal":
-        rich = replace(rich, solve=replace(rich.solve, volumetric="mixed"))
-    if motion is not None:
-        motion = _padded(rich.mesh, jnp.asarray(motion, complex))
-    if about is not None:
-        about = _padded(rich.mesh, jnp.asarray(about))
+    finer = scene.porosity is not None and can_be_refined(scene)
+    rich, within = on_refined_mesh(scene) if finer else (_richer_elements(scene), None)
+    of_all_nodes = partial(_padded, rich.mesh, within)
+    motion = None if motion is None else of_all_nodes(jnp.asarray(motion, complex))
+    about = None if about is None else of_all_nodes(jnp.asarray(about))
     more = harmonic(rich, found.frequencies_Hz, factors, about, motion)
-    force = more.reactions[:, :nodes]
-    if scene.mesh.order == 1:
-        # The force of a quadratic function belongs to the two linear ones that it refines, half to each.
-        columns = jnp.moveaxis(more.reactions, 1, -1)
-        force = jnp.moveaxis(jax.vmap(jax.vmap(lambda f: restricted(rich.mesh, f)))(columns), -1, 1)
+    force = _on_nodes(scene.mesh, rich.mesh, within, more.reactions)
+    factor = 1.0 if within is None else REFINED
+    pressure = None
+    if within is not None and more.pressure is not None and found.pressure is not None:
+        pressure = factor * (more.pressure[:, :nodes] - found.pressure)
     return HarmonicError(
-        displacement=more.displacement[:, :nodes] - found.displacement, reactions=force - found.reactions
+        displacement=factor * (more.displacement[:, :nodes] - found.displacement),
+        reactions=factor * (force - found.reactions),
+        pressure=pressure,
     )
 
 
-def _padded(rich: TetMesh, x: jax.Array) -> jax.Array:
+def _richer_elements(scene: Scene) -> Scene:
+    rich = enriched(scene)
+    if rich.mesh.order == 3:
+        # Cubic elements do not lock.
+        return replace(rich, solve=replace(rich.solve, volumetric="element"))
+    if scene.solve.volumetric == "nodal":
+        return replace(rich, solve=replace(rich.solve, volumetric="mixed"))
+    return rich
+
+
+def _on_nodes(mesh: TetMesh, rich: TetMesh, within: Within | None, forces: jax.Array) -> jax.Array:
+    """Forces (F, V, 3) on the nodes of the run, from those on the richer functions."""
+    nodes = mesh.number_of_nodes
+    if within is not None:
+        return jax.vmap(lambda f: within.forces(f, nodes))(forces)
+    if mesh.order > 1:
+        return forces[:, :nodes]
+    # The force of a quadratic function belongs to the two linear ones that it refines, half to each.
+    columns = jnp.moveaxis(forces, 1, -1)
+    return jnp.moveaxis(jax.vmap(jax.vmap(lambda f: restricted(rich, f)))(columns), -1, 1)
+
+
+def _padded(rich: TetMesh, within: Within | None, x: jax.Array) -> jax.Array:
     """The field x (…, V, 3) in the richer space."""
+    if within is not None:
+        return jnp.moveaxis(within.field(jnp.moveaxis(x, -2, 0)), 0, -2)
     if rich.order == 2:
         return jnp.swapaxes(on_middles(rich, jnp.swapaxes(x, -1, -2)), -1, -2)
     new = jnp.zeros((*x.shape[:-2], rich.number_of_nodes - x.shape[-2], 3), x.dtype)

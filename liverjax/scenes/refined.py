@@ -1,0 +1,147 @@
+"""The same scene on a mesh with every element cut into eight, for the error of a run with a fluid: its pressures are
+linear in both kinds of elements, so only a finer mesh is richer in pressures.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.struct import Indices, Number, param, replace, struct
+from liverjax.laws import Law
+from liverjax.laws.by_region import ByRegion
+from liverjax.mesh import promotion
+from liverjax.mesh.adjacency import node_numbers
+from liverjax.mesh.locate import weights
+from liverjax.mesh.refinement import parts_of, places_in, quarters, refined
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.attached.vessel import Vessel
+from liverjax.physics.base import Physics
+from liverjax.physics.porosity import Porosity
+from liverjax.physics.prescribed import Displaced
+from liverjax.scenes.scene import Scene
+from liverjax.tensors.subsets import subsets
+
+T = TypeVar("T")
+#: The error of a run over the change by a refined mesh: a quarter of an error of second order is left there.
+REFINED = 4 / 3
+
+
+@struct
+class Within:
+    """How the nodes of a refined mesh lie in the elements of the old one."""
+
+    nodes: jax.Array = param("1", "old nodes around each new node (n, V')")
+    weights: jax.Array = param("1", "values of their functions at the new node (n, V')")
+
+    def field(self, values: jax.Array) -> jax.Array:
+        """A field of the old nodes (V, …) at the new nodes (V', …): the same function."""
+        w = self.weights.reshape(*self.weights.shape, *(1,) * (values.ndim - 1))
+        return jnp.sum(w * values[self.nodes], axis=0)
+
+    def forces(self, values: jax.Array, number_of_nodes: int) -> jax.Array:
+        """Forces on the new nodes (V', …) as forces on the old ones (V, …): they do the same work."""
+        w = self.weights.reshape(*self.weights.shape, *(1,) * (values.ndim - 1))
+        return jnp.zeros((number_of_nodes, *values.shape[1:]), values.dtype).at[self.nodes].add(w * values[None])
+
+
+def can_be_refined(scene: Scene) -> bool:
+    """Whether all parts of the scene have a meaning on the refined mesh.
+
+    A vessel has numbers of elements, and a physics may have one number per triangle: these are not refined.
+    """
+
+    def plain(physics: Physics) -> bool:
+        triangles = getattr(physics, "triangles", None)
+        if triangles is None:
+            return not isinstance(physics, Vessel)
+        others = jax.tree.leaves(replace(physics, triangles=None))
+        return all(jnp.shape(leaf)[:1] != (len(triangles),) for leaf in others)
+
+    return all(map(plain, scene.physics))
+
+
+def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
+    """The scene with every element cut into eight of the same order; host side, but numbers may be traced."""
+    old, E = scene.mesh, scene.mesh.number_of_elements
+    mesh = refined(replace(old, triangle_sets=None))
+    element, place = places_in(old, mesh)
+    nodes, values = weights(old, element, place)
+    within = Within(nodes=node_numbers(nodes), weights=jnp.asarray(values))
+
+    def more(nodes: Indices) -> jax.Array:
+        return node_numbers(_with_nodes_between(old, mesh, np.asarray(nodes)))
+
+    def parts(load: T) -> T:
+        triangles = getattr(load, "triangles", None)
+        return load if triangles is None else replace(load, triangles=quarters(old, triangles))  # type: ignore[type-var]
+
+    body = scene.body
+    if body is not None and jnp.ndim(body.density):
+        body = replace(body, density=within.field(jnp.asarray(body.density)))
+    return replace(
+        scene,
+        mesh=mesh,
+        law=_law_of_parts(E, scene.law),
+        viscosity=_of_parts(E, scene.viscosity),
+        region=tuple(replace(r, elements=node_numbers(parts_of(r.elements))) for r in scene.region),
+        porosity=_sponge(_of_parts(E, scene.porosity), more, parts),
+        body=body,
+        fixed=tuple(replace(f, nodes=more(f.nodes)) for f in scene.fixed),
+        displaced=tuple(_moved_in_between(within, d, more(d.nodes), old.number_of_nodes) for d in scene.displaced),
+        traction=tuple(map(parts, scene.traction)),
+        physics=tuple(parts(p.enriched(mesh, more)) for p in scene.physics),
+    ), within
+
+
+def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
+    """Nodes (n,) of the old mesh, and the new nodes on the faces whose vertices they contain."""
+    middles = promotion.of_faces(old, nodes[nodes < old.number_of_vertices])
+    found = np.concatenate([nodes, np.setdiff1d(middles, nodes)])
+    if mesh.order == 1:
+        return found
+    more = promotion.of_faces(mesh, found)
+    return np.concatenate([found, np.setdiff1d(more, found)])
+
+
+def _of_parts(E: int, numbers: T) -> T:
+    """A pytree, whose numbers by element (…, E) or (…, E, 3) are given to the eight parts of each element."""
+
+    def one(a: Number) -> Number:
+        shape = jnp.shape(a)
+        if shape[-1:] == (E,):
+            return jnp.repeat(jnp.asarray(a), 8, axis=-1)
+        return jnp.repeat(jnp.asarray(a), 8, axis=-2) if shape[-2:] == (E, 3) else a
+
+    return jax.tree.map(one, numbers)
+
+
+def _law_of_parts(E: int, law: Law) -> Law:
+    if not isinstance(law, ByRegion):
+        return _of_parts(E, law)
+    groups = [node_numbers(parts_of(own[0])) for own in law.subsets.elements]
+    found = subsets(groups, 8 * E)
+    return ByRegion(
+        laws=tuple(map(partial(_of_parts, E), law.laws)),
+        subsets=found._replace(places=found.places.reshape(*law.subsets.places.shape[:-1], -1)),
+    )
+
+
+def _sponge(porosity: Porosity | None, more: Callable[[Indices], Indices], parts: Callable) -> Porosity | None:
+    """The sponge, drained and supplied at the nodes of the refined mesh too."""
+    if porosity is None:
+        return None
+    inlets = tuple(parts(own if own.nodes is None else replace(own, nodes=more(own.nodes))) for own in porosity.inlet)
+    drained = None if porosity.drained is None else more(porosity.drained)
+    return replace(porosity, drained=drained, inlet=inlets)
+
+
+def _moved_in_between(within: Within, moved: Displaced, nodes: Indices, number_of_nodes: int) -> Displaced:
+    """The motion of the old nodes, and of the new ones by the same function."""
+    if moved.by is None or np.ndim(moved.by) == 1:
+        return replace(moved, nodes=nodes)
+    by = jnp.zeros((number_of_nodes, 3)).at[moved.nodes].set(moved.by)
+    return replace(moved, nodes=nodes, by=within.field(by)[nodes])

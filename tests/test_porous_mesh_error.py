@@ -1,0 +1,170 @@
+"""The error of porous runs by the mesh: with that of the fluid's pressures, against closed forms and finer meshes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.elements.gradients import volume_ratios
+from liverjax.mesh.refinement import places_in, quarters, refined
+from liverjax.mesh.selection import boundary_triangles
+from liverjax.mesh.surface import areas
+from liverjax.physics.attached import vessel
+from liverjax.physics.porosity import Inlet
+from liverjax.scenes.refined import can_be_refined, on_refined_mesh
+from liverjax.simulation.cautions import mesh_sentence
+from liverjax.simulation.equations import forces_at
+from liverjax.simulation.run import prepared
+
+pytestmark = pytest.mark.quick_to_compile
+
+HEIGHT, SHEAR, BULK, LIMIT, FLOW, LOAD = 0.01, 1000.0, 2000.0, 1e6, 1e-11, 1.0
+#: Longitudinal modulus [Pa] of the sponge, and storage [1/Pa] of the fluid.
+M = BULK + 4 / 3 * SHEAR
+STORE = 1 / LIMIT + 1 / M
+#: Time [s] in which the fluid leaves the column.
+LONG = STORE * HEIGHT**2 / FLOW
+
+
+def column(cells, order, **solve):
+    """A column between smooth walls, loaded and drained above (Terzaghi)."""
+    mesh = lj.shapes.box((HEIGHT / cells, HEIGHT / cells, HEIGHT), (1, 1, cells))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    top = mesh.node_sets["z_max"]
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=SHEAR, bulk=BULK),
+        porosity=lj.Porosity(bulk=BULK, limit_bulk=LIMIT, fluid_fraction=0.8, permeability=FLOW, drained=top),
+        body=lj.Body(density=1e-6),
+        fixed=(
+            lj.Fixed(nodes=jnp.arange(mesh.number_of_nodes), axes="xy"),
+            lj.Fixed(nodes=mesh.node_sets["z_min"], axes="z"),
+        ),
+        traction=(lj.Traction(triangles=boundary_triangles(mesh, np.asarray(top)), value=jnp.array([0, 0, -LOAD])),),
+        solve=lj.Solve(**solve),
+    )
+
+
+def swinging(z, omega):
+    """Displacement and pressure at heights z of the column under a load of 1 exp(i omega t), in closed form."""
+    wave, pressure = np.sqrt(1j * omega * STORE / FLOW), LOAD / (M * STORE)
+    P = pressure * (1 - np.cosh(wave * z) / np.cosh(wave * HEIGHT))
+    return (pressure * (z - np.sinh(wave * z) / (wave * np.cosh(wave * HEIGHT))) - LOAD * z) / M, P
+
+
+@pytest.mark.parametrize(
+    ("order", "omega"),
+    [(1, 3.0), (2, 3.0), *(pytest.param(o, w, marks=pytest.mark.slow) for o in (1, 2) for w in (300, 3e4))],
+)
+def test_harmonic_error_against_the_closed_form(order, omega, verified):
+    """From a layer as high as the column to one that is a twentieth of an element."""
+    scene = column(12, order)
+    hertz = omega / LONG / (2 * np.pi)
+    found = lj.harmonic(scene, [hertz]).check()
+    error = lj.harmonic_errors(scene, found)
+    exact = swinging(np.asarray(scene.mesh.points)[:, 2], omega / LONG)
+    pairs = [(found.displacement[0, :, 2], error.displacement[0, :, 2]), (found.pressure[0], error.pressure[0])]
+    for (value, stated), truth in zip(pairs, exact, strict=True):
+        effectivity = np.linalg.norm(stated) / np.linalg.norm(truth - value)
+        assert 0.5 < effectivity < 2
+    verified(
+        f"harmonic mesh error with a fluid, order {order}, omega {omega:g}", "closed form", abs(effectivity - 1), 1.0
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("time", [1e-4, 1e-2, 1.0])
+def test_error_of_a_run_against_twice_refined_meshes(order, time):
+    scene = column(8, order, dt=time * LONG / 5, steps=5)
+    found = lj.simulate(scene, mesh_error=True).check()
+    assert bool(found.mesh_error.found.all())
+    fine = lj.simulate(on_refined_mesh(on_refined_mesh(scene)[0])[0]).check()
+    nodes = scene.mesh.number_of_nodes
+    for name, value in (("positions", found.positions), ("pressure", found.pressure)):
+        truth = np.asarray(getattr(fine, name))[-1, :nodes] - np.asarray(value)[-1]
+        assert 0.5 < np.linalg.norm(getattr(found.mesh_error, name)[-1]) / np.linalg.norm(truth) < 2
+    assert "; pressures up to" in mesh_sentence(scene, found)
+
+
+@pytest.mark.slow
+def test_a_vessel_leaves_the_pressures_out_of_the_error():
+    """Its elements have no counterpart on the refined mesh; the sentence says what is missing."""
+    scene = column(3, 1, dt=1.0)
+    line = np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.8]]) * HEIGHT + HEIGHT / 12
+    own = vessel.along(scene.mesh, line, 1e-4, lj.laws.NeoHookean(mu=SHEAR, bulk=BULK))
+    scene = replace(scene, physics=(own,))
+    assert not can_be_refined(scene)
+    found = lj.simulate(scene, mesh_error=True)
+    assert found.mesh_error.pressure is None
+    assert "without the error of the fluid's pressures" in mesh_sentence(scene, found)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_fields_keep_their_function_on_the_refined_mesh(order):
+    mesh = lj.shapes.box((2.0, 1.0, 1.0), (2, 1, 1))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    fine = refined(mesh)
+    element, place = places_in(mesh, fine)
+    corners = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)[element]]
+    assert np.allclose(np.einsum("am,mai->mi", place.T.T, corners), fine.points, atol=1e-15)
+    scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=1.0, bulk=2.0))
+    _, within = on_refined_mesh(scene)
+    X, Y = np.asarray(mesh.points), np.asarray(fine.points)
+    power = 1 + (order > 1)
+    assert np.allclose(within.field(jnp.asarray(X**power)), Y**power, atol=1e-14)  # squares are quadratic functions
+    f = np.random.default_rng(0).normal(size=Y.shape)
+    work = np.sum(np.asarray(within.forces(jnp.asarray(f), len(X))) * X**power)
+    assert np.isclose(work, np.sum(f * Y**power), rtol=1e-13)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_scene_on_the_refined_mesh_has_its_regions_places_and_loads(order):
+    mesh = lj.shapes.box((0.02, 0.01, 0.01), (2, 1, 1))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    E, left = mesh.number_of_elements, mesh.node_sets["x_min"]
+    half = np.flatnonzero(np.asarray(mesh.points)[np.asarray(mesh.tetrahedra), 0].mean(axis=1) < 0.01)
+    right = boundary_triangles(mesh, np.asarray(mesh.node_sets["x_max"]))
+    stiff = jnp.linspace(1.0, 2.0, E)
+    by = 1e-3 * np.asarray(mesh.points)[np.asarray(left)]
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=stiff, bulk=2.0),
+        region=(lj.Region(elements=half, law=lj.laws.Yeoh(c1=1.0, c2=0.1, c3=0.0, bulk=3.0)),),
+        displaced=(lj.Displaced(nodes=left, by=jnp.asarray(by)),),
+        traction=(lj.Traction(triangles=right, value=jnp.array([1.0, 0.0, 0.0])),),
+        porosity=lj.Porosity(
+            bulk=1.0, limit_bulk=9.0, fluid_fraction=0.5, permeability=1e-3, drained=left,
+            inlet=(Inlet(triangles=right, flux=1e-6),),
+        ),
+        solve=lj.Solve(dt=1.0),
+    )  # fmt: skip
+    fine = on_refined_mesh(scene)[0]
+    middle = np.asarray(fine.mesh.points)[np.asarray(fine.mesh.tetrahedra)].mean(axis=1)
+    assert set(np.asarray(fine.region[0].elements)) == set(np.flatnonzero(middle[:, 0] < 0.01))
+    assert np.allclose(fine.law.mu, np.repeat(stiff, 8)) and fine.mesh.number_of_elements == 8 * E
+    assert np.isclose(fine.mesh.volumes.sum(), 2e-6) and np.all(fine.mesh.volumes > 0)
+    ends = set(np.flatnonzero(np.asarray(fine.mesh.points)[:, 0] < 1e-12))
+    assert set(np.asarray(fine.displaced[0].nodes)) == ends == set(np.asarray(fine.porosity.drained))
+    nodes = np.asarray(fine.displaced[0].nodes)
+    assert np.allclose(fine.displaced[0].by, 1e-3 * np.asarray(fine.mesh.points)[nodes], atol=1e-16)
+    for load in (fine.traction[0], fine.porosity.inlet[0]):
+        assert np.allclose(areas(fine.mesh.points, load.triangles).sum(axis=0), [1e-4, 0, 0])
+    # The prepared scene has one law for each kind of element: the same forces as of the scene with regions.
+    ready = on_refined_mesh(prepared(scene))[0]
+    x = fine.mesh.points * jnp.array([[1.1, 0.95, 1.0]])
+    assert np.allclose(volume_ratios(ready.mesh, x), 1.1 * 0.95)
+    one, other = (np.asarray(jax.jit(forces_at)(s, x)) for s in (prepared(fine), ready))
+    assert np.abs(one - other).max() < 1e-12 * np.abs(one).max()
+
+
+def test_the_parts_of_triangles_and_element_sets():
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    mesh = replace(mesh, element_sets={"first": np.array([0, 2])})
+    assert set(refined(mesh).element_sets["first"].tolist()) == {*range(8), *range(16, 24)}
+    whole = boundary_triangles(mesh)
+    parts = np.asarray(quarters(mesh, whole)).reshape(len(whole), 4, 3)
+    each = np.asarray(areas(refined(mesh).points, parts.reshape(-1, 3))).reshape(len(whole), 4, 3)
+    assert np.allclose(each, np.asarray(areas(mesh.points, whole))[:, None] / 4)
