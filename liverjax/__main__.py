@@ -21,7 +21,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None, prog: str = "liverjax") -> int:
-    """Entry point; returns the exit code: 0 done, 1 failed, 2 unusable input."""
+    """Entry point. Return the exit code: 0 done, 1 failed, 2 unusable input."""
     show_unknown_letters()
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["fit"]:

@@ -1,4 +1,4 @@
-"""Arguments that several sub-commands have."""
+"""Arguments of several sub-commands."""
 
 import argparse
 import re
@@ -14,7 +14,7 @@ def add_out(command: argparse.ArgumentParser) -> None:
 
 
 def with_joined_numbers(arguments: Sequence[str]) -> list[str]:
-    """The command line with "--gap -1e-5" as "--gap=-1e-5": argparse takes a number such as -1e-5 for an option."""
+    """The command line with "--gap=-1e-5" for "--gap -1e-5": argparse would treat a number like -1e-5 as an option."""
     joined: list[str] = []
     for argument in arguments:
         if joined and re.fullmatch(r"-[0-9.]+[eE][-+]?[0-9]+", argument) and re.fullmatch(r"--[a-z0-9-]+", joined[-1]):

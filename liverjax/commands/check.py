@@ -16,12 +16,12 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the table of a law's gradient check and draw it; 1 if a row failed."""
+    """Print the table of a law's gradient check and draw its figure. Return 1 if a row failed."""
     import jax
 
     from liverjax.laws import figures, gradient_check
 
-    jax.config.update("jax_enable_x64", True)  # its limits are those of 64 bits
+    jax.config.update("jax_enable_x64", True)  # the limits of the check are for 64 bits
     law, label = gradient_check.load(options.law), options.law.rpartition(":")[2]
     file = options.out / f"check_{label}.png"
     writable(options.out, (file.name,))

@@ -1,4 +1,4 @@
-"""How a command ends: its exit code, and one sentence on the error that stopped it."""
+"""The end of a command: its exit code, and one sentence on the error that stopped it."""
 
 import argparse
 import errno
@@ -13,26 +13,26 @@ from pathlib import Path
 from liverjax.core import program_cache
 from liverjax.core.errors import InputError
 
-#: What a disk without room answers; not every system knows quotas.
+#: Error numbers of a full disk. Not every system has quotas.
 FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 
 def show_unknown_letters() -> None:
-    """Show "?" for letters such as "±" that a terminal does not know; to be called before a command line is parsed."""
+    """Show "?" for characters that a terminal does not know, e.g. "±". Call this before the command line is parsed."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
 
 
 def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace, resumable: bool = False) -> int:
-    """Run a command; return its exit code, 2 for unusable input and 130 for Ctrl-C.
+    """Run a command and return its exit code: 2 for unusable input and 130 for Ctrl-C.
 
-    Compiled programs are kept on disk for the next command, see `liverjax.core.program_cache`. If the command names
-    `optional_files`, a note lists those that an earlier run has left in the folder.
+    Compiled programs are kept on disk for the next command (see `liverjax.core.program_cache`). If the command has
+    `optional_files`, a note lists the ones that an earlier run has left in the folder.
 
     Args:
         run: runs the command with its options and returns 0 or 1.
         options: the parsed command line.
-        resumable: a stopped run can go on with --resume.
+        resumable: whether a stopped run can continue with --resume.
     """
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
@@ -47,22 +47,22 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
             return 2
         except KeyboardInterrupt:
             print("stopped" + ("; finished parts are kept: go on with --resume" if resumable else ""), file=sys.stderr)
-            return 130  # as shells do
-        except BrokenPipeError:  # the reader of a pipe has seen enough
+            return 130  # the code that shells use
+        except BrokenPipeError:  # the reader of a pipe has closed it
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         except OSError as error:
             if error.errno is None or error.errno not in FULL:
                 raise
             print(
-                f"error: {os.strerror(error.errno)}: what was written last is not whole; make room and repeat",
+                f"error: {os.strerror(error.errno)}: the last file is not complete; free some space and repeat",
                 file=sys.stderr,
             )
             return 2
 
 
 def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
-    """Print a note on optional files in the folder of results that are older than `begin`, the start of this run."""
+    """Print a note on optional files in the folder of results that are older than the `begin` of this run."""
     names = [name for name in getattr(options, "optional_files", ()) if _older(options.out / name, begin)]
     if names:
         verb = "is" if len(names) == 1 else "are"

@@ -1,4 +1,4 @@
-"""``liverjax fit …``: the commands of the package `fitting` under the same name as the others."""
+"""``liverjax fit …``: the commands of the package `fitting`, called in the same way as the other commands."""
 
 import argparse
 
@@ -11,13 +11,13 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 
 def run(arguments: list[str], prog: str) -> int:
-    """Run a fit; the exit code.
+    """Run a fit and return the exit code.
 
     Args:
-        arguments: those after `fit`.
-        prog: the command as it was called, which --help shows.
+        arguments: the arguments after `fit`.
+        prog: the command as the user called it; --help shows it.
     """
-    # Imported when called: `fitting` is built on `liverjax`, and nothing else here may know it.
+    # Imported here only: `fitting` uses `liverjax`, and nothing else in `liverjax` may import `fitting`.
     from fitting.__main__ import main
 
     return main(arguments, prog)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
-    """Solve the scene's harmonic motion and write it; 1 if a frequency has no answer."""
+    """Solve the scene's harmonic motion and write it. Return 1 if a frequency has no solution."""
     from liverjax.core.versions import versions
     from liverjax.jobs import waves
 

@@ -1,4 +1,4 @@
-"""``liverjax play SCENE.toml``: the body in a browser, to be pulled by the mouse while it moves."""
+"""``liverjax play SCENE.toml``: show the body in a browser, where the mouse can pull it while it moves."""
 
 import argparse
 import time
@@ -20,7 +20,9 @@ def add(parsers: argparse._SubParsersAction) -> None:
         "lets the mouse pull at it.",
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
-    command.add_argument("--port", type=int, default=8765, metavar="N", help="of the page (8765; 0: any free one)")
+    command.add_argument(
+        "--port", type=int, default=8765, metavar="N", help="port of the page (8765; 0: any free port)"
+    )
     command.add_argument("--no-browser", action="store_true", help="do not open the page")
     command.add_argument(
         "--steps", type=int, metavar="N", help="no page: pull at the body for N steps and print steps per second"
@@ -29,7 +31,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Play until Ctrl-C, or for some steps."""
+    """Run until Ctrl-C, or for a number of steps."""
     if not 0 <= options.port < 65536:
         raise InputError(f"--port {options.port} is no port: give 0 to 65535")
     if options.steps is not None and options.steps < 1:
@@ -57,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _without_page(playing: "Playing", steps: int) -> int:
-    """Pull at the node farthest from the held ones, by a tenth of the size; 1 if a step failed."""
+    """Pull the node that is farthest from the held nodes by a tenth of the size. Return 1 if a step failed."""
     import numpy as np
 
     from liverjax.core import status
@@ -69,7 +71,9 @@ def _without_page(playing: "Playing", steps: int) -> int:
     centre = X[np.concatenate(held)].mean(axis=0) if held else X.mean(axis=0)
     nodes = np.setdiff1d(playing.nodes, np.concatenate(held)) if held else playing.nodes
     if not len(nodes):
-        raise InputError("[[fixed]] and [[displaced]] hold the whole surface: leave a node that can be pulled")
+        raise InputError(
+            "[[fixed]] and [[displaced]] hold the whole surface: leave a node free, so that it can be pulled"
+        )
     node = int(nodes[np.argmax(np.linalg.norm(X[nodes] - centre, axis=1))])
     away = X[node] - centre
     to = X[node] + 0.1 * playing.size * away / max(float(np.linalg.norm(away)), 1e-300)

@@ -1,4 +1,4 @@
-"""``liverjax plot NAME | FILE.py:LAW …`` draws stress-stretch curves of laws; ``plot RESULT.h5`` a field of a run."""
+"""``liverjax plot NAME | FILE.py:LAW …``: draw stress-stretch curves of laws; ``plot RESULT.h5``: a field of a run."""
 
 import argparse
 from pathlib import Path
@@ -23,7 +23,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
         help=f"{LAW}; all for every shipped one; or a result of liverjax simulate",
     )
     command.add_argument("--field", metavar="NAME", help="of a result: cauchy_stress, …; default displacement")
-    command.add_argument("--step", type=int, metavar="N", help="of a result, from 1; default the last")
+    command.add_argument("--step", type=int, metavar="N", help="step of a result, from 1; default the last")
     command.add_argument("--stretch", nargs=2, type=float, metavar=("LOW", "HIGH"), help="of a law; default 0.6 1.6")
     add_out(command)
     command.set_defaults(run=run)

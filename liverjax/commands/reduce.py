@@ -1,4 +1,4 @@
-"""``liverjax reduce SCENE.toml ROWS.csv``: a reduced model of a scene from full runs of a table's rows."""
+"""``liverjax reduce SCENE.toml ROWS.csv``: make a reduced model of a scene from full runs of a table's rows."""
 
 import argparse
 from pathlib import Path

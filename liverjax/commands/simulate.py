@@ -1,4 +1,4 @@
-"""``liverjax simulate SCENE.toml``: one run of a scene file."""
+"""``liverjax simulate SCENE.toml``: run a scene file."""
 
 import argparse
 import sys
@@ -28,14 +28,17 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("--reactions", action="store_true", help="write the forces of held parts over time as CSV")
     command.add_argument("--mesh-error", action="store_true", help="estimate the mesh's error in the result")
     command.add_argument(
-        "--about", type=Path, metavar="RESULT.h5", help="for a harmonic scene: the run about whose last state it moves"
+        "--about",
+        type=Path,
+        metavar="RESULT.h5",
+        help="for a harmonic scene: it moves about the last state of this run",
     )
     add_out(command)
     command.set_defaults(run=run, optional_files=("reactions.csv", "result.png", "vtu"))
 
 
 def run(options: argparse.Namespace) -> int:
-    """Simulate the scene and write its results; 1 if a step failed. The steps before it are kept."""
+    """Simulate the scene and write its results. Return 1 if a step failed; the steps before it are kept."""
     import numpy as np
     from tqdm import tqdm
 
@@ -94,7 +97,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[list[str], bool]:
-    """Names of fields and whether reactions are written, from the command line and from [output] together."""
+    """Names of fields, and whether reactions are written, from the command line and from [output]."""
     import tomllib
 
     from liverjax.jobs import fields
@@ -108,7 +111,7 @@ def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[
 
 
 def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:
-    """The run of a scene that names a reduced model, or None if the full model has to run; and the scene without it."""
+    """The run with a reduced model, or None if the full model has to run; and the scene without the reduced model."""
     if not scene.solve.reduced:
         return None, scene
     from liverjax.core.struct import replace
@@ -131,7 +134,7 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
 
 
 def _sizes_of_places(scene: "Scene") -> list[str]:
-    """What each traction and each region covers: only whole triangles and whole elements belong to a place."""
+    """Sizes of the places of tractions and regions, in words. A place has only whole triangles and whole elements."""
     import numpy as np
 
     from liverjax.mesh.surface import areas
@@ -148,7 +151,7 @@ def _sizes_of_places(scene: "Scene") -> list[str]:
 
 
 def _write_and_tell(given: tuple["Scene", str, list[str]], ran: "Ran", target: Path, found: dict) -> None:
-    """Write the results of a scene with its text and its cautions; print them and the statistics of the run."""
+    """Write the results with the text of the scene and the cautions. Print the cautions and statistics of the run."""
     import numpy as np
 
     from liverjax.core.versions import versions

@@ -1,4 +1,4 @@
-"""``liverjax sweep SCENE.toml PARAMETERS.csv``: one scene, once for every row of a table."""
+"""``liverjax sweep SCENE.toml PARAMETERS.csv``: run a scene once for every row of a table."""
 
 import argparse
 import math
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from liverjax.core.errors import InputError
 
-#: The names of `liverjax.jobs.sweep.OUTPUTS`, which --help shows without loading it.
+#: The names of `liverjax.jobs.sweep.OUTPUTS`. With this copy --help need not load that module.
 OUTPUTS = ("final_positions", "positions", "largest_displacement", "final_reactions", "largest_pressure")
 
 
@@ -35,7 +35,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the rows; 1 if a row failed or the disk is full. Finished rows are kept."""
+    """Run the rows. Return 1 if a row failed or the disk is full. Finished rows are kept."""
     import jax
     from tqdm import tqdm
 
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
     finally:
         bar.close()
     if done.file is None:
-        print(f"process {process[0]} of {process[1]}: {done.computed} rows; others have rows to do yet")
+        print(f"process {process[0]} of {process[1]}: {done.computed} rows; other processes still have rows to compute")
         return 0
     print(f"{len(table.rows)} rows, {done.computed} computed now, {len(done.failed)} failed\nwritten: {done.file}")
     for row, code in list(done.failed.items())[:20]:
@@ -95,12 +95,15 @@ def _of_crushed(rows: dict[int, float]) -> list[str]:
 
 
 def _share(given: list[str]) -> tuple[int, int]:
-    """Number of this process and of all, from JAX's distributed runtime: HOST:PORT N I, or nothing on a cluster."""
+    """Index and number of the processes from JAX's distributed runtime.
+
+    `given` is HOST:PORT N I, or empty on a cluster.
+    """
     import jax
 
     option = f"--distributed {' '.join(given)}"
     if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
-        raise InputError(f"{option}: give HOST:PORT, number of processes and this one's, or nothing")
+        raise InputError(f"{option}: give HOST:PORT, the number of processes and the number of this one, or nothing")
     if given and int(given[2]) >= int(given[1]):
         raise InputError(f"{option}: processes are numbered from 0 to {int(given[1]) - 1}")
     try:
@@ -109,7 +112,7 @@ def _share(given: list[str]) -> tuple[int, int]:
         else:
             jax.distributed.initialize()
         process = (jax.process_index(), jax.process_count())
-        # Rows need no communication: leave at once, so that a process that dies stops no other.
+        # Rows need no communication. The runtime is left at once, so that a process that dies does not stop the others.
         jax.distributed.shutdown()
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]

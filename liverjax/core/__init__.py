@@ -1,1 +1,1 @@
-"""Basics of all folders: frozen structs, errors, status codes, names, files, versions, plotting."""
+"""Basics that all folders use: frozen structs, errors, status codes, names, files, versions, plotting."""

@@ -1,10 +1,10 @@
-"""Old addresses of modules that have moved, so that scripts of users still work."""
+"""Old names of modules that have moved, so that scripts of users still work."""
 
 import importlib
 import sys
 from types import ModuleType
 
-#: Old address -> new one.
+#: Old name -> new name.
 MOVED = {
     "liverjax.batch": "liverjax.simulation.batch",
     "liverjax.boundary": "liverjax.physics.boundary",
@@ -51,7 +51,7 @@ MOVED = {
 
 
 def keep_loaded(package: str) -> None:
-    """Make moved modules that are loaded importable from their old addresses (`from PACKAGE.MODULE import …`)."""
+    """Make loaded modules importable under their old names, too (`from PACKAGE.MODULE import …`)."""
     for old, new in MOVED.items():
         if old.startswith(f"{package}.") and new in sys.modules:
             sys.modules.setdefault(old, sys.modules[new])

@@ -1,6 +1,4 @@
-"""Check the numbers of a struct against the bounds that its fields declare, whether they come from files or from
-Python.
-"""
+"""Check the numbers of a struct against the bounds of its fields, for numbers from files and from Python."""
 
 import dataclasses
 import math
@@ -14,19 +12,19 @@ from liverjax.core.errors import InputError
 
 #: Fields of regions that may be dictionaries of numbers; they are checked together with the numbers of the scene.
 _DICTIONARIES = ("law", "viscosity", "porosity")
-#: A message lists at most so many numbers; if there are more, it names only the first wrong one and its place.
+#: Maximum count of numbers in a message. If there are more, it names only the first wrong one and its place.
 _FEW = 8
-#: The largest whole number: compiled programs store 32-bit integers.
+#: Maximum whole number: compiled programs store 32-bit integers.
 _LARGEST = 2**31 - 1
 
 
 def check_fields(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
-    """Refuse a struct with a value that is out of bounds, not finite or not a number; host side, compiles nothing.
+    """Refuse a struct with a value that is out of bounds, not finite or not a number. Host side; nothing is compiled.
 
     Args:
-        thing: any struct; structs inside it are checked too. Values that are None or traced are skipped.
+        thing: any struct; structs inside it are checked, too. Values that are None or traced are skipped.
         name: name of the struct. It is put before the names of its fields: ``law`` gives ``law.mu``.
-        leave: fields to skip, because they have checks of their own.
+        leave: fields to skip, because they are checked elsewhere.
 
     Raises:
         InputError: one sentence with dotted name, value, bound and remedy.
@@ -41,7 +39,7 @@ def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str
         value = getattr(thing, field.name)
         if value is None or field.name in leave or (isinstance(value, dict) and field.name in _DICTIONARIES):
             continue
-        # Names are those of the scene file: `law.0.mu`, not `law.laws.0.mu`.
+        # The names are the names in scene files: `law.0.mu`, not `law.laws.0.mu`.
         dotted = name if field.metadata.get("unnamed") else ".".join(filter(None, (name, field.name)))
         several = isinstance(value, tuple) and any(dataclasses.is_dataclass(v) for v in value)
         if dataclasses.is_dataclass(value):
@@ -54,12 +52,12 @@ def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str
 
 
 def check_bound(where: str, metadata: Mapping, value: object) -> None:
-    """Refuse a value that a field's `metadata` does not allow, in one sentence that begins with `where`.
+    """Refuse a value that the field's `metadata` does not allow. The message begins with `where`.
 
     Args:
         where: name of the value, for the message.
-        metadata: metadata of the field, as `param` or `static` of `liverjax.core.struct` makes it.
-        value: a number, an array, or a sequence of these; traced values pass.
+        metadata: metadata of the field, from `param` or `static` of `liverjax.core.struct`.
+        value: a number, an array, or a sequence of numbers or arrays; traced values pass.
 
     Raises:
         InputError: not a number, not finite, out of bounds, or not one of the words that a static field allows.
@@ -78,7 +76,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         return
     if type(value) is int and not finite(value):
         raise InputError(f"{where} is a whole number with hundreds of digits: give a smaller one")
-    if type(value) is float or type(value) is int:  # most values: quick, since every run checks them
+    if type(value) is float or type(value) is int:  # most values: this branch is quick, since every run checks them
         leaves, numbers = [value], None
         least = most = value
     else:
@@ -96,7 +94,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
 
 
 def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -> None:
-    """Refuse with a sentence on the first bound that one of the numbers (n,) breaks."""
+    """Raise an error with the first bound that one of the numbers (n,) violates."""
     unit, typical = metadata.get("unit", "1"), metadata.get("typical")
     if not np.isfinite(numbers).all():
         raise InputError(
@@ -128,7 +126,7 @@ def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> n
 
 
 def _in(unit: str) -> str:
-    """The unit in words; an empty text for a number without a unit."""
+    """ " in " and the unit; an empty text for a number without a unit."""
     return "" if unit == "1" else f" in {unit}"
 
 
@@ -143,7 +141,7 @@ def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> st
 
 
 def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
-    """Refuse an array whose shape is not one of `allowed`, in one sentence; None passes.
+    """Refuse an array with a shape that is not in `allowed`. None passes.
 
     Raises:
         InputError: another shape.
@@ -154,7 +152,7 @@ def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
 
 
 def finite(value: float) -> bool:
-    """Whether a number is finite as a float; it may be a whole number with any count of digits."""
+    """Whether a number is finite as a float. It may be a whole number with any number of digits."""
     try:
         return math.isfinite(value)
     except OverflowError:
@@ -162,8 +160,10 @@ def finite(value: float) -> bool:
 
 
 def array_of(value: object) -> np.ndarray | None:
-    """The float array of a number, or of lists of numbers, of a scene file; None for texts, booleans, numbers that are
-    not finite, and lists of unequal length."""
+    """The float array of a number or of lists of numbers from a scene file; None if this is not possible.
+
+    Not possible are texts, booleans, numbers that are not finite, and lists of unequal length.
+    """
     if not _is_numbers(value):
         return None
     try:

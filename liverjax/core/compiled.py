@@ -1,7 +1,10 @@
-"""A function compiled for given arguments. If its program is kept on disk, it is found without tracing the function.
+"""A function that is compiled for given arguments.
 
-JAX's own cache saves only the compilation. It must trace a program to find it, which takes seconds for a large one.
-Here the arguments' structure and shapes are the key, within the folder of `liverjax.core.program_cache`.
+A program that is kept on disk is found without tracing the function.
+
+JAX's cache saves only the compilation: it must trace a program to find it, which takes seconds for a large program.
+Here the key is made of the structure and the shapes of the arguments. The files are in the folder of
+`liverjax.core.program_cache`.
 """
 
 import dataclasses
@@ -24,30 +27,32 @@ import numpy as np
 from liverjax.core import program_cache
 from liverjax.core.files import whole
 
-#: Packages whose sources are part of the folder's name: a program must not depend on code of other packages.
+#: The folder's name contains a digest of the sources of these packages. A program must not depend on other code.
 OWN = ("liverjax.", "fitting.")
 
 
-#: Options of a program that takes longer to compile than to run. XLA's newer kernels run up to twice as fast and take
-#: half as long again to compile; jax 0.11 and later know no others.
+#: Options for a program that takes longer to compile than to run. XLA's newer kernels run up to twice as fast, but the
+#: compilation takes 1.5 times as long. In jax 0.11 and later there are only the newer kernels.
 _QUICK: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 
 
 class _Unknown(Exception):
-    """Something that the key cannot describe, such as a law of the user's own or a function inside another one."""
+    """Something that the key cannot describe, for example a law of a user, or a function inside another one."""
 
 
 def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False) -> Callable[..., Any]:
-    """Compile `function` for arguments like these, on one device. A call with such arguments then only runs it.
+    """Compile `function` for arguments like these, on one device.
+
+    A call with such arguments then only runs the program.
 
     Args:
-        function: defined at the top of a module, or `functools.partial` of such a function; its keywords become
-            constants of the program.
-        arguments: pytrees of arrays and numbers. With structs of the user's own, nothing is kept on disk.
-        short: the program runs for a second or less, so that its compilation counts for more than its speed.
+        function: a function at the top level of a module, or `functools.partial` of such a function. The keywords of
+            the partial become constants of the program.
+        arguments: pytrees of arrays and numbers. With structs that a user has defined, nothing is kept on disk.
+        short: whether the program runs for a second or less, so that a quick compilation is more important than speed.
     """
     folder, options = program_cache.folder(), _QUICK if short and jax.default_backend() == "cpu" else {}
-    if folder is None or jax.default_backend() != "cpu":  # other devices use only JAX's own cache so far
+    if folder is None or jax.default_backend() != "cpu":  # other devices use only JAX's cache
         return jax.jit(function).lower(*arguments).compile(options)
     try:
         file = folder / f"whole_{_function_name(function)}-{_key(function, arguments, options)}-cache"
@@ -57,7 +62,10 @@ def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False)
 
 
 def _made(file: Path, function: Callable[..., Any], arguments: tuple, options: dict) -> Callable[..., Any]:
-    """Compile the function for flat lists of arrays, whose structure can be saved, and save the program if possible."""
+    """Compile the function for flat lists of arrays, since their structure can be saved.
+
+    Save the program if possible.
+    """
     structure = jax.tree.structure(arguments)
     shape: list[Any] = []
 
@@ -66,7 +74,7 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple, options: d
         shape[:] = [jax.tree.structure(out)]
         return jax.tree.leaves(out)
 
-    # JAX's own cache must not find or store this program: one that was read from disk cannot be written again.
+    # JAX's cache must not find or store this program: a program that was read from disk cannot be written again.
     flat.__name__ = f"program_{uuid.uuid4().hex}"
     keep_from = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", math.inf)
@@ -81,7 +89,7 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple, options: d
         content = zlib.compress(pickle.dumps((*serialize_executable.serialize(program), example)), 1)
         with whole(file, f".{os.getpid()}.part") as beside:
             beside.write_bytes(content)
-    except Exception:  # callbacks in it, a full disk, another JAX: it is not saved, but it can run
+    except Exception:  # e.g. callbacks, a full disk, another JAX: it is not saved, but can run
         pass
     return partial(_called, program, shape[0])
 
@@ -93,12 +101,12 @@ def _found(file: Path) -> Callable[..., Any] | None:
     try:
         from jax.experimental import serialize_executable
 
-        # XLA uses SciPy's LAPACK, which JAX registers only when a factorisation is lowered for the first time.
+        # XLA uses SciPy's LAPACK. JAX registers it only when a factorisation is lowered for the first time.
         jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.result_type(float)))
         kept, given, taken, example = pickle.loads(zlib.decompress(file.read_bytes()))
         program = serialize_executable.deserialize_and_load(kept, given, taken, execution_devices=jax.devices()[:1])
         return partial(_called, program, jax.tree.structure(example))
-    except Exception:  # broken, or of another release: compiled anew and written in its place
+    except Exception:  # broken, or from another release: it is compiled and written again
         return None
 
 
@@ -111,7 +119,7 @@ def _function_name(function: Callable[..., Any]) -> str:
 
 
 def _top(function: Any) -> str:
-    """Name of a function at the top of a module, which the sources define; one inside another raises `_Unknown`."""
+    """Name of a function at the top level of a module. A function inside another one raises `_Unknown`."""
     module, name = function.__module__, function.__qualname__
     if not module.startswith(OWN) or not name.isidentifier():
         raise _Unknown
@@ -135,7 +143,7 @@ def _key(function: Callable[..., Any], arguments: tuple, options: dict | None = 
 
 
 def _said(thing: Any, static: bool = False) -> Any:
-    """Describe, for the key, what a program depends on: types, static values, and the shapes of all other numbers."""
+    """What a program depends on, for the key: types, static values, and the shapes of all other numbers."""
     if thing is None or isinstance(thing, (str, bool)):
         return repr(thing)
     if isinstance(thing, FunctionType) and static:

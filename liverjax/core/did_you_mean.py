@@ -1,4 +1,4 @@
-"""Check words that users write, and end the message about an unknown word with a hint."""
+"""Check words from users, and make the hint at the end of a message about an unknown word."""
 
 import difflib
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from liverjax.core.errors import InputError
 
 
 def hint(word: str, known: Iterable[str]) -> str:
-    """The end of a sentence about an unknown word: the nearest known word, or all known words if none is near."""
+    """The end of a message on an unknown word: the most similar known word, or all known words if none is similar."""
     words = list(known)
     longer = [name for name in words if len(word) > 2 and name.startswith(word)]
     near = longer or difflib.get_close_matches(word, words, n=1, cutoff=0.5 if len(word) < 4 else 0.6)

@@ -1,5 +1,5 @@
-"""The one exception a user meets: a sentence that names field, value and remedy."""
+"""The exception for unusable input."""
 
 
 class InputError(ValueError):
-    """Unusable input. The message is one sentence naming file or field, value and remedy; command lines exit with 2."""
+    """Unusable input. The message is one sentence with file or field, value and remedy. Commands exit with code 2."""

@@ -1,6 +1,6 @@
-"""Folders for results, tested before anything is computed; files that are written completely or not at all.
+"""Folders for results, which are tested before anything is computed; files that are written completely or not at all.
 
-A file of progress stores marks (digests) of its problem, so that a run continues only from a file of the same problem.
+A progress file contains marks (digests) of its problem, so that a run continues only from a file of the same problem.
 """
 
 import hashlib
@@ -37,11 +37,11 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
 def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
     """Give a temporary path beside `file` to write to; at the end it is renamed to `file`.
 
-    If the process is killed, `file` stays as it was. After an error it stays too, and the temporary file is removed.
+    If the process is killed or an error occurs, `file` does not change. After an error the temporary file is removed.
 
     Args:
-        file: the file to be written completely or not at all.
-        ending: suffix of the temporary path. If several processes may write `file`, each needs a suffix of its own.
+        file: the file that is written completely or not at all.
+        ending: suffix of the temporary path. If several processes may write `file`, each needs a different suffix.
     """
     beside = file.with_suffix(ending)
     try:
@@ -53,7 +53,7 @@ def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
 
 
 def mark_of(*arrays: object) -> str:
-    """A text that is equal for equal arrays only (SHA-256 of type, shape and bytes)."""
+    """A text that is equal only for equal arrays (SHA-256 of type, shape and bytes)."""
     found = hashlib.sha256()
     for a in map(np.asarray, arrays):
         found.update(f"{a.dtype} {a.shape}".encode() + np.ascontiguousarray(a).tobytes())
@@ -61,7 +61,7 @@ def mark_of(*arrays: object) -> str:
 
 
 def refuse_other(file: Path, held: Mapping[str, object], marks: Mapping[str, object]) -> None:
-    """Raise `InputError` if the marks `held`, read from `file`, differ from `marks`; it names those that differ."""
+    """Raise `InputError` if the marks `held` in `file` differ from `marks`. The message names the different marks."""
     other = [name for name, own in marks.items() if held.get(name) != own]
     if other:
         raise InputError(

@@ -1,6 +1,6 @@
-"""Tables of time: numbers at increasing times. Between two times a table is linear, outside them it is constant.
+"""Tables in time: numbers at increasing times. Between two times a table is linear; before and after, it is constant.
 
-A table with one number for each time is a factor of its load; a table with three is the vector itself.
+A table with one number for each time gives factors of its load. A table with three numbers gives the vector itself.
 """
 
 from pathlib import Path
@@ -77,10 +77,11 @@ def check_times(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1
     """Refuse a history made in Python that cannot be used; traced numbers pass.
 
     Raises:
-        InputError: times without history or the reverse, shapes that do not match, times that do not increase.
+        InputError: times without a history or a history without times, shapes that do not match, times that do not
+            increase.
     """
     if (times is None) != (history is None):
-        raise InputError(f"{name} needs both times and history, or none of them: give the other")
+        raise InputError(f"{name} needs both times and history, or none of them: give both, or leave both out")
     if history is None:
         return
     count = np.shape(times)
@@ -105,7 +106,10 @@ def entry_at(time: Number, times: Any, history: Numbers) -> jax.Array:
 
 
 def value_at(value: object, time: Number, times: Any, history: Any) -> Any:
-    """A value at a time [s]: multiplied by the factor or replaced by the vector; constant without a history."""
+    """A value at a time [s]: it is multiplied by the factor, or replaced by the vector.
+
+    Without a history it is constant.
+    """
     if history is None:
         return value
     now = entry_at(time, times, history)

@@ -1,4 +1,4 @@
-"""Dotted names, as scene files use them: `law.1.mu` leads to a number."""
+"""Dotted names as in scene files, for example `law.1.mu`: each name leads to a value."""
 
 import dataclasses
 import itertools
@@ -14,7 +14,7 @@ from liverjax.core.struct import replace
 
 
 class PathStep(NamedTuple):
-    """One step on the way to a number: from `owner` to its content at `key`."""
+    """One step on the path to a number: from `owner` to its content at `key`."""
 
     owner: Any  # a struct, tuple, dictionary or array
     key: Any  # field, place or entry
@@ -49,7 +49,7 @@ def put(thing: Any, name: str, value: object, refusal: str) -> Any:
 
 
 def metadata(thing: Any, name: str, refusal: str) -> dict[str, object]:
-    """Unit and bounds of the field that a dotted name leads to. `walk` explains arguments and errors."""
+    """Unit and bounds of the field at a dotted name. `walk` explains arguments and errors."""
     last = next(step for step in reversed(walk(thing, name, refusal)) if dataclasses.is_dataclass(step.owner))
     return dict(last.owner.__dataclass_fields__[last.key].metadata)
 
@@ -82,14 +82,14 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
 
 
 def _names_that_end_in(thing: object, name: str) -> list[str]:
-    """At most three dotted names of numbers with this end: capital letters and a unit in brackets do not count."""
+    """At most three dotted names of numbers that end in `name`. Capital letters and a unit in brackets are ignored."""
     end = name.partition("[")[0].strip().lower()
     every = _names_of_numbers(thing) if end else ()
     return list(itertools.islice((own for own in every if f".{own}".lower().endswith(f".{end}")), 3))
 
 
 def _names_of_numbers(struct: object, before: str = "") -> Iterator[str]:
-    """Dotted names of all fields of a struct that hold numbers, those of structs inside it too."""
+    """Dotted names of all fields with numbers in a struct and in the structs inside it."""
     for field in dataclasses.fields(struct) if dataclasses.is_dataclass(struct) else ():
         value = getattr(struct, field.name)
         own = before if field.metadata.get("unnamed") else f"{before}{field.name}."
@@ -104,7 +104,7 @@ def _names_of_numbers(struct: object, before: str = "") -> Iterator[str]:
 
 
 def _keys(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
-    """The keys for the first words of a path, and the words after them."""
+    """The keys for the first words of a path, and the remaining words."""
     word, rest = path[0], path[1:]
     if dataclasses.is_dataclass(thing):
         return _keys_of_struct(thing, path, refusal)
@@ -138,7 +138,7 @@ def _keys_of_struct(thing: Any, path: list[str], refusal: str) -> tuple[list, li
 
 
 def _is_place(word: str) -> bool:
-    """Whether a word is a number of a place, as Python writes it: 2, but not 02, which would be a second name of 2."""
+    """Whether a word is an index as Python writes it: 2, but not 02, which would be a second name for 2."""
     return word.isascii() and word.isdigit() and str(int(word)) == word
 
 

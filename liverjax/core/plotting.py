@@ -1,18 +1,21 @@
-"""Pictures: colours, and a Matplotlib that draws to files."""
+"""Pictures: colours, and Matplotlib for drawing to files."""
 
 import os
 import threading
 from pathlib import Path
 from typing import Any
 
-#: The colours of Okabe and Ito, distinct for every kind of colour vision.
+#: The colours of Okabe and Ito: people with any kind of colour vision can distinguish them.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 
 def pyplot() -> Any:
-    """Matplotlib's `pyplot`, set to work without a screen; imported only for a picture, because the import is slow."""
-    os.environ["MPLBACKEND"] = "Agg"  # a name there that Matplotlib does not know would end the import
+    """Matplotlib's `pyplot`, set to work without a screen.
+
+    It is imported only if needed, because the import is slow.
+    """
+    os.environ["MPLBACKEND"] = "Agg"  # with an unknown name there the import would fail
     import matplotlib
 
     matplotlib.use("Agg")
@@ -22,7 +25,7 @@ def pyplot() -> Any:
 
 
 def import_meanwhile() -> None:
-    """Begin to import pyplot, which takes a second, while a computation outside of Python runs."""
+    """Start to import pyplot in a thread. It takes a second, during which a computation outside of Python can run."""
     threading.Thread(target=pyplot, daemon=True).start()
 
 

@@ -1,7 +1,7 @@
-"""Compiled programs kept on disk, so that a machine compiles a program once: JAX's own cache, in a folder of its own.
+"""Compiled programs on disk, so that a machine compiles each program only once: JAX's cache in a separate folder.
 
-The folder is in the user's cache directory. Its name states the releases, the sources and the processor, so no other
-release, checkout or machine uses its programs. `LIVERJAX_CACHE` names another folder, or is "off".
+The folder is in the user's cache directory. Its name depends on the releases, the sources and the processor, so no
+other release, checkout or machine uses its programs. `LIVERJAX_CACHE` can name another folder; "off" means no cache.
 """
 
 import hashlib
@@ -15,9 +15,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 SWITCH = "LIVERJAX_CACHE"
-#: Bytes on disk; above, the next command removes programs that were not used for longest. One takes 10 kB to 1 MB.
+#: Maximum size on disk [bytes]. Above it, the next command removes the programs that were not used for the longest
+#: time. A program takes 10 kB to 1 MB.
 LIMIT = 500_000_000
-#: Programs that compile in fewer seconds are not kept. Finding a program takes a few milliseconds.
+#: A program is not kept if it compiles faster than this [s]. To find a program takes a few milliseconds.
 WORTH_KEEPING = 0.05
 
 
@@ -25,7 +26,7 @@ _in_use: list[Path] = []
 
 
 def folder() -> Path | None:
-    """The folder where programs are kept now; `None` outside of `kept_on_disk`, or without a cache."""
+    """The folder in which programs are kept now; `None` outside of `kept_on_disk`, or without a cache."""
     return _in_use[-1] if _in_use else None
 
 
@@ -33,12 +34,13 @@ def folder() -> Path | None:
 def kept_on_disk() -> Iterator[Path | None]:
     """Read and write compiled programs on disk inside this context. It gives the folder, or `None` without a cache.
 
-    There is no cache if `LIVERJAX_CACHE` is "off", if the folder cannot be written, or if the user has given JAX a
-    folder already (`JAX_COMPILATION_CACHE_DIR`), which stays as it is. Entries that cannot be read are compiled anew.
+    There is no cache if `LIVERJAX_CACHE` is "off" or if the folder cannot be written. There is none either if the user
+    has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`): then JAX uses that folder. Entries that cannot be
+    read are compiled again.
     """
     chosen = _folder()
     with warnings.catch_warnings():
-        # A broken entry, a full disk, another process that removes old entries: each costs a compilation, no more.
+        # A broken entry, a full disk, or another process that removes old entries only causes another compilation.
         warnings.filterwarnings("always", "Error (reading|writing) persistent compilation cache")
         show = warnings.showwarning
 
@@ -63,15 +65,18 @@ def _switch_on(folder: Path) -> None:
 
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
-    # JAX itself sets TF_CPP_MIN_LOG_LEVEL to 1.
+    # JAX sets TF_CPP_MIN_LOG_LEVEL to 1 if it is not set.
     if "JAX_LOGGING_LEVEL" not in os.environ and os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
-        # XLA writes an error for every CPU program that it reads: it mistakes two of its own tuning flags for features
-        # that the processor lacks. The folder is only for this processor, so the error has no meaning here.
+        # For every CPU program that it reads, XLA writes an error: it treats two of its tuning flags as missing
+        # features of the processor. The folder is only for this processor, so the error has no meaning here.
         jax.config.update("jax_logging_level", "CRITICAL")
 
 
 def _folder() -> Path | None:
-    """The folder for these releases, sources and this processor, made if missing; `None` without a cache."""
+    """The folder for these releases, these sources and this processor.
+
+    It is made if missing; `None` without a cache.
+    """
     chosen = os.environ.get(SWITCH, "")
     if chosen.lower() == "off" or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return None
@@ -82,7 +87,7 @@ def _folder() -> Path | None:
         if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
             return None
         bound(root)
-    except (OSError, RuntimeError):  # RuntimeError: a user without a home
+    except (OSError, RuntimeError):  # RuntimeError: a user without a home directory
         return None
     return folder.absolute()
 
@@ -94,11 +99,11 @@ def _user_cache() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches"
     given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return given if given.is_absolute() else Path.home() / ".cache"  # XDG's rule: ignore relative paths
+    return given if given.is_absolute() else Path.home() / ".cache"  # by the rules of XDG relative paths are ignored
 
 
 def _name() -> str:
-    """Name of the folder: the releases in words, and a digest of sources and processor."""
+    """Name of the folder: the releases, and a digest of sources and processor."""
     import liverjax
 
     package = Path(liverjax.__file__).parent
@@ -109,7 +114,7 @@ def _name() -> str:
 
 
 def _processor() -> str:
-    """Kind of the processor and its features: a program compiled for one may not run on another."""
+    """Kind and features of the processor: a program that is compiled for one processor may not run on another."""
     said = f"{platform.system()} {platform.machine()} {platform.processor()}\n"
     try:
         first = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0]
@@ -120,8 +125,7 @@ def _processor() -> str:
 
 
 def _forgotten(folder: Path, message: str) -> bool:
-    """Whether a warning is about the cache. The broken entries that it names are removed here, since JAX would keep
-    them."""
+    """Whether a warning is about the cache. A broken entry in the warning is removed, since JAX would keep it."""
     if "persistent compilation cache" not in message:
         return False
     if "reading" in message:
@@ -132,14 +136,14 @@ def _forgotten(folder: Path, message: str) -> bool:
 
 
 def bound(root: Path, limit: int = LIMIT) -> None:
-    """Remove the programs that were not used for longest, until all releases together take less than `limit` bytes."""
+    """Remove the programs with the oldest last use, until all releases together take less than `limit` bytes."""
     entries = []
     for entry in root.glob("*/*-cache"):
         try:
             found = entry.stat()
         except OSError:  # another process was faster
             continue
-        # Not every file system records when a file was last read: then the time of writing counts.
+        # Some file systems do not record when a file was last read. Then the time of writing is used.
         entries.append((max(found.st_atime, found.st_mtime), found.st_size, entry))
     left = sum(size for _, size, _ in entries)
     for _, size, entry in sorted(entries):
@@ -152,5 +156,5 @@ def bound(root: Path, limit: int = LIMIT) -> None:
 def _remove(entry: Path) -> None:
     try:
         entry.unlink()
-    except OSError:  # gone already, or in use (on Windows): the next command tries again
+    except OSError:  # already removed, or in use (on Windows): the next command tries again
         return

@@ -1,4 +1,4 @@
-"""Result codes of solves, each with a sentence of advice. Inside jit they are numbers; the host has the words."""
+"""Result codes of solves, and one sentence of advice for each. Inside jit there are only the codes."""
 
 CONVERGED = 0
 STALLED = 1

@@ -1,4 +1,4 @@
-"""Frozen dataclasses that are JAX pytrees, with unit and bounds for each parameter."""
+"""Frozen dataclasses that are JAX pytrees, with a unit and bounds for each parameter."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,30 +11,32 @@ import numpy as np
 T = TypeVar("T")
 #: One number, or an array with one number per element or sample; it may be traced.
 Number = float | np.ndarray | jax.Array
-#: Numbers as a user writes them: one, a sequence of them, or an array.
+#: Numbers as a user writes them: one number, a sequence of numbers, or an array.
 Numbers = Number | Sequence[float] | Sequence[Sequence[float]]
-#: An array on the host (NumPy) or of a program (JAX).
+#: An array of NumPy (on the host) or of JAX.
 Array = np.ndarray | jax.Array
 #: Numbers of nodes, elements or triangles.
 Indices = Array
-#: The table under a heading of a TOML file, or the content of a JSON file; values are checked where they are read.
+#: A table of a TOML file, or the content of a JSON file. The values are checked when they are read.
 Content = dict[str, Any]
 
 
 def static(
     default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None, words: Sequence[str] = ()
 ) -> Any:
-    """A field that is part of the structure (a tag, a count): a change compiles anew, and there is no gradient.
+    """A field that is part of the structure, for example a tag or a count.
 
-    With `lower` it must be a whole number, `lower` or more; with `words` it must be one of them (see
-    `liverjax.core.bounds`).
+    It has no gradient, and a change compiles again.
+
+    With `lower` its value must be a whole number, `lower` or more. With `words` its value must be one of these words
+    (see `liverjax.core.bounds`).
     """
     metadata = {"static": True, "about": about, "lower": lower, "words": tuple(words)}
     return dataclasses.field(default=default, metadata=metadata)
 
 
 class Limits(TypedDict, total=False):
-    """What `liverjax.core.bounds.check_fields` asks of a number."""
+    """Bounds of a number that `liverjax.core.bounds.check_fields` checks."""
 
     lower: float  # inclusive
     upper: float  # inclusive
@@ -56,8 +58,9 @@ def param(
     Args:
         unit: SI unit, ``"1"`` for a pure number. Fields in ``Pa`` scale together in `liverjax.laws.scaled`.
         about: one line for ``python -m liverjax laws``.
-        each: a sequence with one number per term (or the components of a direction).
-        typical: value for a soft tissue of about 1 kPa shear modulus, used if a law is given by its name alone.
+        each: whether the value is a sequence with one number per term (or the components of a direction).
+        typical: value for a soft tissue with a shear modulus of about 1 kPa. It is used if only the name of a law is
+            given.
         default: as in `dataclasses.field`.
         limits: ``lower`` and ``upper``, inclusive bounds; ``above``, a strict lower bound; ``nonzero=True``, 0 is
             refused.
@@ -76,11 +79,11 @@ def param(
 
 
 def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.MISSING) -> Any:
-    """A field that contains structs, and is left out of their dotted names: `law.mu`, not `law.law.mu`.
+    """A field that contains structs. Its name is left out of their dotted names: `law.mu`, not `law.law.mu`.
 
     Args:
-        about: one line on it.
-        places: name of a method that returns the places in this field for a word: `support.0` is the first of
+        about: one line on the field.
+        places: name of a method that returns, for a word, indices in this field: `support.0` is at the first index of
             ``named("support")``.
         default: as in `dataclasses.field`.
     """
@@ -89,7 +92,7 @@ def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(static, param, unnamed))
 def struct(cls: type[T]) -> type[T]:
-    """Make `cls` a frozen, keyword-only dataclass registered as a pytree; `static` fields are not leaves."""
+    """Make `cls` a frozen, keyword-only dataclass that is registered as a pytree. `static` fields are not leaves."""
     made: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
     fields = dataclasses.fields(made)
     meta = tuple(f.name for f in fields if f.metadata.get("static"))
@@ -98,8 +101,8 @@ def struct(cls: type[T]) -> type[T]:
 
     def flatten(thing: Any) -> tuple[tuple, tuple]:
         values = thing.__dict__
-        # The class itself is part of the structure. `register_dataclass` of jaxlib 0.10.0 to 0.12.0.1 leaves it out
-        # where structures are compared: a jitted function then may run one law's program on another law's numbers.
+        # The class is part of the structure. `register_dataclass` of jaxlib 0.10.0 to 0.12.0.1 ignores it when
+        # structures are compared: a jitted function may then run the program of one law with numbers of another.
         return tuple(values[name] for name in data), (made, *(values[name] for name in meta))
 
     def flatten_with_keys(thing: Any) -> tuple[tuple, tuple]:

@@ -1,1 +1,1 @@
-"""Force and stiffness of elements: MJED, its references, stiffness without negative eigenvalues."""
+"""Force and stiffness of elements: MJED, references for it, and a stiffness without negative eigenvalues."""

@@ -10,16 +10,18 @@ from liverjax.tensors.matrices import Matrix, Vector, cofactor, deformation_grad
 
 
 def volume_gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
-    """dJ/dx_a = cof(F) D_a for the four corners at every point."""
+    """dJ/dx_a = cof(F) D_a of the four corners at every integration point."""
     cof = cofactor(F)
     g = [matvec(cof, tuple(mesh.gradients[a])) for a in range(3)]
     return [tuple(-(x + y + z) for x, y, z in zip(*g, strict=True)), *g]
 
 
 def volume_ratios(mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """J of every element at positions x (V, 3) [m]: (1, E), or if quadratic (Q + 4, E) at points and vertices.
+    """J of every element at positions x (V, 3) [m]: (1, E), or in quadratic elements (Q + 4, E), at points and
+    vertices.
 
-    A quadratic element may be folded between its points, although it is not folded at them. The vertices show it first.
+    A quadratic element can be inverted between its integration points although it is not inverted at these points. It
+    is inverted first at the vertices.
     """
     J = determinant(deformation_gradient(mesh, x))
     if mesh.order == 1:

@@ -1,15 +1,15 @@
-"""MJED: force and stiffness of tetrahedra from hand-derived terms, all terms of the energy at once.
+"""MJED: force and stiffness of tetrahedra from hand-derived terms, for all terms of the energy at once.
 
-Chapter, section 4.1.2, with J treated as one more invariant and the scalars summed before anything is assembled:
+It follows the chapter's section 4.1.2, with J as an additional invariant. Scalars are summed before the assembly:
 
     f_i  = V0 sum_a W_a v_a,i                                             v_a,i = dI_a/dx_i
     K_ij = V0 [ sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j ]
 
-so the cost does not grow with the number of terms g^k h^k. No matrix is inverted. In all functions the force is the
-gradient of the energy, f = + dW/dx (the chapter's nodal force is its negative).
+So the cost does not grow with the number of terms g^k h^k. No matrix is inverted. In all functions the force is the
+gradient of the energy, f = + dW/dx; the nodal force in the chapter is -dW/dx.
 
-A linear element has one point. At each point of a quadratic element the same terms hold, for the corners that
-`liverjax.mesh.shape_functions` describes.
+A linear element has one integration point. At each point of a quadratic element the terms are the same, for the corners
+that `liverjax.mesh.shape_functions` describes.
 """
 
 from functools import partial
@@ -30,7 +30,7 @@ from liverjax.tensors.matrices import Matrix, deformation_gradient, dot, stored,
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Blocks that are computed; the others follow.
+#: Blocks that are computed. The other blocks follow from them.
 _PAIRS = ((1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 
 
@@ -41,7 +41,7 @@ def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
-    """Sum over points of V0 P D_a at their nodes: (V, 3) [N] from first Piola-Kirchhoff stresses [Pa]."""
+    """Nodal forces (V, 3) [N] from first Piola-Kirchhoff stresses P [Pa]: the sum of V0 P D_a over the points."""
     D, V0 = mesh.gradients, mesh.weights
     forces: Any = [[V0 * dot(P[i], tuple(D[a])) for i in range(3)] for a in range(3)]
     if mesh.order > 1:
@@ -62,9 +62,9 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def linear_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
-    """Derivative of `internal_force` along a motion (V, 3) [m] of the reference shape, (V, 3) [N].
+    """Derivative of `internal_force` at the reference shape along a motion (V, 3) [m]: (V, 3) [N].
 
-    The gradient and the sum at nodes are linear in the motion; only the stress has to be differentiated.
+    The deformation gradient and the sum at nodes are linear, so only the stress has to be differentiated.
     """
     law, dF = mesh.at_points(law), deformation_gradient(mesh, motion)
     rest = tuple(tuple(jnp.full_like(dF[i][j], i == j) for j in range(3)) for i in range(3))
@@ -74,10 +74,10 @@ def linear_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
 def element_stiffness(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> dict[tuple[int, int], Matrix]:
-    """Blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3 at every point: 45 different numbers per point.
+    """Blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3 at every point: 45 different entries per point.
 
     `terms` is "contracted", or "chapter" for the chapter's six terms per product (`liverjax.laws.terms.chapter_terms`).
-    The other blocks follow from symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
+    The other blocks follow from the symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
     """
     F, pairs = stored(deformation_gradient(mesh, x)), tuple((a - 1, b - 1) for a, b in _PAIRS)
     D = [tuple(mesh.gradients[a]) for a in range(3)]
@@ -95,7 +95,7 @@ def element_stiffness(
 
 
 def all_blocks(blocks: dict[tuple[int, int], Matrix]) -> list[list[Matrix]]:
-    """The 4 x 4 blocks of every element from the six of `element_stiffness`."""
+    """The 4 x 4 blocks of every element, from the six blocks of `element_stiffness`."""
 
     def negative_sum(*matrices: Matrix) -> Matrix:
         return tuple(tuple(-(a + b + c) for a, b, c in zip(*rows, strict=True)) for rows in zip(*matrices, strict=True))
@@ -114,7 +114,7 @@ _ENTRIES = [(a, b, r, c) for a, b in _PAIRS for r in range(3) for c in range(r i
 
 
 def _expansion() -> np.ndarray:
-    """Matrix (45, 144) that expands the 45 different entries, with their signs, to the element matrix."""
+    """Matrix (45, 144) that makes the element matrix from its 45 different entries."""
     basis = dict(zip(_ENTRIES, np.eye(45), strict=True))
     blocks = {
         (a, b): tuple(
@@ -136,7 +136,7 @@ def element_matrices(
     """Element stiffness matrices (E, 9 n^2) [N/m] of n nodes, degree of freedom 3 * local node + component."""
     K = element_stiffness(mesh, law, x, regularised, terms)
     entries = [K[a, b][r][c] for a, b, r, c in _ENTRIES]
-    # A product with a constant writes the other 99 entries: stacked one by one they triple the time to compile.
+    # A product with a constant matrix gives all 144 entries. Stacking them one by one triples the time to compile.
     corners = jnp.stack(jnp.broadcast_arrays(*entries), axis=-1) @ jnp.asarray(_EXPANSION, x.dtype)
     return corners if mesh.order == 1 else of_nodes(mesh.order, corners)
 
@@ -151,7 +151,7 @@ def of_nodes(order: int, corners: jax.Array) -> jax.Array:
 
 def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
     """Global matrix (3V, 3V) of element matrices (E, 9 n^2) of n nodes, degree of freedom 3 * node + component."""
-    import scipy.sparse  # here, since it takes a fifth of the package's import time
+    import scipy.sparse  # imported here, since it takes a fifth of the package's import time
 
     nodes = mesh.element_nodes_on_host.T
     dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
@@ -167,8 +167,9 @@ def stiffness_matrix(
 
     Args:
         mesh, law, x: as in `internal_force`.
-        regularised: use the regularisation of section 4.1.2 iii, with the trace kept. It changes the path of a Newton
-            iteration, never its root.
-        terms: "contracted", or "chapter" for the chapter's six terms per product g(I1, I2) h(J), equal to roundoff.
+        regularised: use the regularisation of section 4.1.2 iii, with an unchanged trace. It changes the path of
+            Newton's iteration, but not its root.
+        terms: "contracted", or "chapter" for the chapter's six terms per product g(I1, I2) h(J). Both agree up to
+            roundoff.
     """
     return sparse(mesh, np.asarray(element_matrices(mesh, law, x, regularised, terms)))

@@ -1,13 +1,14 @@
 """Element stiffness without negative eigenvalues, from the singular values of F: no LAPACK call, no inverse.
 
-For F = U diag(s) V^T an isotropic energy has, in the axes of U and V, a 3 x 3 matrix for the three stretches and one
-2 x 2 matrix [[a, b], [b, a]] for each pair of axes, with the twist a - b and the flip a + b as eigenvalues (Smith,
-De Goes, Kim 2019, Analytic eigensystems for isotropic distortion energies). Negative eigenvalues become their absolute
-value (Chen et al. 2024) and the blocks are turned back.
+Let F = U diag(s) V^T. In the axes of U and V, the second derivative of an isotropic energy has two kinds of blocks: one
+3 x 3 matrix for the three stretches, and one 2 x 2 matrix [[a, b], [b, a]] for each pair of axes. The eigenvalues of
+the 2 x 2 matrix are a - b (twist) and a + b (flip) (Smith, De Goes, Kim 2019, Analytic eigensystems for isotropic
+distortion energies). Negative eigenvalues are replaced by their absolute values (Chen et al. 2024). Then the blocks are
+rotated back.
 
-Fibres, energies of Green's strain and the memory of a viscosity have other axes. Their geometric stiffness uses the
-projected S. The negative part of a fibre's own stiffness is left out. Each part then has no negative eigenvalue, so
-their sum has none.
+Fibres, energies of Green's strain and the memory of viscosity have other axes. For Green's strain and viscosity the
+geometric stiffness uses the projected S. The negative part of the stiffness of a fibre is left out. Then no part has a
+negative eigenvalue, so their sum has none.
 """
 
 from typing import Any, NamedTuple
@@ -42,7 +43,7 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 class Frame(NamedTuple):
-    """F = U diag(s) V^T with rotations U and V: the last, smallest s is negative where F is inverted."""
+    """F = U diag(s) V^T with rotations U and V. The last and smallest s is negative if F is inverted."""
 
     U: Matrix
     s: Vector
@@ -50,7 +51,10 @@ class Frame(NamedTuple):
 
 
 def frame(F: Matrix) -> Frame:
-    """Signed singular values of a tuple matrix F, largest first; the axes of values that are 0 are arbitrary."""
+    """Signed singular values of a tuple matrix F, the largest first, and their axes.
+
+    Axes of values that are 0 are arbitrary.
+    """
     _, axes = principal(F)
     n = list(transpose(axes))
     f = [matvec(F, a) for a in n]
@@ -60,7 +64,7 @@ def frame(F: Matrix) -> Frame:
         f[i], f[j] = _chosen(swap, f[j], f[i]), _chosen(swap, scale(-1.0, f[i]), f[j])
     one, zero = jnp.ones_like(f[0][0]), jnp.zeros_like(f[0][0])
     u1 = _unit(f[0], (one, zero, zero))
-    # Perpendicular to u1, from a coordinate axis that is not near u1.
+    # A direction perpendicular to u1, from a coordinate axis that is not close to u1.
     small = abs(u1[0]) < 0.8
     aside = cross(u1, (jnp.where(small, one, zero), jnp.where(small, zero, one), zero))
     rest = add(f[1], scale(-dot(f[1], u1), u1))
@@ -87,10 +91,10 @@ def blocks(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """Blocks like those of `invariant_terms.blocks`; their element matrix has no negative eigenvalue.
+    """Blocks as from `invariant_terms.blocks`, but such that the element matrix has no negative eigenvalue.
 
     Args:
-        parts: weights and laws that add up.
+        parts: pairs (weight, law) that add up.
         S: constant second Piola-Kirchhoff stress that is added, or None.
         F: tuple matrix.
         D: shape vectors of the nodes.
@@ -132,7 +136,7 @@ def blocks(
 def _by_subset(
     parts: list[tuple[Number, Law]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple, volume: Scalars | None
 ) -> list[Matrix]:
-    """`blocks` of laws of several kinds, each at its own elements."""
+    """`blocks` for laws of several kinds, each in the elements of its region."""
     groups = next(law.subsets for _, law in parts if law.subsets is not None)
 
     def own(k: int) -> list[Matrix]:
@@ -174,7 +178,7 @@ def _diagonal_matrix(value: Any) -> Matrix:
 
 
 def _fibre(W4: Number, W44: Number, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """2 W_4 (a.D_i)(a.D_j) Id + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa, the positive part of each eigenvalue."""
+    """2 W_4 (a.D_i)(a.D_j) Id + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa, with only the positive part of each eigenvalue."""
     Fa = matvec(F, a)
     across = jnp.maximum(2 * W4, 0.0)
     along = jnp.maximum(2 * W4 + 4 * W44 * dot(Fa, Fa), 0.0)
@@ -185,7 +189,7 @@ def _fibre(W4: Number, W44: Number, a: Vector, F: Matrix, D: list[Vector], pairs
 
 
 def projected(A: Matrix) -> Matrix:
-    """A symmetric tuple matrix with the absolute value of its eigenvalues."""
+    """The symmetric tuple matrix with its eigenvalues replaced by their absolute values."""
     axes = symmetric_axes(A)
     n = transpose(axes)
     return _from_axes([abs(dot(a, matvec(A, a))) for a in n], n)

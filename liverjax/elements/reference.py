@@ -1,6 +1,6 @@
-"""The reference: force and stiffness by automatic differentiation of the energy, and by standard finite elements.
+"""References: force and stiffness by automatic differentiation of the energy, and by standard finite elements.
 
-Independent of the hand-derived terms: everything here starts from `law.strain_energy` alone. Speed does not matter
+They do not use the hand-derived terms: everything here starts only from `law.strain_energy`. Speed does not matter
 here.
 """
 
@@ -34,7 +34,7 @@ _VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Total strain energy [J] at positions x (V, 3) [m], through (..., E, 3, 3) deformation gradients."""
+    """Total strain energy [J] at positions x (V, 3) [m], from deformation gradients (..., E, 3, 3)."""
     return jnp.sum(mesh.weights * mesh.at_points(law).energy(_gradient(mesh, x)))
 
 
@@ -93,7 +93,7 @@ def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.s
 
 
 def _all_shape_vectors(mesh: TetMesh) -> jax.Array:
-    """Gradients (E, 4, 3) of linear functions, else (Q, E, n, 3)."""
+    """Gradients of the shape functions: (E, 4, 3) in linear elements, else (Q, E, n, 3)."""
     D = jnp.transpose(mesh.shape_vectors, (2, 0, 1))
     D = jnp.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
     return D if mesh.order == 1 else jnp.einsum("akq,ekj->qeaj", jnp.asarray(basis(mesh.order).c, D.dtype), D)
@@ -105,7 +105,7 @@ def _gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
 
 
 def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:
-    """W of C alone, through the Cholesky factor as deformation gradient (isotropic or not: F^T F = C and J > 0)."""
+    """W as a function of C, with the Cholesky factor as F: then F^T F = C and J > 0, also for laws with fibres."""
     return law.energy(jnp.swapaxes(jnp.linalg.cholesky(0.5 * (C + jnp.swapaxes(C, -1, -2))), -1, -2))
 
 
@@ -122,7 +122,7 @@ def _voigt(S: jax.Array) -> jax.Array:
 
 
 def _strain_displacement(F: jax.Array, D: jax.Array) -> jax.Array:
-    """B (..., E, 6, n, 3): variation of Green's strain (shears doubled) with the position of node a."""
+    """B (..., E, 6, n, 3): derivative of Green's strain (shears doubled) with respect to the position of each node."""
     rows = []
     for i, j in _VOIGT:
         term = jnp.einsum("...k,...a->...ak", F[..., :, i], D[..., :, j])

@@ -1,1 +1,1 @@
-"""Long runs, sweeps, designs of experiments and their files."""
+"""Long runs, sweeps, designs of experiments, and the files of their results."""

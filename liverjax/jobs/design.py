@@ -8,15 +8,15 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 
 KINDS = ("grid", "latin", "sobol")
-#: First bytes of a table of `design`.
+#: Possible first bytes of a table that `design` has written.
 _BEGINNINGS = tuple(f"# {kind}".encode() for kind in KINDS)
 
 
 def number_of(text: str) -> float:
-    """The number in a cell of a table. Unlike Python's own, it has no underscores and no digits of other scripts.
+    """The number in a cell of a table. Other than in Python, underscores and digits of other scripts are not allowed.
 
     Raises:
-        ValueError: no number.
+        ValueError: the text is not such a number.
     """
     if "_" in text or not text.isascii():
         raise ValueError(text)
@@ -27,7 +27,7 @@ def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
     """``law.mu=500:1000`` as {name: (low, high)}.
 
     Raises:
-        InputError: a text that is not a range of numbers, a range that does not rise, a name given twice.
+        InputError: a text that is not a range of numbers, a range with low >= high, a name that occurs twice.
     """
     ranges: dict[str, tuple[float, float]] = {}
     for text in given:
@@ -51,7 +51,7 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
 
     Args:
         ranges: low and high of every parameter.
-        rows: number of rows; a grid has as many values of each parameter as fit into it.
+        rows: number of rows. A grid has at most this number, with the same number of values of each parameter.
         kind: "grid", "latin" (hypercube) or "sobol" (balanced if `rows` is a power of 2), from SciPy.
         seed: seed of "latin" and "sobol".
 
@@ -83,17 +83,17 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
 
 
 def write_table(file: Path, names: list[str], rows: np.ndarray, note: str) -> None:
-    """A CSV file that `liverjax.jobs.sweep.read_table` reads, with `note` as a comment.
+    """Write a CSV file for `liverjax.jobs.sweep.read_table`, with `note` as a comment.
 
     Raises:
-        InputError: a file that cannot be written, or that is there and is no such table.
+        InputError: the file cannot be written, or it exists and is not a table of `design`.
     """
     lines = [names, *([repr(float(v)) for v in row] for row in rows)]
     text = f"# {note}\n" + "".join(",".join(line) + "\n" for line in lines)
     try:
         if file.is_file() and file.stat().st_size and not file.read_bytes().startswith(_BEGINNINGS):
             raise InputError(f"{file} is there and is no table of design: name another file, or remove it")
-        if file.exists() and not file.is_file():  # the terminal, a pipe
+        if file.exists() and not file.is_file():  # e.g. the terminal, a pipe
             file.write_text(text, encoding="utf-8")
             return
         with whole(file) as beside:

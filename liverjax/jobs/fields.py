@@ -1,7 +1,7 @@
-"""Fields of a finished run, on demand: stress, strain, stretches, volume ratio, energy, the fluid's velocity.
+"""Fields of a finished run: stress, strain, stretches, volume ratio, energy, velocity of the fluid.
 
-The positions of every step are put into its equations again. So memories (viscosity, fluid) are those of the run.
-Nothing is solved.
+The equations of every step are evaluated again at the positions of the run. So memories (viscosity, fluid) are the same
+as in the run. Nothing is solved again.
 """
 
 from typing import Any
@@ -46,10 +46,11 @@ def check(names: list[str], scene: Scene) -> None:
 
 
 def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarray]:
-    """Fields (T, E, …) of the elements of a finished run: means over an element.
+    """Fields (T, E, …) of a finished run: means over each element.
 
-    cauchy_stress (3, 3) [Pa] with the pressure of a fluid, green_strain (3, 3), principal_stretches (3,) from the
-    largest, volume_ratio J, energy [Pa] of the law per reference volume, fluid_velocity (3,) [m/s] through the body.
+    The fields are cauchy_stress (3, 3) [Pa] with the pressure of a fluid, green_strain (3, 3), principal_stretches (3,)
+    with the largest first, volume_ratio J, energy [Pa] of the law per reference volume, and fluid_velocity (3,) [m/s]
+    relative to the body.
 
     Args:
         scene: the scene of the run.
@@ -79,7 +80,7 @@ def _put_again(scene: Scene, sizes: Sizes, state: State, given: Any) -> tuple[St
     k, x, pressure = given
     mesh, e = scene.mesh, equations(scene, state, k, sizes)
     F = deformation_gradient(mesh, x)
-    if e.mixed is not None:  # not in the result, but at a solution they follow from the volumes
+    if e.mixed is not None:  # the result has no such pressures, but they follow from the volumes
         pressure = e.mixed.settled(mesh, determinant(F))
     P = _whole_stress(e, F, pressure)
     law = law_at_rest(scene)
@@ -105,7 +106,7 @@ def _whole_stress(e: Equations, F: Matrix, pressure: jax.Array) -> Matrix:
 
 
 def _velocity(scene: Scene, F: Matrix, pressure: jax.Array) -> jax.Array:
-    """Darcy's velocity: minus permeability times the gradient of the pressure in space, (3, Q, E) [m/s]."""
+    """Darcy velocity (3, Q, E) [m/s]: minus the permeability times the spatial gradient of the pressure."""
     mesh: TetMesh = scene.mesh
     corner, g, J = pressure[mesh.tetrahedra.T], volume_gradients(mesh, F), determinant(F)
     of = corner if mesh.order == 1 else corner[:, None]
@@ -115,7 +116,7 @@ def _velocity(scene: Scene, F: Matrix, pressure: jax.Array) -> jax.Array:
 
 
 def _means(P: np.ndarray, F: np.ndarray, energy: np.ndarray, velocity: np.ndarray, names: list[str]) -> dict:
-    """Fields of the elements (E, …) from values at points."""
+    """Fields of the elements (E, …) from values at integration points."""
     turned, J = np.swapaxes(F, -1, -2), np.linalg.det(F)
     make = {
         "cauchy_stress": lambda: P @ turned / J[..., None, None],
@@ -131,7 +132,7 @@ def _means(P: np.ndarray, F: np.ndarray, energy: np.ndarray, velocity: np.ndarra
 
 
 def at_vertices(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
-    """Fields (T, E, …) of the elements at the vertices (T, V, …): means by volume of the elements around."""
+    """Fields at the vertices (T, V, …): means of the surrounding elements (T, E, …), weighted by volume."""
     tets, volumes = np.asarray(mesh.tetrahedra), np.asarray(mesh.volumes)
     total = np.zeros((len(values), mesh.number_of_vertices, *values.shape[2:]))
     weight = np.zeros(mesh.number_of_vertices)

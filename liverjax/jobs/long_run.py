@@ -1,7 +1,7 @@
-"""A run in parts of some steps: finished parts stay on disk, and a killed run goes on from there.
+"""A run in parts of some steps: finished parts stay on disk, and a killed run can continue from there.
 
-A folder beside the output has one file per part: its rows, and the state after its last step. Every part begins with a
-new tangent, whether or not the run was stopped before it, so a resumed run ends with the same numbers.
+A folder next to the output has one file per part, with its rows and the state after its last step. Every part begins
+with a new tangent, also if the run was not stopped before it. So a resumed run gives exactly the same numbers.
 """
 
 import time
@@ -29,20 +29,21 @@ _ROWS = ("times", "positions", "reactions", "pressure", "status")
 
 
 class Ran(NamedTuple):
-    """A finished run and the time it took. Parts found on disk take no time."""
+    """A finished run and its computing time. Parts from disk count as 0 s."""
 
     result: Result  # numpy arrays
-    steps: int  # computed now
+    steps: int  # steps that were computed now
     run_time: float  # [s]
     compile_time: float  # [s]
-    beside: Mapping[str, tuple[np.ndarray, str]] = {}  # further datasets of the result: name -> values, unit
+    beside: Mapping[str, tuple[np.ndarray, str]] = {}  # additional datasets of the result: name -> values, unit
 
 
 def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
-    """Refuse results in the place of a run that was stopped, unless it goes on; and to go on with another scene's.
+    """Refuse to overwrite a stopped run, unless it is resumed; refuse to resume the result of another scene.
 
     Raises:
-        InputError: parts on disk without `resume`; with it, a finished result of a scene file with another text.
+        InputError: there are parts on disk and `resume` is false; or `resume` is true and there is a finished result of
+            a scene file with another text.
     """
     folder = resumable_parts.beside(out)
     if folder.exists() and not resume:
@@ -51,7 +52,7 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
         try:
             with h5py.File(out) as file:
                 before = tomllib.loads(str(file.attrs.get("scene", text)).lstrip("\ufeff"))
-        except (OSError, tomllib.TOMLDecodeError):  # no result of a scene
+        except (OSError, tomllib.TOMLDecodeError):  # not a result of a scene
             return
         if before != tomllib.loads(text):  # comments may differ
             raise InputError(f"{out} is the result of another scene: name another --out, or leave --resume out")
@@ -65,16 +66,16 @@ def run(
     resume: bool = False,
     report: Callable[[int], None] | None = None,
 ) -> Ran:
-    """Run a scene in parts of `every` steps; a run of one part leaves nothing beside its output.
+    """Run a scene in parts of `every` steps. A run with only one part makes no folder next to its output.
 
     Args:
         scene: `Scene`.
         text: content of the scene file; results of another scene file are not continued.
-        out: file of the results, which the caller writes before it removes `resumable_parts.beside(out)`.
-        every: steps per part.
-        resume: continue from the parts on disk.
-        report: called with the number of every finished step, those found on disk too, at the end of each part: JAX
-            keeps no program on disk that calls back while it runs.
+        out: file of the results. The caller writes it, and then removes `resumable_parts.beside(out)`.
+        every: number of steps per part.
+        resume: whether to continue from the parts on disk.
+        report: function that is called with the number of every finished step, also of steps from disk. The calls come
+            at the end of each part: JAX cannot keep a program on disk that calls back while it runs.
 
     Raises:
         InputError: parts on disk without `resume`, parts of another scene, or parts in use by another process.
@@ -89,7 +90,7 @@ def run(
         return _run_parts(scene, steps, None, report)
     resumable_parts.make_folder(folder)
     with resumable_parts.locked(folder / "lock_0"):
-        # The text names files (mesh, history) whose content may change, so all numbers are compared too.
+        # The text names files (mesh, history) with content that may change, so all numbers are compared, too.
         numbers = resumable_parts.digest(*jax.tree.leaves(scene))
         resumable_parts.same(
             {"scene": text, "numbers": numbers, "every": every, "versions": versions()}, folder / "run.json"
@@ -98,7 +99,7 @@ def run(
 
 
 def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[int], None] | None) -> Ran:
-    """Read the parts that are in the folder; compute and write the others."""
+    """Read the parts that are in the folder. Compute and write the other parts."""
     firsts = range(1, scene.solve.steps + 1, count)
     files = [None if folder is None else resumable_parts.part(folder, k) for k in range(len(firsts))]
     state, results, computed, run_time = initial_state(scene), [], 0, 0.0
@@ -125,7 +126,7 @@ def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[
     return Ran(whole, computed, run_time, compile_time)
 
 
-#: Quadrature points times steps of a run that takes about a second.
+#: A run with this number of integration points times steps takes about a second.
 _SHORT = 100_000
 
 

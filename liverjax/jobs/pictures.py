@@ -23,7 +23,7 @@ class Surface(NamedTuple):
     title: str
 
 
-#: Field -> name of the number that is drawn.
+#: Field -> name of the quantity that is drawn.
 DRAWN = {
     "cauchy_stress": "von Mises stress [Pa]",
     "green_strain": "largest principal strain [1]",
@@ -35,7 +35,7 @@ DRAWN = {
 
 
 def draw_surface(file: Path, surface: Surface) -> None:
-    """The surface before (grey) and after, coloured, into a PNG."""
+    """Draw the surface before (grey) and after (coloured) into a PNG file."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     before, after, triangles = surface.before, surface.after, surface.triangles
@@ -62,12 +62,12 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
     """The surface of a result.h5 with a field, `displacement` or `pressure`.
 
     Args:
-        file: as `liverjax simulate` writes it.
-        name: a field that the run has written.
-        step: from 1; None: the last.
+        file: result.h5 of `liverjax simulate`.
+        name: name of a field in the file.
+        step: number of the step, from 1; None: the last step.
 
     Raises:
-        InputError: a file, field or step that is not there.
+        InputError: the file, the field or the step does not exist.
     """
     import h5py
 
@@ -86,8 +86,8 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
             known = ["displacement", *(["pressure"] if "pressure" in data else []), *fields]
             if name not in known:
                 raise InputError(
-                    f"{file} has no field {name!r}: {hint(name, known)}; it has {', '.join(known)}, and liverjax "
-                    "simulate --fields writes more"
+                    f"{file} has no field {name!r}: {hint(name, known)}; it has {', '.join(known)}; liverjax "
+                    "simulate --fields writes more fields"
                 )
             step = steps if step is None else step
             if not 1 <= step <= steps:
@@ -108,7 +108,7 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
 
 
 def _drawn_number(name: str, values: np.ndarray) -> np.ndarray:
-    """One number per vertex (V,) of a field (V, …)."""
+    """One number per vertex (V,) from a field (V, …)."""
     if name == "cauchy_stress":
         deviator = values - np.trace(values, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
         return np.sqrt(1.5 * np.sum(deviator**2, axis=(1, 2)))

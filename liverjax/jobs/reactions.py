@@ -1,4 +1,4 @@
-"""Forces on the body over time, part by part: the table of `reactions.csv`."""
+"""Forces on the body over time, for each part that holds it: the table of `reactions.csv`."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ from liverjax.simulation.run import Result, prepared
 
 
 def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]:
-    """Time, and the force of each part that holds the body over time: column names and rows.
+    """Column names and rows of a table: time, and the force of each part that holds the body.
 
-    For obstacles also their displacement, and the largest depth of the surface in them.
+    Obstacles also have their displacement and the maximum depth of the surface in them.
     """
     names, columns = ["time"], [np.asarray(result.times)]
 
@@ -42,10 +42,11 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
 
 
 def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
-    """Forces (T, 3) [N] of every fixed, displaced and sliding part, from those at the nodes (T, V, 3), by name.
+    """Name -> force (T, 3) [N] of every fixed, displaced and sliding part, from the forces at the nodes (T, V, 3).
 
-    A part has the force along the axes that it holds, a sliding one along its normal. If two parts hold the same axis
-    of a node, its force counts for the first alone, so the parts add up to the force on the body.
+    A part has the force along the axes that it holds; a sliding part has the force along its normal. If two parts hold
+    the same axis of a node, its force counts only for the first part. So the sum over the parts is the force on the
+    body.
     """
     taken, found = np.zeros(reactions.shape[1:], bool), {}
 
@@ -68,7 +69,7 @@ def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
         if physics.axis:
             found[f"support.{k}"] = along(nodes, [AXES.index(physics.axis)])
             continue
-        # An oblique normal counts at nodes where it acts: at others all of its axes are held already.
+        # An oblique normal counts only at nodes where it acts: at other nodes all of its axes are already held.
         normal = np.asarray(physics.normal)
         loose = nodes[~held[nodes][:, np.abs(normal) > 1e-12].all(axis=1)]
         found[f"support.{k}"] = (reactions[:, loose] @ normal).sum(axis=1)[:, None] * normal
@@ -76,7 +77,7 @@ def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:
-    """Forces (T, 3) [N] on the body of every support with springs and every ligament that ends outside, by name.
+    """Name -> force (T, 3) [N] on the body, for supports with springs and for ligaments that end outside of the body.
 
     Args:
         scene: the scene that was run.

@@ -1,4 +1,4 @@
-"""Reduced models of scene files: make one from a table of rows, and run it while its error is small."""
+"""Reduced models of scene files: make a model from a table of rows, and use it for a run if its error is small."""
 
 import time
 from pathlib import Path
@@ -25,7 +25,7 @@ from liverjax.solvers.problem import StepStatistics
 
 
 def learnt(model: ReducedModel) -> str:
-    """A sentence on the correction that a model has learnt."""
+    """A sentence on the learnt correction of a model."""
     if model.correction is None:
         return "no correction: too few rows, or none made the errors smaller"
     left = np.asarray(model.correction.left)
@@ -33,7 +33,7 @@ def learnt(model: ReducedModel) -> str:
 
 
 class Tried(NamedTuple):
-    """A run of a scene by its reduced model."""
+    """A run of a scene with its reduced model."""
 
     ran: Ran | None  # None: the estimated error is above the tolerance, or a step failed
     sentence: str  # on the outcome
@@ -42,7 +42,7 @@ class Tried(NamedTuple):
 def make(
     scene_file: Path, rows_file: Path, out: Path, tolerance: float, modes: int, runs: int | None = None
 ) -> ReducedModel:
-    """Run the rows of a table with the full model and write the reduced model made from them.
+    """Run the rows of a table with the full model, and write the reduced model that is made from these runs.
 
     Raises:
         InputError: an unusable scene, table, tolerance or output.
@@ -77,7 +77,7 @@ def tried(scene: Scene) -> Tried:
         again = time.perf_counter()
         found = jax.block_until_ready(simulate_reduced(model, plain))
         run_time = time.perf_counter() - again
-    compile_time = max(again - begin - run_time, 0.0)  # 0 for a program found on disk
+    compile_time = max(again - begin - run_time, 0.0)  # 0 if the program was found on disk
     x, found = reduced_positions(model, plain, found), reduced_error(model, plain, found)
     error = np.asarray(found.error)
     moved = float(np.linalg.norm(np.asarray(x) - np.asarray(scene.mesh.points), axis=-1).max())

@@ -1,4 +1,4 @@
-"""Results in parts, for runs that resume after a kill: a finished part is a file of its own beside the output."""
+"""Results in parts, for runs that can resume after a kill: each finished part is a separate file next to the output."""
 
 import fcntl
 import hashlib
@@ -18,7 +18,7 @@ from liverjax.core.struct import Number
 
 
 def beside(out: Path) -> Path:
-    """The folder of the parts of `out`."""
+    """The folder with the parts of `out`."""
     return out.with_name(out.name + ".parts")
 
 
@@ -33,7 +33,7 @@ def write(file: Path, content: dict[str, np.ndarray]) -> None:
     Raises:
         OSError: the disk is full.
     """
-    # Made in memory: on a full disk HDF5 ends the process, while a plain write raises OSError.
+    # Made in memory first: on a full disk HDF5 ends the process, but a plain write raises OSError.
     memory = io.BytesIO()
     with h5py.File(memory, "w") as datasets:
         for name, value in content.items():
@@ -45,7 +45,7 @@ def write(file: Path, content: dict[str, np.ndarray]) -> None:
 
 
 def finished(file: Path) -> bool:
-    """Whether the part is there; one that cannot be read is removed, so that it is computed again."""
+    """Whether the part exists. A part that cannot be read is removed, so that it is computed again."""
     if not file.exists():
         return False
     try:
@@ -73,10 +73,10 @@ def make_folder(folder: Path) -> None:
 
 @contextmanager
 def locked(file: Path) -> Iterator[None]:
-    """Hold a lock that ends with the process.
+    """Hold a lock, which is released when the process ends.
 
     Raises:
-        InputError: another process has it.
+        InputError: another process holds the lock.
     """
     with file.open("w") as lock:
         try:
@@ -89,10 +89,10 @@ def locked(file: Path) -> Iterator[None]:
 
 
 def same(identity: Mapping[str, object], file: Path) -> None:
-    """Write down the input that decides the results; refuse to go on if the parts on disk were made with other input.
+    """Store the input that determines the results. Refuse to continue if the parts on disk were made with other input.
 
     Raises:
-        InputError: the parts beside `file` belong to other input.
+        InputError: the parts next to `file` were made with other input.
     """
     identity = json.loads(json.dumps(identity))
     if not file.exists():
@@ -115,7 +115,7 @@ def remove(folder: Path) -> None:
 
 
 def digest(*arrays: Number) -> str:
-    """SHA-256 of the numbers of some arrays."""
+    """SHA-256 of the bytes of some arrays."""
     sha = hashlib.sha256()
     for a in arrays:
         sha.update(np.ascontiguousarray(a).tobytes())

@@ -1,8 +1,9 @@
-"""Sweeps: one scene and many rows of parameters. A kill at any moment cannot spoil the results.
+"""Sweeps: one scene and many rows of parameters. A kill at any moment cannot damage the results.
 
-Rows are run chunk by chunk. A finished chunk is a file of its own in FILE.h5.parts, written beside and renamed; when
-all are finished they are joined to FILE.h5. So whatever stops a run, finished chunks stay, and `--resume` computes the
-others. Several processes may work on one sweep: each takes every n-th chunk, and the last to finish joins the parts.
+Rows are run in chunks. A finished chunk is a separate file in FILE.h5.parts. It is written under a temporary name and
+then renamed. When all chunks are finished, they are joined to FILE.h5. So finished chunks are kept if a run is stopped,
+and `--resume` computes the others. Several processes may work on one sweep: each of n processes takes every n-th chunk,
+and the last one joins the parts.
 """
 
 import csv
@@ -40,7 +41,7 @@ from liverjax.simulation.automatic import with_solver
 from liverjax.simulation.batch import simulate_batch
 from liverjax.simulation.cautions import LEAST_J, MOST_J
 
-#: Outputs that may be stored for every row, from its result and its reference positions (V, 3).
+#: Name of an output that may be stored for every row -> function of result and reference positions (V, 3).
 OUTPUTS: dict[str, Callable] = {
     "final_positions": lambda result, reference: result.positions[-1],
     "positions": lambda result, reference: result.positions,
@@ -54,25 +55,25 @@ _UNITS = {"final_reactions": "N", "largest_pressure": "Pa", "status": "1", "resi
 
 
 class Sweep(NamedTuple):
-    """The runs to make; `identity` contains everything that the results depend on."""
+    """The runs to compute. `identity` contains everything on which the results depend."""
 
     scene: Scene
     names: tuple[str, ...]
     rows: np.ndarray  # (N, P) numbers
     numbers: np.ndarray  # (N,) numbers of the rows in the file, from 1
     outputs: tuple[str, ...]
-    probes: tuple[int, ...]  # nodes whose positions are kept over time
+    probes: tuple[int, ...]  # nodes with positions that are stored over time
     chunk: int
     identity: dict[str, object]
 
 
 class Done(NamedTuple):
-    """How a sweep ended."""
+    """The outcome of a sweep."""
 
-    file: Path | None  # None: other processes still have chunks to do
-    failed: dict[int, int]  # number of the row -> code
-    computed: int  # rows, by this process now
-    crushed: dict[int, float]  # number of a row that converged -> its J beyond what a tissue does
+    file: Path | None  # None: other processes still have chunks to compute
+    failed: dict[int, int]  # number of the row -> status code
+    computed: int  # number of rows that this process computed now
+    crushed: dict[int, float]  # number of a converged row -> its J outside of the range of tissues
 
 
 def read_sweep(
@@ -83,7 +84,7 @@ def read_sweep(
     chunk: int = 16,
     only: tuple[int, ...] = (),
 ) -> Sweep:
-    """A sweep from a scene file and a table with a header of dotted names, every row checked before any compile.
+    """A sweep from a scene file and a table with a header of dotted names. All rows are checked before any compilation.
 
     Raises:
         InputError: an unusable scene or table, a name that the scene does not have, a value out of its bounds.
@@ -141,8 +142,8 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     """Header and numbers (N, P) of a CSV file; # begins a comment.
 
     Raises:
-        InputError: unreadable or empty, a name given twice, a row of another length, a value that is not a finite
-            number.
+        InputError: an unreadable or empty file, a name that occurs twice, a row of another length, a value that is not
+            a finite number.
     """
     try:
         text = file.read_text(encoding="utf-8-sig")
@@ -186,14 +187,14 @@ def run(
     process: tuple[int, int] = (0, 1),
     report: Callable[[int], None] = lambda rows: None,
 ) -> Done:
-    """Run the rows of a sweep that are not done yet; write into `out`.
+    """Run the rows of a sweep that are not finished, and write the results to `out`.
 
     Args:
         sweep: `Sweep`.
-        out: file for the results; its parts are beside it until all are done.
-        resume: continue from the parts on disk.
-        process: number of this process and of all that share the work.
-        report: called with the number of rows finished.
+        out: file for the results; its parts are next to it until all are finished.
+        resume: whether to continue from the parts on disk.
+        process: index of this process, and number of processes that share the work.
+        report: function that is called after each chunk with its number of rows.
 
     Raises:
         InputError: results that exist already, that belong to another sweep, or that another process uses.
@@ -246,7 +247,7 @@ def _rows(outputs: tuple, probes: tuple, scene: Scene, values: dict[str, jax.Arr
 
 
 def _volume_ratios(scene: Scene, values: dict[str, jax.Array], reference: jax.Array | None, x: jax.Array) -> jax.Array:
-    """The least and the greatest J (2,) at positions x (V, 3) [m] of a row."""
+    """Minimum and maximum J (2,) at positions x (V, 3) [m] of a row."""
     mesh = with_parameters(scene, values).mesh
     J = volume_ratios(mesh if reference is None else with_points(mesh, reference), x.astype(mesh.points.dtype))
     return jnp.stack([jnp.min(J), jnp.max(J)])
@@ -254,7 +255,7 @@ def _volume_ratios(scene: Scene, values: dict[str, jax.Array], reference: jax.Ar
 
 def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
     chosen = _of(sweep, k)
-    # The last chunk is filled up with its last row: one program for all.
+    # The last chunk is filled with copies of its last row, so that all chunks share one program.
     filled = np.minimum(chosen.start + np.arange(sweep.chunk), chosen[-1])
     values = {name: sweep.rows[filled, j] for j, name in enumerate(sweep.names)}
     result = program(sweep.scene, values)
@@ -275,7 +276,7 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
 
 
 def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
-    """Join all parts to one file; the last process does it."""
+    """Join all parts to one file if all are finished: this is done by the last process."""
     files = [resumable_parts.part(folder, k) for k in _chunks(sweep)]
     try:
         with resumable_parts.locked(folder / "lock_join"):
@@ -284,7 +285,7 @@ def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
             if not all(f.exists() for f in files):
                 return Done(None, {}, computed, {})
             codes, J = _join(sweep, out, files)
-    except (InputError, FileNotFoundError):  # another process joins them at this moment
+    except (InputError, FileNotFoundError):  # another process is joining them
         return Done(None, {}, computed, {})
     resumable_parts.remove(folder)
     return Done(out, _failures(sweep, codes), computed, _crushed(sweep, codes, J))
@@ -295,7 +296,7 @@ _HEADERS = 100_000
 
 
 def _join(sweep: Sweep, out: Path, files: list[Path]) -> tuple[np.ndarray, np.ndarray]:
-    """Write the whole file; the codes of all rows, and their `volume_ratios`."""
+    """Write the complete file. Return the codes of all rows and their `volume_ratios`."""
     mesh = sweep.scene.mesh
     needed = (
         sum(f.stat().st_size for f in files) + mesh.points.nbytes + meshio_cells(mesh)[1].nbytes + sweep.rows.nbytes
@@ -315,7 +316,7 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> tuple[np.ndarray, np.nd
         joined["parameters"].attrs["names"] = list(sweep.names)
         if sweep.probes:
             joined["probe_nodes"] = np.array(sweep.probes, dtype=int)
-        if "reference" not in joined:  # with a loaded mesh every row has its own
+        if "reference" not in joined:  # with a loaded mesh every row has another one
             joined["reference"] = np.asarray(sweep.scene.mesh.points)
         joined["reference"].attrs["unit"] = "m"
         joined["tetrahedra"] = meshio_cells(sweep.scene.mesh)[1]
@@ -329,7 +330,7 @@ def _failures(sweep: Sweep, codes: np.ndarray) -> dict[int, int]:
 
 
 def _crushed(sweep: Sweep, codes: np.ndarray, J: np.ndarray) -> dict[int, float]:
-    """The J of each row that is beyond `LEAST_J` or `MOST_J` at its end; failed rows are told as such."""
+    """Number of a row -> J at its end that is below `LEAST_J` or above `MOST_J`; only for converged rows."""
     J = np.where(J[:, :1] < LEAST_J, J[:, :1], J[:, 1:])[:, 0]
     beyond = ((J < LEAST_J) | (J > MOST_J)) & np.all(codes == status.CONVERGED, axis=1)
     return {int(sweep.numbers[k]): float(J[k]) for k in np.flatnonzero(beyond)}

@@ -1,4 +1,4 @@
-"""Harmonic motion of scene files: solved, written as HDF5 and for ParaView."""
+"""Solve the harmonic motion of scene files, and write it as HDF5 and for ParaView."""
 
 import json
 import time
@@ -29,7 +29,7 @@ from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.mesh_error import HarmonicError, harmonic_errors
 from liverjax.waves.rest import under_its_weight
 
-#: Part of a run's reactions by which those of the relaxed body may differ without a word.
+#: Without a caution, the reactions of the relaxed body may differ from the run's reactions by this fraction.
 _RESTED = 0.05
 
 
@@ -47,8 +47,8 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 
     Args:
         scene: `Scene`.
-        about: result.h5 of a run of the same mesh, whose last positions are the state about which the body moves; None:
-            the state of rest under gravity, if there is gravity.
+        about: result.h5 of a run of the same mesh; the body moves about the last state of this run. None: about the
+            state of rest under gravity and pre-tension, or about the reference shape.
         mesh_error: whether to estimate the error of the mesh.
 
     Raises:
@@ -85,15 +85,15 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
 
 
 def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> list[str]:
-    """A sentence if the run's reactions (V, 3) [N] are not those of the relaxed body at x: then its stress is another.
+    """A sentence if the run's reactions (V, 3) [N] differ from those of the relaxed body at x: then its stress differs.
 
-    A sponge, whose pressure the file does not tell, is not compared.
+    A sponge is not compared.
     """
     pulled = np.linalg.norm(reactions, axis=1)
     if scene.porosity is not None or not pulled.any():
         return []
     at = pulled > 0.01 * pulled.max()
-    # Capsules, ligaments and springs pull at held nodes too. Obstacles do not, and sliding supports hold.
+    # Membranes, ligaments and springs also pull at held nodes. Obstacles do not, and sliding supports only hold.
     pulling = tuple(own for own in scene.physics if not isinstance(own, Obstacle | SlidingSupport))
     still = resting(replace(by_element(scene), traction=(), fixed=(), displaced=(), physics=pulling))
     still = replace(still, solve=Solve(volumetric=scene.solve.volumetric))
@@ -103,13 +103,14 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
         return []
     return [
         f"the relaxed body has other forces in the state of {name} than the run had there ({100 * apart:.2g} % apart), "
-        "and moves with these: let the run rest for much longer than its relaxation times, and give both one material"
+        "and moves with these: let the run rest for much longer than its relaxation times, and use one material in both"
     ]
 
 
 def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
-    """What the mesh leaves out of the motion, (F,) [1], and of the largest force of a part that holds the body, (F,)
-    [1]; NaN where nothing moves or pulls. The error of the mesh must have been estimated.
+    """Relative mesh errors of the motion, (F,) [1], and of the largest force of a part that holds the body, (F,) [1].
+
+    They are NaN where nothing moves or pulls. The mesh error must have been estimated.
     """
     error, found = waves.mesh_error, waves.found
     if error is None:
@@ -126,7 +127,7 @@ def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str, object]) -> None:
-    """Frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), the mesh; and `attributes`."""
+    """Write frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), the mesh and `attributes`."""
     import h5py
 
     arrays = {name: (getattr(waves.found, name), unit) for name, unit in _UNITS.items()}
@@ -151,7 +152,7 @@ _UNITS = {"frequencies_Hz": "Hz", "displacement": "m", "reactions": "N", "residu
 
 
 def write_waves_vtu(folder: Path, scene: Scene, found: Harmonic) -> Path:
-    """One VTU file per frequency with real and imaginary part of the displacement; the series that ParaView opens."""
+    """Write one VTU file per frequency with the complex displacement, and the series file that ParaView opens."""
     import meshio
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -9,19 +9,20 @@ from liverjax.laws.base import Law
 
 
 def first_piola(law: Law, F: jax.Array) -> jax.Array:
-    """dW/dF [Pa] of one (3, 3) or many (..., 3, 3) deformation gradients by reverse mode."""
+    """dW/dF [Pa] at one (3, 3) or many (..., 3, 3) deformation gradients, by reverse mode."""
     return jax.grad(lambda F: jnp.sum(law.energy(F)))(F)
 
 
 def tangent(law: Law, F: jax.Array) -> jax.Array:
-    """d2W/dF dF [Pa] of deformation gradients (..., 3, 3): (..., 3, 3, 3, 3) by forward over reverse mode."""
+    """d2W/dF dF [Pa], (..., 3, 3, 3, 3), at deformation gradients (..., 3, 3), by forward over reverse mode."""
     return derivative(lambda F: first_piola(law, F), F)
 
 
 def derivative(function: Callable[[jax.Array], jax.Array], A: jax.Array) -> jax.Array:
-    """Derivative of an element-wise function of matrices (…, n, m): (…, its shape, n, m), by forward mode.
+    """Derivative of an element-wise function of matrices A (…, n, m), by forward mode.
 
-    It takes one direction for all elements at a time, so that a law may have one number for each element.
+    The result has the shape of the function's values, followed by (n, m). Each direction is applied to all elements at
+    the same time, so that a law may have one parameter value for each element.
     """
     n, m = A.shape[-2:]
     directions = jnp.eye(n * m, dtype=A.dtype).reshape(n * m, n, m)

@@ -1,16 +1,18 @@
 """The base class of material laws: a strain energy and its derivatives.
 
-A law is a frozen pytree made with `liverjax.core.struct.struct`. It states one or more of
+A law is a frozen pytree made with `liverjax.core.struct.struct`. It defines one or more of these energies, which add
+up:
 
 * `isochoric_energy(Ibar1, Ibar2)` of J^(-2/3) I1 and J^(-4/3) I2;
-* `stretch_energy(X_1, …)` of X_k = sum_m (J^(-1/3) lambda_m)^alpha_k - 3, with `exponents()` giving the alpha_k;
-* `green_energy(E)` of Green's strain in the axes `fibre`, `sheet` and their normal (the coordinate axes without them);
-* the volumetric energy U(J): fields `bulk` and `volumetric`;
+* `stretch_energy(X_1, …)` of X_k = sum_m (J^(-1/3) lambda_m)^alpha_k - 3; `exponents()` gives the alpha_k;
+* `green_energy(E)` of Green's strain in the axes `fibre`, `sheet` and their normal. Without these fields the axes are
+  the coordinate axes;
+* the volumetric energy U(J): fields `bulk` and `volumetric`.
 
-which add up, or overrides `strain_energy(I)`, the whole energy of the `invariants` it names (I1, I2, I4, J;
-I4 = a . C a needs a field `fibre`). Only the named invariants are computed. Derivatives come from scalar automatic
-differentiation unless `isochoric_derivatives`, `stretch_derivatives`, `green_derivatives` or `energy_derivatives` are
-written by hand.
+Or it overrides `strain_energy(I)`, the complete energy, as a function of the invariants that its `invariants` names
+(I1, I2, I4, J; I4 = a . C a needs a field `fibre`). Only the named invariants are computed. Derivatives are computed by
+scalar automatic differentiation, unless the law defines `isochoric_derivatives`, `stretch_derivatives`,
+`green_derivatives` or `energy_derivatives`.
 """
 
 from collections.abc import Callable
@@ -37,52 +39,50 @@ class Law(Energies):
 
     def shear_modulus(self) -> Any:
         """Ground-state shear modulus [Pa]."""
-        raise InputError(f"law {type(self).__name__} states no ground-state shear modulus: define shear_modulus(self)")
+        raise InputError(f"law {type(self).__name__} has no ground-state shear modulus: define shear_modulus(self)")
 
     def bulk_modulus(self) -> Any:
         """Ground-state bulk modulus [Pa]: `bulk`, if all other energies of the law are isochoric."""
         if type(self).strain_energy is not Energies.strain_energy or self.green_energy is not None:
-            raise InputError(
-                f"law {type(self).__name__} states no ground-state bulk modulus: define bulk_modulus(self)"
-            )
+            raise InputError(f"law {type(self).__name__} has no ground-state bulk modulus: define bulk_modulus(self)")
         return 0.0 if self.bulk is None else self.bulk
 
     def check(self) -> None:
-        """Raise `InputError` if the values of two fields contradict each other."""
+        """Raise `InputError` if the values of the fields contradict each other."""
         self.check_directions()
 
     def check_directions(self) -> None:
-        """Raise `InputError` if a fibre has no length; traced ones pass."""
+        """Raise `InputError` if a fibre has length 0. Traced fibres pass."""
         if self.fibre is None or any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(self.fibre)):
             return
         if not np.all(np.linalg.norm(np.asarray(self.fibre, float), axis=-1) > 0):
             raise InputError(f"law {type(self).__name__}: a fibre has no length: give a direction that is not zero")
 
-    # -- what a law is made of ----------------------------------------------------------------------------------------
+    # -- parts of a law -----------------------------------------------------------------------------------------------
 
     def each(self, change: Callable[["Law"], "Law"]) -> "Law":
         """Apply `change` to the law of every part of the body."""
         return change(self)
 
     def isochoric_part(self) -> Any:
-        """The law without U(J); `None` if its energy has no such split (or is only volumetric)."""
+        """The law without U(J); `None` if its energy has no isochoric part or no such split."""
         if self.isochoric_energy is None and self.stretch_energy is None:
             return None
         return self if self.bulk is None else replace(self, bulk=None)
 
     def volumetric_part(self) -> Any:
-        """U(J) as a law of its own; `None` if the law has no U(J)."""
+        """U(J) as a separate law; `None` if the law has no U(J)."""
         return None if self.bulk is None else Volumetric(bulk=self.bulk, volumetric=self.volumetric)
 
     def without_volume(self) -> Any:
-        """The law without every U(J) that is a separate term of it; `None` if nothing is left."""
+        """The law without each U(J) that is a separate term of its energy; `None` if nothing is left."""
         split = self.isochoric_part()
         if split is not None:
             return split
         apart = self.bulk is not None and type(self).strain_energy is Law.strain_energy
         return replace(self, bulk=None) if apart else self
 
-    # -- what a law can then do --------------------------------------------------------------------------------------
+    # -- what follows from them --------------------------------------------------------------------------------------
 
     def energy(self, F: jax.Array) -> jax.Array:
         """Strain energy density [Pa], shape (...), of deformation gradients (..., 3, 3)."""
@@ -93,7 +93,7 @@ class Law(Energies):
         return pack(invariant_terms.first_piola(self, unpack(_floating(F))))
 
     def tangent(self, F: jax.Array) -> jax.Array:
-        """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), by the hand-derived MJED terms: blocks of unit vectors D."""
+        """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3): the hand-derived MJED blocks for unit vectors D."""
         A = invariant_terms.tangent(invariant_terms.state(self, unpack(_floating(F))))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
         # pack gives (..., i, k); stacking L last then J second: (..., i, J, k, L).
@@ -105,12 +105,12 @@ class Law(Energies):
         return Sum(laws=self.summands() + other.summands())
 
     def __radd__(self, other: Number) -> "Law":
-        """0 + law, so that Python's `sum` adds a list of laws."""
+        """0 + law is the law, so that Python's `sum` can add a list of laws."""
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
 def _floating(F: Number) -> jax.Array:
-    """`F` as an array of floating-point numbers; integers become the default precision."""
+    """`F` as an array of floating-point numbers. Integers are converted to the default precision."""
     F = jnp.asarray(F)
     return F if jnp.issubdtype(F.dtype, jnp.floating) else F.astype(float)
 
@@ -126,7 +126,10 @@ class Sum(Law):
         return self.laws
 
     def isochoric_part(self):
-        """The sum of the isochoric parts, without laws that are only volumetric; `None` if a law has no such part."""
+        """The sum of the isochoric parts.
+
+        Laws that are only volumetric are left out; `None` if another law has no such part.
+        """
         parts = [law.isochoric_part() for law in self.laws if not isinstance(law, Volumetric)]
         return None if any(part is None for part in parts) else _added(parts)
 
@@ -144,7 +147,7 @@ class Sum(Law):
             law.check()
 
     def measures(self, F):
-        """One set of invariants for each law of the sum; shared ones are computed once."""
+        """One set of invariants for each law of the sum. Invariants that laws share are computed once."""
         return tuple(law.measures(F) for law in self.laws)
 
     def strain_energy(self, I):
@@ -152,7 +155,10 @@ class Sum(Law):
         return sum(law.strain_energy(i) for law, i in zip(self.laws, I, strict=True))
 
     def energy_derivatives(self, I):
-        """Sum of the scalar derivatives: summed before anything is assembled, so a second law costs only scalars."""
+        """Sum of the scalar derivatives.
+
+        It is formed before the assembly, so a second law only adds scalar operations.
+        """
         first, second = {}, {}
         fibres = fibre_invariants(self.laws)
         for law, i in zip(self.laws, I, strict=True):
@@ -175,7 +181,7 @@ class Sum(Law):
 
 @struct
 class Volumetric(Law):
-    """U(J) alone.
+    """A law that consists of U(J) only.
 
     W = K/2 (J - 1)^2 ("quadratic"), K/2 ln^2 J ("log") or K/4 (J^2 - 1 - 2 ln J) ("simo").
     """
@@ -212,7 +218,7 @@ class Volumetric(Law):
         return 0.0
 
     def bulk_modulus(self):
-        """K [Pa]: every form of U has this curvature at rest."""
+        """K [Pa]: every form of U has the curvature K at rest."""
         return self.bulk
 
 

@@ -1,4 +1,4 @@
-"""A body with laws of several kinds: each element has the law of its region, and is computed by that law alone."""
+"""A body with laws of several kinds. Each element is computed only with the law of its region."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,19 +16,19 @@ from liverjax.tensors.subsets import Subsets, in_subset, put_together
 class ByRegion(Law):
     """Several laws, one for each subset of the elements.
 
-    A number of a law may have one value for each element of the whole body (E,); only the values in its subset are
-    used.
+    A parameter of a law may have one value for each element of the whole body (E,). Only the values of the law's subset
+    are used.
     """
 
     laws: tuple[Law, ...] = unnamed("one law for each subset")
     subsets: Subsets = param("1", "which elements each law has")  # type: ignore[assignment]
 
     def pieces(self) -> tuple[Law, ...]:
-        """The laws, with the numbers of the whole body."""
+        """The laws, with the parameters of the whole body."""
         return self.laws
 
     def piece(self, k: int) -> Law:
-        """Law k with the numbers of its own elements."""
+        """Law k with the parameters of its elements."""
         return in_subset(self.subsets, k, self.laws[k])
 
     def each(self, change: Callable[[Law], Law]) -> "ByRegion":
@@ -41,27 +41,27 @@ class ByRegion(Law):
             law.check()
 
     def isochoric_part(self) -> Any:
-        """The isochoric part of each law; None if one law has none."""
+        """The isochoric part of each law; None if a law has no isochoric part."""
         if any(law.isochoric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.isochoric_part())
 
     def volumetric_part(self) -> Any:
-        """The volumetric part of each law; None if no law has one."""
+        """The volumetric part of each law; None if no law has a volumetric part."""
         if all(law.volumetric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.volumetric_part() or Volumetric(bulk=0.0))
 
     def measures(self, F: Matrix) -> tuple:  # type: ignore[override]
-        """The invariants of each law at its own elements."""
+        """The invariants of each law in the elements of its subset."""
         return tuple(self.piece(k).measures(in_subset(self.subsets, k, F)) for k in range(len(self.laws)))
 
     def strain_energy(self, I: tuple) -> jax.Array:  # type: ignore[override]
-        """Energy density (…, E) [Pa] of every element, by its own law."""
+        """Energy density (…, E) [Pa] of every element, from the law of its region."""
         return put_together(self.subsets, [self.piece(k).strain_energy(i) for k, i in enumerate(I)])
 
     def energy_derivatives(self, I: Any) -> Any:
-        """Refused: laws of several kinds have no invariants in common."""
+        """Raise an error: laws of several kinds have no common invariants."""
         raise InputError("laws of several kinds have no derivatives in common: use those of each law")
 
     def shear_modulus(self) -> jax.Array:

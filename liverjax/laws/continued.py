@@ -1,4 +1,4 @@
-"""A law continued below a chosen J: finite energy for flat and inverted elements, for which the law itself has none."""
+"""A law that is continued below a chosen J, so that flat and inverted elements have a finite energy."""
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,11 @@ from liverjax.tensors.matrices import determinant
 
 @struct
 class Continued(Law):
-    """A law of I1, I2 and J, unchanged above J = c; below c its energy continues smoothly in value and slope.
+    """A law of I1, I2 and J. It is unchanged above J = c; below c its energy continues smoothly in value and slope.
 
-    Below c an isochoric energy is evaluated at c^2/(2c - J) in place of J. This is positive, so that isochoric
-    invariants exist. A volumetric energy is replaced by its Taylor parabola at c. The energy rises towards inversion.
+    Below c an isochoric energy is evaluated at c^2/(2c - J) instead of J. This value is positive, so the isochoric
+    invariants exist. A volumetric energy is replaced by its Taylor parabola at c. The energy increases towards
+    inversion.
     """
 
     law: Law = unnamed("the law that is continued")
@@ -26,7 +27,7 @@ class Continued(Law):
         return self.law.invariants if "J" in self.law.invariants else (*self.law.invariants, "J")
 
     def isochoric_part(self) -> Law | None:
-        """The law without its volumetric energy; None if it has no such split."""
+        """The law without its volumetric energy; None if its energy cannot be split."""
         part = self.law.isochoric_part()
         return None if part is None else Continued(law=part, below=self.below)
 
@@ -82,7 +83,7 @@ class Continued(Law):
         return self.law if part is None else part
 
     def _replaced(self, J: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The replaced volume ratio, c^2/(2c - J) below c and J above, with its slope and curvature."""
+        """The replaced volume ratio (c^2/(2c - J) below c, J above c), and its first and second derivative."""
         c, lower = self.below, self.below > J
         inverse = 1 / (2 * c - jnp.minimum(J, c))
         squared = c * c * inverse * inverse
@@ -94,14 +95,14 @@ class Continued(Law):
 
 
 def continued(law: Law, below: float) -> Law:
-    """The law with finite energy and forces for every J, unchanged above J = `below`; see `Continued`.
+    """The law with finite energy and forces for every J. It is unchanged above J = `below`; see `Continued`.
 
     Args:
         law: a law of I1, I2 and J, or a sum of such laws.
         below: c, between 0 and 1, e.g. 0.1.
 
     Raises:
-        InputError: c out of bounds; an energy of stretches, of fibres or of Green's strain (the last is finite anyway).
+        InputError: c out of bounds; an energy of stretches, of fibres or of Green's strain (which is always finite).
     """
     if isinstance(below, bool) or not isinstance(below, (int, float)) or not 0 < below < 1:
         raise InputError(f"law continued_below = {below!r} must lie between 0 and 1: give e.g. 0.1")

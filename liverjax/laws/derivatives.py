@@ -10,23 +10,26 @@ from liverjax.tensors.matrices import Invariants
 First = dict[str, Any]
 Second = dict[tuple[str, str], Any]
 
-#: Scalar invariants in order; keys of second derivatives are pairs in this order.
+#: Scalar invariants. Keys of second derivatives are pairs in this order.
 ORDER = ("I1", "I2", "I4", "J")
 
 
 def accumulate(total: dict, key: object, value: object) -> None:
-    """Add to an entry of a table of derivatives, in place; an absent entry begins with the value."""
+    """Add a value to an entry of a table of derivatives, in place. A missing entry gets the value."""
     total[key] = total[key] + value if key in total else value
 
 
 def reduced(I: Invariants) -> tuple[Any, Any]:
-    """Isochoric invariants Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2; NaN for J <= 0, where they do not exist."""
+    """Isochoric invariants Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2.
+
+    They are NaN for J < 0, where they do not exist.
+    """
     m = I.J ** (-2 / 3)
     return (None if I.I1 is None else m * I.I1), (None if I.I2 is None else m * m * I.I2)
 
 
 def split_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
-    """Chain rule from w(Ibar1, Ibar2) + U(J) to I1, I2, J (mathematics of the chapter's section 4.1.2, contracted)."""
+    """Derivatives of w(Ibar1, Ibar2) with respect to I1, I2 and J (chapter, section 4.1.2, contracted)."""
     m = I.J ** (-2 / 3)
     inverse_J = 1 / I.J
     Ibar = {"I1": m * I.I1} if "I1" in law.invariants else {}
@@ -58,7 +61,7 @@ def _isochoric_derivatives(law: Any, Ibar: dict) -> tuple[First, Second]:
 
 
 def autodiff_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
-    """The scalar derivatives of `law.strain_energy` by forward mode, for a law that states only its energy."""
+    """The scalar derivatives of `law.strain_energy` by forward mode, for a law that defines only its energy."""
     values = {n: getattr(I, n) for n in ORDER if n in law.invariants}
     return _scalar_derivatives(lambda **v: law.strain_energy(I._replace(**v)), values)
 

@@ -1,5 +1,8 @@
-"""What a law states: its energies and their derivatives by scalar invariants. The terms of stress and stiffness
-(`liverjax.laws.terms`) are made of this; `liverjax.laws.base.Law` adds what a law can then do."""
+"""What a law defines: its energies and their derivatives with respect to scalar invariants.
+
+The terms of stress and stiffness (`liverjax.laws.terms`) use these. `liverjax.laws.base.Law` adds what follows from
+them, for example the stress.
+"""
 
 from typing import Any, ClassVar
 
@@ -16,17 +19,17 @@ class Energies:
     invariants: ClassVar[tuple[str, ...]] = ("I1", "J")
     #: Every law is a struct, so `dataclasses.replace` works on it.
     __dataclass_fields__: ClassVar[Content]
-    #: The energies of a law; None: it has none of that kind.
+    #: The energies of a law; None: the law has no energy of this kind.
     isochoric_energy: Any = None
     stretch_energy: Any = None
     green_energy: Any = None
-    #: Their derivatives by hand; None: by automatic differentiation.
+    #: Hand-derived derivatives of these energies; None: automatic differentiation.
     isochoric_derivatives: Any = None
     stretch_derivatives: Any = None
     green_derivatives: Any = None
     #: The powers of a `stretch_energy`.
     exponents: Any
-    #: Fields of the volumetric energy U(J), and of directions; None: the law has none.
+    #: Fields of the volumetric energy U(J), and fields for directions; None: the law has no such energy or direction.
     bulk: Number | None = None
     volumetric: str
     fibre: Numbers | None = None
@@ -47,7 +50,7 @@ class Energies:
         return W if U is None else W + U.strain_energy(I)
 
     def energy_derivatives(self, I: Invariants) -> tuple[First, Second]:
-        """dW/dI_a and d2W/dI_a dI_b of scalar invariants; a missing key is a structural zero and costs nothing."""
+        """dW/dI_a and d2W/dI_a dI_b for scalar invariants. A missing key means 0 and needs no computation."""
         if type(self).strain_energy is not Energies.strain_energy:
             return autodiff_derivatives(self, I)
         first, second = split_derivatives(self, I) if self.isochoric_energy is not None else ({}, {})
@@ -59,21 +62,21 @@ class Energies:
         return first, second
 
     def volumetric_part(self) -> "Energies | None":
-        """U(J) as a law of its own; `None` if the law has no U(J)."""
+        """U(J) as a separate law; `None` if the law has no U(J)."""
         return None
 
-    # -- what a law is made of ----------------------------------------------------------------------------------------
+    # -- parts of a law -----------------------------------------------------------------------------------------------
 
     def summands(self) -> tuple[Any, ...]:
-        """The laws that add up to this one: itself, unless it is a sum."""
+        """The laws whose sum is this law: the law itself, unless it is a sum."""
         return (self,)
 
     def pieces(self) -> tuple[Any, ...]:
-        """The laws of the parts of the body: itself, unless regions have laws of other kinds."""
+        """The laws of the parts of the body: the law itself, unless regions have laws of other kinds."""
         return (self,)
 
     def piece(self, k: int) -> Any:
-        """The law of part k of the body, with the numbers of its elements."""
+        """The law of part k of the body, with the parameters of the elements of this part."""
         return self
 
     # -- its arguments -------------------------------------------------------------------------------------------------
@@ -91,12 +94,12 @@ class Energies:
         return I if self.bulk is None else I._replace(J=determinant(F))
 
     def material_axes(self, like: Number) -> Matrix:
-        """Columns fibre, sheet and normal in the precision of `like`; the coordinate axes if the law has no fibre."""
+        """Columns fibre, sheet and normal, in the precision of `like`. Without a fibre they are the coordinate axes."""
         return orthogonal_axes(self.fibre, None if self.fibre is None else self.sheet, like)
 
 
 def fibre_invariants(laws: tuple) -> dict[str, Energies]:
-    """Name of each invariant a . C a in a sum of laws -> its law; every law has its own fibre a."""
+    """Name of each invariant a . C a in a sum of laws -> law with this fibre a; fibres of laws may differ."""
     if len(laws) == 1:
         return {"I4": laws[0]} if "I4" in laws[0].invariants else {}
     return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}

@@ -1,4 +1,4 @@
-"""Figures of laws: stress against stretch, and the gradient check."""
+"""Figures of laws: stress over stretch, and the gradient check."""
 
 from pathlib import Path
 
@@ -15,12 +15,12 @@ def _stress_of_curve(law: Law, test: str, driven: np.ndarray) -> np.ndarray:
 
 
 def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (0.6, 1.6)) -> None:
-    """Nominal stress of incompressible samples in four tests, one line per law, written to `file`.
+    """Draw the nominal stress of incompressible samples in four tests, with one line per law, and write it to `file`.
 
     Args:
         named: label -> law.
         file: picture to write.
-        stretches: range of stretch; shear goes to its upper end minus 1.
+        stretches: range of stretches; the amount of shear goes up to the upper end minus 1.
     """
     figure, axes = pyplot().subplots(1, 4, figsize=(13, 3.4), layout="constrained")
     for axis, (test, what) in zip(axes, homogeneous.TESTS.items(), strict=True):
@@ -46,7 +46,7 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
 
 
 def gradient_check(result: Check, name: str, file: Path) -> None:
-    """The V-shaped errors of difference quotients, and stress-stretch curves with their stable range."""
+    """Draw the errors of difference quotients over the step, and stress-stretch curves within their stable ranges."""
     figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 3.8), layout="constrained")
     for (label, errors), colour in zip(result.difference_errors.items(), (BLUE, ORANGE), strict=True):
         left.loglog(result.steps, errors, "o-", ms=3, color=colour, label=label)

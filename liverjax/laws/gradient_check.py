@@ -18,18 +18,19 @@ from liverjax.laws import Law, autodiff, homogeneous
 
 #: Steps of the difference quotients, relative to F.
 STEPS = 10.0 ** -np.arange(1.0, 10.5, 0.5)
-#: A central difference cannot be better than about eps^(2/3) of its terms; the factor allows for large terms.
+#: Limit for difference quotients. Their error is at least about eps^(2/3) of their terms; the factor allows large
+#: terms.
 DIFFERENCE_LIMIT = 1e3 * np.finfo(float).eps ** (2 / 3)
-#: Allows for roundoff in sums of some hundred terms, and for cancellation in deviatoric parts.
+#: Limit for exact results. It allows roundoff in sums of some hundred terms, and cancellation in deviatoric parts.
 EXACT_LIMIT = 1e-10
-#: Stretches at which a law is compared. The narrower ones are for laws that lock, such as Gent's with a small limit.
+#: Ranges of stretch for the comparisons. The narrower ranges are for laws that lock, for example Gent's law.
 _MODERATE, _NARROWER = (0.7, 1.4), ((0.85, 1.18), (0.95, 1.05), (0.99, 1.01))
-#: Equal in number, so that one compiled program serves both.
+#: Both arrays have the same length, so that they share one compiled program.
 STRETCHES, SHEARS = np.linspace(0.2, 4.0, 381), np.linspace(0.0, 3.8, 381)
 
 
 class Row(NamedTuple):
-    """One line of the table; `passed` is None for a line that only informs."""
+    """One row of the table; `passed` is None for a row that only informs."""
 
     name: str
     found: str
@@ -38,7 +39,7 @@ class Row(NamedTuple):
 
 
 class Check(NamedTuple):
-    """A table, and the data of the figure."""
+    """The rows of the table, and the data of the figure."""
 
     law: Law
     rows: list[Row]
@@ -53,17 +54,17 @@ class Check(NamedTuple):
 
 
 def load(name: str) -> Law:
-    """Load a shipped law by its name, or FILE.py:LAW, a law of a Python file. A class gets its typical parameters.
+    """Load an included law by its name, or the law FILE.py:LAW of a Python file. A class gets its typical parameters.
 
     Raises:
-        InputError: no such law or file, a file that does not run, a parameter without typical value.
+        InputError: no such law or file, a file that does not run, a parameter without a typical value.
     """
     if ":" not in name and not name.endswith(".py"):
         return laws.typical(name)
     file, _, attribute = name.rpartition(":") if ":" in name else (name, "", "")
     if not Path(file).is_file():
         raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
-    # The module is registered, as dataclasses look it up, under a private name: the file may be called jax.py.
+    # `dataclasses` look the module up, so it is registered; under a private name, since the file may be called jax.py.
     spec = importlib.util.spec_from_file_location(f"_law_file_{Path(file).stem}", file)
     if spec is None:
         raise InputError(f"{file} is not a Python file: give FILE.py:LAW")
@@ -99,7 +100,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _try(law: Law, name: str) -> None:
-    """Evaluate the law once. Any error becomes one sentence."""
+    """Evaluate the law once. Every error is reported as one sentence."""
     for shape in ((), (2,)):
         F = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 0.9, 1.05])), (*shape, 3, 3))
         for what, expected in (("energy", shape), ("first_piola", (*shape, 3, 3)), ("tangent", (*shape, 3, 3, 3, 3))):
@@ -115,7 +116,7 @@ def _try(law: Law, name: str) -> None:
 
 
 def _try_parts(law: Law, name: str) -> None:
-    """Make the law's parts once. Any error becomes one sentence."""
+    """Make the parts of the law once. Every error is reported as one sentence."""
     for what in ("isochoric_part", "volumetric_part"):
         try:
             part = getattr(law, what)()
@@ -149,7 +150,7 @@ def _typical_law(cls: type, name: str) -> Law:
 
 
 def check(law: Law) -> Check:
-    """Run all checks, one per row. A wrong law raises nothing: its rows fail."""
+    """Run all checks, one per row. A wrong law raises no error: its rows fail."""
     programs = [jax.jit(lambda law, F, what=what: getattr(law, what)(F)) for what in _PROGRAMS]
     energy, stress, tangent = (partial(program, law) for program in programs)
     more, stable = _stability(law, tangent)
@@ -174,8 +175,9 @@ def check(law: Law) -> Check:
 
 
 def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarray, Row]:
-    """Deformation gradients and directions at moderate stretches, or at the widest ones with finite values; and a row
-    that says so.
+    """Deformation gradients, directions, and a row that names their range of stretches.
+
+    The range is moderate, or if the law is not finite there, the widest narrower range with finite values.
     """
     for low, high in (_MODERATE, *_NARROWER):
         F, D = _samples(low, high)
@@ -189,12 +191,14 @@ def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarr
 
 
 def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], programs: Sequence[Callable]) -> list[Row]:
-    """Stress and tangent against automatic differentiation: at moderate stretches, over the stable range, and with
-    other numbers, of which none is 0. Of the three the first that fails is shown.
+    """Rows that compare stress and tangent with automatic differentiation.
+
+    There are three comparisons: at moderate stretches, over the stable range, and with other parameters, none of which
+    is 0. The first comparison that fails is shown.
     """
     low, high = max(stable[0], 0.5), min(stable[1], 2.0)
     sets = [("", law, F)]
-    if low < high:  # at rest alone the stress is roundoff
+    if low < high:  # if only rest is stable, the stress is roundoff
         sets.append((f", stretches {low:.2g} to {high:.2g}", law, _samples(low, high)[0]))
     sets.append((", numbers times 0.8 (0: 0.1)", _with_other_numbers(law), F))
     rows = []
@@ -203,7 +207,7 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
         exact, found = jax.jit(oracle), []
         for where, own, at in sets:
             ours, theirs = (_as_numbers(partial(f, own), at).reshape(len(at), -1) for f in (program, exact))
-            # Beyond the moderate stretches a law may lock; the row above says whether it is finite there.
+            # Outside the moderate stretches a law may lock, so values that are not finite are ignored there.
             known = (np.isfinite(ours) & np.isfinite(theirs)).all(axis=1) | (where == "")
             if np.any(known):
                 found.append(_exact(f"{name} by hand against autodiff{where}", ours[known], theirs[known]))
@@ -212,12 +216,12 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
 
 
 def _with_other_numbers(law: Law) -> Law:
-    """The law with other numbers, of which none is 0."""
+    """The law with other parameters, none of which is 0."""
     return jax.tree.map(lambda v: jnp.where(jnp.asarray(v) == 0, 0.1, 0.8 * jnp.asarray(v)), law)
 
 
 def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]:
-    """Whether the energy is the sum of its parts, which viscosity and mixed elements take for the whole."""
+    """A row on whether the energy is the sum of its two parts. Viscosity and mixed elements use only the parts."""
     isochoric, volumetric = law.isochoric_part(), law.volumetric_part()
     if isochoric is None or volumetric is None:
         return []
@@ -226,7 +230,7 @@ def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]
 
 
 def _idle_numbers_row(law: Law, programs: Sequence[Callable], F: np.ndarray) -> list[Row]:
-    """A row that names the numbers that change neither energy nor stress."""
+    """A row with the parameters that change neither energy nor stress; no row if there is none."""
     law = _with_other_numbers(law)
     leaves, structure = jax.tree_util.tree_flatten_with_path(law)
     before, idle = [_as_numbers(partial(f, law), F) for f in programs], []
@@ -239,7 +243,7 @@ def _idle_numbers_row(law: Law, programs: Sequence[Callable], F: np.ndarray) -> 
     return [Row("numbers without effect", ", ".join(idle), "is the energy complete?", False)] if idle else []
 
 
-#: Methods of a law, each compiled once for all its numbers.
+#: Methods of a law. Each is compiled once for all values of the parameters.
 _PROGRAMS = ("energy", "first_piola", "tangent")
 
 
@@ -247,7 +251,8 @@ def _as_numbers(function: Callable, F: np.ndarray) -> np.ndarray:
     return np.asarray(function(jnp.asarray(F)), float)
 
 
-#: Distance from rest at which a stiffness that jumps there is looked for; a smooth one changes by less than `JUMP`.
+#: To find a stiffness that jumps at rest, it is computed at this distance from rest. Without a jump it changes by less
+#: than `JUMP`.
 NEAR, JUMP = 1e-7, 1e-4
 
 
@@ -257,7 +262,7 @@ def _rotation(seed: int) -> np.ndarray:
 
 
 def _samples(low: float = _MODERATE[0], high: float = _MODERATE[1]) -> tuple[np.ndarray, np.ndarray]:
-    """Deformation gradients with stretches between these, and directions of unit length."""
+    """Deformation gradients with stretches between `low` and `high`, and directions of unit length."""
     rng = np.random.default_rng(2)
     stretches = rng.uniform(low, high, (12, 3))
     stretches[:3, 1] = stretches[:3, 0]  # two equal
@@ -267,7 +272,7 @@ def _samples(low: float = _MODERATE[0], high: float = _MODERATE[1]) -> tuple[np.
 
 
 def _difference(function: Callable, F: np.ndarray, D: np.ndarray, h: float, exact: np.ndarray) -> float:
-    """Largest relative error of the central difference with step h."""
+    """Maximum relative error of the central difference with step h."""
     quotient = (_as_numbers(function, F + h * D) - _as_numbers(function, F - h * D)) / (2 * h)
     return float(np.abs(quotient - exact).max() / max(np.abs(exact).max(), 1e-300))
 
@@ -291,8 +296,9 @@ def _exact(name: str, ours: np.ndarray, theirs: np.ndarray, size: float | None =
 
 
 def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> list[Row]:
-    """Energy, stress and moduli of the undeformed state. Moduli are Voigt's means; for an isotropic law these are the
-    moduli of every direction.
+    """Rows on energy, stress and moduli of the undeformed state.
+
+    The moduli are Voigt means. For an isotropic law they are the moduli in every direction.
     """
     W, P, A = (_as_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
     if not np.isfinite(A).all():
@@ -300,7 +306,7 @@ def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable)
     scale = np.abs(A).max()
     rows = []
     for name, value in (("energy at rest", np.abs(W)), ("stress at rest", np.abs(P).max())):
-        # A law without stiffness at rest, such as that of slack fibres, is compared with a pascal.
+        # A law without stiffness at rest (for example of slack fibres) is compared with 1 Pa.
         error = value / (scale if scale > 0 else 1.0)
         found = f"{error:.1e} of the tangent" if scale > 0 else f"{value:.1e} Pa"
         rows.append(Row(name, found, f"< {EXACT_LIMIT:.0e}", bool(error < EXACT_LIMIT)))
@@ -324,21 +330,21 @@ def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable)
 
 
 def _mean_moduli(A: np.ndarray) -> np.ndarray:
-    """Voigt's means of shear and bulk modulus (2, n) [Pa] of tangents (n, 3, 3, 3, 3)."""
+    """Voigt means of shear and bulk modulus (2, n) [Pa] of tangents (n, 3, 3, 3, 3)."""
     normal, coupled = np.einsum("niiii->n", A), A[:, 0, 0, 1, 1] + A[:, 0, 0, 2, 2] + A[:, 1, 1, 2, 2]
     sheared = A[:, 0, 1, 0, 1] + A[:, 0, 2, 0, 2] + A[:, 1, 2, 1, 2]
     return np.stack([(normal - coupled) / 15 + sheared / 5, (normal + 2 * coupled) / 9])
 
 
 def _near_rest() -> np.ndarray:
-    """Deformation gradients (n, 3, 3) a hair from rest, in pairs of opposite directions."""
+    """Deformation gradients (n, 3, 3) very close to rest, in pairs of opposite directions."""
     D = _samples()[1]
     D = np.concatenate([np.eye(3)[None], D + np.transpose(D, (0, 2, 1))])
     return np.eye(3) + NEAR * np.concatenate([D, -D])
 
 
 def _limits_of_energy(energy: Callable) -> list[Row]:
-    """The energy at J -> 0, J -> infinity, J = 0 and J < 0."""
+    """Rows on the energy for J -> 0, J -> infinity, J = 0 and J < 0."""
 
     def along(*sizes: float) -> np.ndarray:
         return _as_numbers(energy, np.stack([s ** (1 / 3) * np.eye(3) for s in sizes]))
@@ -362,9 +368,9 @@ def _limits_of_energy(energy: Callable) -> list[Row]:
 
 
 def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
-    """Ranges about rest with positive work and strong ellipticity. The row fails if rest is not stable.
+    """Rows on the ranges around rest with positive work and strong ellipticity. A row fails if rest is not stable.
 
-    A law without stiffness at rest, such as that of fibres alone, neither resists nor helps there.
+    A law without stiffness at rest, for example of fibres only, is neither stable nor unstable there: its row informs.
     """
     rows, ranges = [], {}
     stress = jax.jit(partial(homogeneous.nominal_stress, law))
@@ -389,21 +395,24 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
     return rows, ranges
 
 
-#: Part of its change within a step by which an energy misses the work of the stress, from which a jump is looked for;
-#: the parts into which the step is cut then, and how often. A jump stays in one of them, the error of an energy without
-#: one falls.
+#: A jump of the energy is searched in a step if its change differs from the work of the stress by more than this
+#: fraction. Then the step is cut into this number of parts, this many times. A jump stays in one part; without a jump
+#: the difference decreases.
 _MISSED, _PARTS, _CUTS = 0.05, 32, 3
 
 
 def _jumps(law: Law, energy: Callable) -> list[Row]:
-    """A row on an energy that jumps: it misses the work of the stress, which no check at single states shows."""
+    """A row if the energy jumps: then its change is not the work of the stress.
+
+    Checks at single states cannot find this.
+    """
     stress = jax.jit(partial(homogeneous.nominal_stress, law))
-    # Of a law of the volume alone these tests show the roundoff of an energy of 0.
+    # The energy of a law of the volume only is 0 in these tests, apart from roundoff.
     swollen = np.abs(_as_numbers(lambda F: law.first_piola(F[0])[None], 1.1 * np.eye(3)[None]))
     roundoff = 1e-12 * np.nan_to_num(swollen).max()
 
     def missed(test: str, driven: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Change of the energy without the work, and the change, over each step (n - 1,) [Pa]."""
+        """Difference of the energy's change and the work, and this change, in each step (n - 1,) [Pa]."""
         F = np.asarray(homogeneous.deformation_gradient(test, driven))
         P, W = _as_numbers(stress, F), _as_numbers(energy, F)
         with np.errstate(all="ignore"):
@@ -430,14 +439,14 @@ def _jumps(law: Law, energy: Callable) -> list[Row]:
 
 
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Whether the nominal stress rises; one-sided differences decide at the ends."""
+    """Whether the nominal stress increases; at the ends by one-sided differences."""
     stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
     with np.errstate(all="ignore"):
         return np.gradient(stress, driven) > 0
 
 
 def ellipticity(A: np.ndarray) -> np.ndarray:
-    """Smallest eigenvalue of the acoustic tensor A_iJkL n_J n_L over 200 directions, relative to the tangent."""
+    """Minimum eigenvalue (n,) [Pa] of the acoustic tensor A_iJkL n_J n_L over 203 directions."""
     k = np.arange(200) + 0.5
     z, angle = 1 - k / 200, np.pi * (1 + 5**0.5) * k  # Fibonacci's points of the upper half sphere
     n = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
@@ -458,7 +467,7 @@ def _range(driven: np.ndarray, stable: np.ndarray, start: int) -> tuple[float, f
 
 
 def table(result: Check) -> str:
-    """The rows as text, below the law's first line of documentation."""
+    """The rows as text, below the first line of the law's docstring."""
     width = max(len(row.name) for row in result.rows)
     mark = {True: "ok", False: "FAILED", None: ""}
     lines = [(type(result.law).__doc__ or type(result.law).__name__).strip().splitlines()[0]]

@@ -1,4 +1,4 @@
-"""Isotropic laws in thin parts of a body: layers without stress across them, and bars."""
+"""Isotropic laws in thin parts of a body: layers without stress across their thickness, and bars."""
 
 import dataclasses
 from typing import Any
@@ -11,7 +11,7 @@ from liverjax.core.struct import replace
 from liverjax.laws.base import Law
 from liverjax.laws.registry import create, find
 
-#: Iterations for the stretch of the thickness, and the largest change of its logarithm in one iteration.
+#: Number of iterations for the stretch of the thickness, and maximum change of its logarithm in one iteration.
 _ITERATIONS, _LONGEST = 30, 0.5
 
 
@@ -19,7 +19,7 @@ def read_layer(table: object, name: str) -> Law:
     """Read the law of a thin part from its table. Its bulk modulus has no effect and may be left out.
 
     Raises:
-        InputError: an unknown law or number, in a sentence that begins with `name`.
+        InputError: an unknown law or parameter, in a sentence that begins with `name`.
     """
     if not isinstance(table, dict) or "name" not in table:
         raise InputError(f'{name} law needs name = "…": python -m liverjax laws lists them')
@@ -34,7 +34,7 @@ def read_layer(table: object, name: str) -> Law:
 
 
 def check(law: Law, name: str) -> None:
-    """Refuse a law that has directions, or numbers that contradict each other.
+    """Refuse a law that has directions, or parameters that contradict each other.
 
     Raises:
         InputError: one sentence that begins with `name`.
@@ -45,12 +45,12 @@ def check(law: Law, name: str) -> None:
 
 
 def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
-    """Energy density (Q, m) [Pa] of a layer without stress across it.
+    """Energy density (Q, m) [Pa] of a layer without stress across its thickness.
 
     Args:
-        law: isotropic. It is taken at J = 1, or if `solved` at the J for which the stress across is 0.
+        law: isotropic law. It is evaluated at J = 1, or if `solved` at the J for which the stress across is 0.
         C: C_11, C_12, C_22 (Q, m) of the in-plane right Cauchy-Green tensor.
-        solved: whether the stretch of the thickness is solved for.
+        solved: whether the stretch of the thickness is an unknown.
     """
     f11 = jnp.sqrt(C[0])
     f12 = C[1] / f11
@@ -66,14 +66,14 @@ def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
 
 
 def _thinned(density: Any, start: jax.Array) -> jax.Array:
-    """Logarithm (Q, m) of the thickness stretch with the least energy; it has the derivatives of the root."""
+    """Logarithm (Q, m) of the thickness stretch with the minimum energy. Its derivatives are exact."""
 
     def slope(u: jax.Array) -> jax.Array:
         return jax.jvp(density, (u,), (jnp.ones_like(u),))[1]
 
     def newton(u: jax.Array) -> jax.Array:
         first, second = jax.jvp(slope, (u,), (jnp.ones_like(u),))
-        # The step goes downhill also where the energy is not convex.
+        # With |second| the step decreases the energy even if the energy is not convex.
         return u - jnp.clip(first / jnp.where(second == 0, 1.0, jnp.abs(second)), -_LONGEST, _LONGEST)
 
     frozen = jax.lax.stop_gradient

@@ -1,4 +1,4 @@
-"""Laws as the chapter writes them (section 4.1.2 i): sums of products g(I1, I2) h(J), and functions of such sums."""
+"""Laws in the form of the chapter (section 4.1.2 i): sums of products g(I1, I2) h(J), and functions of such sums."""
 
 from collections.abc import Callable
 from math import comb
@@ -31,14 +31,14 @@ class Product(NamedTuple):
 
 
 class Group(NamedTuple):
-    """phi(sum_k W^k); `slopes` gives phi' and phi'' of the sum, `None` stands for the sum itself."""
+    """phi(sum_k W^k); `slopes` gives phi' and phi'' for a sum. None: phi is the identity."""
 
     products: list[Product]
     slopes: Callable[[Number], tuple[Number, Number]] | None = None
 
 
 def _isochoric(c: Number, i: int, j: int) -> list[Product]:
-    """c (Ibar1 - 3)^i (Ibar2 - 3)^j by the binomial theorem, without its constant."""
+    """c (Ibar1 - 3)^i (Ibar2 - 3)^j as products, by the binomial theorem, without the constant term."""
     return [
         Product(c * comb(i, a) * comb(j, b) * (-3.0) ** (i - a + j - b), a, b, -2 * a / 3 - 4 * b / 3)
         for a in range(i + 1)
@@ -48,7 +48,7 @@ def _isochoric(c: Number, i: int, j: int) -> list[Product]:
 
 
 def groups(law: Law) -> list[Group]:
-    """The products of a single law; `InputError` for a law that cannot be written in this form."""
+    """The products of a single law. Raise `InputError` if the law cannot be written in this form."""
     match law:
         case NeoHookean():
             return [Group(_isochoric(law.mu / 2, 1, 0))]
@@ -87,7 +87,7 @@ def _exponential(scale: Number, factor: Number) -> Group:
 
 
 def functions_of_volume(law: Law, J: Number) -> list[tuple[jax.Array, jax.Array]]:
-    """h' and h'' of the products whose g is 1."""
+    """h' and h'' of the products with g = 1."""
     if isinstance(law, NeoHookeanCompressible):
         first, second = law.energy_derivatives(Invariants(J=J))
         return [(first["J"], second["J", "J"])]

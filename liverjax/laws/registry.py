@@ -1,4 +1,4 @@
-"""The laws by name: Table 1 of the chapter and three more; how to make, check and scale one."""
+"""The laws by name (those of the chapter's Table 1 and three more), and functions to make, check and scale a law."""
 
 import dataclasses
 from typing import Any
@@ -48,7 +48,7 @@ LAWS: dict[str, type[Law]] = {
 
 
 def find(name: str) -> type[Law]:
-    """The class of the law called `name`; the `InputError` for an unknown name offers the nearest known one."""
+    """The class of the law with this name. The `InputError` for an unknown name suggests a similar known name."""
     if as_word(name, "law name") not in LAWS:
         raise InputError(f"law {name!r} is not known: {hint(name, LAWS)}")
     return LAWS[name]
@@ -60,7 +60,7 @@ def parameters(law: Any) -> list[dataclasses.Field]:
 
 
 def create(name: str, **values: Numbers) -> Law:
-    """A law by its name, its parameters checked against their bounds.
+    """A law by its name. The parameters are checked against their bounds.
 
     Args:
         name: a key of `LAWS`.
@@ -88,7 +88,7 @@ def create(name: str, **values: Numbers) -> Law:
 
 
 def _sequence(value: Any) -> Any:
-    """A tuple of the numbers of the terms, so that each is a leaf. Directions of elements stay an array."""
+    """A tuple with the parameters of the terms, so that each is a leaf. Directions of elements stay an array."""
     if isinstance(value, (list, tuple)) and not any(isinstance(v, (list, tuple)) for v in value):
         return tuple(value)
     if jnp.ndim(value) == 0:
@@ -97,7 +97,7 @@ def _sequence(value: Any) -> Any:
 
 
 def check_value(where: str, metadata: Any, value: Any) -> None:
-    """Refuse a value that a parameter's `metadata` does not allow, in one sentence that begins with `where`."""
+    """Refuse a value that the parameter's `metadata` does not allow. The message begins with `where`."""
     if metadata.get("static"):
         if not isinstance(value, str) or value not in VOLUMETRIC:
             raise InputError(f"{where} = {value!r} is not known: use one of {', '.join(VOLUMETRIC)}")
@@ -117,7 +117,7 @@ def typical(name: str) -> Law:
 
 
 def scaled(law: Law, factor: Number) -> Law:
-    """The law with its energy times `factor`: every parameter in Pa is multiplied, all others are kept."""
+    """The law with its energy multiplied by `factor`: parameters in Pa are multiplied, other parameters are kept."""
 
     def one(s: Law) -> Law:
         if isinstance(s, Continued):

@@ -26,7 +26,7 @@ VOLUMETRIC = {"quadratic": _quadratic_energy, "log": _log, "simo": _simo}
 
 
 def volumetric(kind: str, K: Number, J: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """U, dU/dJ and d2U/dJ2 [Pa] of bulk modulus K [Pa]; `InputError` for an unknown kind."""
+    """U, dU/dJ and d2U/dJ2 [Pa] for the bulk modulus K [Pa]. Raise `InputError` for an unknown kind."""
     if kind not in VOLUMETRIC:
         raise InputError(f"volumetric = {kind!r} is not known: use one of {', '.join(VOLUMETRIC)}")
     return VOLUMETRIC[kind](K, J)

@@ -1,4 +1,4 @@
-"""Meshes of tetrahedra: geometry, files, shapes, neighbours of nodes."""
+"""Meshes of tetrahedra: geometry, files, generated shapes, and neighbours of nodes."""
 
 from liverjax.mesh.files import read_mesh, write_mesh
 from liverjax.mesh.promotion import quadratic

@@ -1,4 +1,4 @@
-"""Nodes of a mesh that share an element, and patches of near nodes. They are made once for a mesh, on the host."""
+"""Nodes of a mesh that share an element, and patches of nearby nodes. They are computed once per mesh, on the host."""
 
 from typing import Any
 
@@ -11,50 +11,53 @@ from liverjax.core.struct import Indices, param, static, struct
 #: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
-#: Nodes per patch, up to so many patches; nodes per patch in larger meshes, where iterations must not grow;
-#: the most patches: the coarse matrix is dense, with 12 unknowns per patch.
+#: Nodes per patch, up to `FEW_PATCHES` patches; nodes per patch in larger meshes, where the number of iterations must
+#: not grow; maximum number of patches, since the coarse matrix is dense with 12 unknowns per patch.
 PATCH_SIZE, FEW_PATCHES, LARGE_PATCH, MOST_PATCHES = 80, 32, 160, 192
 
-#: Neighbours are near if their distance is below this part of each one's mean distance; most nodes of a cluster; the
-#: part of its vertices that must have a near neighbour for a mesh to have clusters.
+#: Two neighbours are near if their distance is below this fraction of the mean distance of each to its neighbours.
+#: Maximum number of nodes of a cluster. A mesh has clusters if at least this fraction of its vertices has a near
+#: neighbour.
 NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
 
 
 @struct
 class Clusters:
-    """Groups of near nodes in thin cells, and where the blocks of their matrices come from.
+    """Groups of near nodes in thin cells, and the sources of the blocks of their matrices.
 
-    In the M x M blocks of a cluster, the matrix entries between its members a < b are at place a M + b.
+    A cluster has M x M blocks. The matrix entries between its members a < b are at place a M + b.
     """
 
     nodes: jax.Array = param("1", "members of every cluster (G, M), padded with 0")
     there: jax.Array = param("1", "1 for a member, 0 for padding (G, M)")
     places: jax.Array = param("1", "place of every source (n,) in all blocks (G M M)")
     sources: tuple[jax.Array, ...] = param(
-        "1", "arrays (n,), of vertices: edge; of functions: element, one function, another, sign of the product"
+        "1", "arrays (n,); for vertices: edge; for functions: element, one function, another, sign of their product"
     )
 
 
 @struct
 class Pattern:
-    """Edges, and the neighbours of every node in rows padded to one length W (ELL): no search when assembling."""
+    """Edges, and the neighbours of every node in rows of one length W (ELL format): the assembly needs no search."""
 
     edges: jax.Array = param("1", "node numbers (2, N), the lower first")
     element_edges: jax.Array = param("1", "number of the edge of each of `PAIRS` (6, E)")
     row_nodes: jax.Array = param("1", "neighbours of every node (W, V), padded with the node itself")
-    row_edges: jax.Array = param("1", "the edges to them (W, V), padded with N")
+    row_edges: jax.Array = param("1", "the edges to these neighbours (W, V), padded with N")
     edge_slots: jax.Array = param("1", "place of each edge (N,) in the flattened rows, in the row of its lower node")
     patches: jax.Array = param("1", "number of the patch of every node (V,), for the coarse space")
-    patch_functions: jax.Array = param("1", "1 and the place in its patch, about 1 in size, of every node (V, 4)")
-    patch_width: jax.Array = param("m", "mean of the patches' widest extents")
+    patch_functions: jax.Array = param(
+        "1", "1 and the scaled position in its patch (up to about 1) of every node (V, 4)"
+    )
+    patch_width: jax.Array = param("m", "mean of the largest extents of the patches")
     clusters: Any = param("1", "`Clusters` of the vertices, where cells are thin", default=None)
     number_of_patches: int = static(default=1, about="P")
 
 
 def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
-    """The pattern of elements (E, 4) on points (V, 3) [m]; host side, equal meshes give equal patterns.
+    """The pattern of elements (E, 4) on points (V, 3) [m]; host side. Equal meshes give equal patterns.
 
-    The points may be traced (derivatives by the shape): then all nodes are one patch.
+    The points may be traced (for derivatives with respect to the shape). Then all nodes are in one patch.
     """
     number_of_nodes = points.shape[0]
     traced = isinstance(points, jax.core.Tracer)
@@ -95,12 +98,12 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
 
 
 def node_numbers(of: Any) -> jax.Array:
-    """A copy as 32-bit integers, converted by NumPy: JAX would compile a program for each shape."""
+    """A copy as 32-bit integers. NumPy converts them, since JAX would compile a program for each shape."""
     return jax.device_put(np.asarray(of).astype(np.int32))
 
 
 def patches(points: np.ndarray) -> np.ndarray:
-    """Number of the patch of every node (V,): boxes halved at the median of their longest side; host side."""
+    """Number of the patch of every node (V,): boxes are halved at the median along their longest side; host side."""
     groups = [np.arange(len(points))]
     few = min(-(-len(points) // PATCH_SIZE), FEW_PATCHES)
     while len(groups) < max(few, min(len(points) // LARGE_PATCH, MOST_PATCHES)):
@@ -115,7 +118,7 @@ def patches(points: np.ndarray) -> np.ndarray:
 
 
 def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    # On the host if positions are known: JAX would take a second to compile small programs for this.
+    # On the host if positions are known: JAX would need a second to compile small programs for this.
     xp: Any = jnp if isinstance(points, jax.core.Tracer) else np
     given: Any = points if xp is jnp else np.asarray(points)
     members = [given[patch == k] for k in range(int(patch.max(initial=0)) + 1)]
@@ -128,12 +131,12 @@ def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, j
 
 
 def vertex_clusters(points: np.ndarray, edges: np.ndarray) -> Clusters | None:
-    """Clusters of vertices (V, 3) that edges (2, N) join; None if few cells are thin; host side."""
+    """Clusters of vertices (V, 3) along the edges (2, N); None if few cells are thin; host side."""
     return _clustered(near_groups(points, edges), edges, (np.arange(edges.shape[1]),))
 
 
 def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) -> Clusters | None:
-    """Clusters of the elements' functions, from their numbers (n, E), places (N, 3) and signs (n, E); host side."""
+    """Clusters of the elements' functions, from their numbers (n, E), positions (N, 3) and signs (n, E); host side."""
     a, b = np.triu_indices(len(nodes), 1)
     pairs, elements = np.stack([nodes[a], nodes[b]]).reshape(2, -1), np.tile(np.arange(nodes.shape[1]), len(a))
     group = near_groups(places, np.unique(np.sort(pairs, axis=0), axis=1))
@@ -142,7 +145,10 @@ def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) 
 
 
 def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Number of the group of every node (V,). Chains of near pairs, out of `pairs` (2, N), join a group; host side."""
+    """Number of the group of every node (V,).
+
+    Nodes that chains of near `pairs` (2, N) connect form a group; host side.
+    """
     count, (one, other) = len(places), pairs
     square = np.sum((places[one] - places[other]) ** 2, axis=1)
     neighbours = np.maximum(np.bincount(pairs.ravel(), minlength=count), 1)
@@ -168,7 +174,7 @@ def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _packed(group: np.ndarray) -> np.ndarray:
-    """Join groups of several nodes up to the size of the largest group, so that blocks of one size are nearly full."""
+    """Join groups of several nodes up to the size of the largest one: then blocks of equal size have little padding."""
     size = np.bincount(group)
     largest, free, last = int(size.max()), 0, 0
     new = np.arange(len(size))
@@ -180,7 +186,7 @@ def _packed(group: np.ndarray) -> np.ndarray:
 
 
 def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, ...]) -> Clusters | None:
-    """Clusters from groups of nodes (V,) and pairs (2, n) of nodes; `sources`: arrays with an entry per pair."""
+    """Clusters from the group of each node (V,) and pairs (2, n) of nodes; `sources` has one entry for each pair."""
     size = np.bincount(group)
     if size.max(initial=0) < 2:
         return None

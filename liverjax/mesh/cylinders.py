@@ -1,7 +1,7 @@
-"""Cylinders with rings and layers at given places: whole ones, and sectors of axisymmetric problems.
+"""Cylinders with rings and layers at given places: complete cylinders, and sectors for axisymmetric problems.
 
-A ring is a regular polygon. Its corners lie a little outside the circle, so that the polygon has the circle's area. The
-error of a stiffness is then of fourth order in the polygon's angle, not of second order.
+A ring is a regular polygon. Its corners lie a little outside the circle, so that the polygon and the circle have the
+same area. The error of a stiffness is then of fourth order in the angle between corners, not of second order.
 """
 
 import itertools
@@ -14,7 +14,8 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.prisms import stacked
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: How fast cells grow away from a rim: with quadratic elements slower growth gains little (experiments/TABLES.md).
+#: Growth of the cell length per distance from a rim. In quadratic elements slower growth gains little
+#: (experiments/TABLES.md).
 GROWTH = 0.7
 
 
@@ -22,18 +23,18 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
     """Places from 0 to `length`, with short cells near given places.
 
     Args:
-        length: [m].
-        cells: place [m] -> length of a cell there [m]; every such place is also in the result.
-        largest: length of the longest cells [m].
-        growth: by how much cells grow in length, per distance from such a place.
+        length: total length [m].
+        cells: place [m] -> length of a cell there [m]; the result contains all these places.
+        largest: maximum length of a cell [m].
+        growth: increase of the cell length per distance from such a place.
 
     Returns:
-        Rising places (n,) [m].
+        Increasing places (n,) [m].
     """
     stops = np.unique([0.0, *cells, length])
     parts = [np.zeros(1)]
     for low, high in itertools.pairwise(stops):
-        # Geometric spacing at both ends: cells much shorter than the part are resolved.
+        # Geometric spacing at both ends, so that cells much shorter than the part are resolved.
         half = np.concatenate([np.zeros(1), np.geomspace(1e-6, 0.5, 500)])
         x = low + (high - low) * np.concatenate([half, 1 - half[-2::-1]])
         cell = np.full_like(x, largest)
@@ -48,19 +49,19 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
 def graded_cylinder(radii: np.ndarray, heights: np.ndarray, match_area: bool = True) -> TetMesh:
     """A cylinder about the z axis with rings of nodes at `radii` and layers of nodes at `heights`.
 
-    Edges around the axis are about as long as the widest ring is wide. The number of corners grows only across wide
-    rings. A thin ring has as many corners outside as inside.
+    Edges around the axis are about as long as the width of the widest ring. The number of corners increases only across
+    wide rings. A thin ring has the same number of corners outside and inside.
 
     Args:
-        radii: of the rings (n,) [m], rising from 0 (the axis).
-        heights: of the layers (m,) [m], rising.
-        match_area: give each polygon the area of its circle; else its corners are on the circle.
+        radii: radii of the rings (n,) [m], increasing from 0 (the axis).
+        heights: heights of the layers (m,) [m], increasing.
+        match_area: whether each polygon has the area of its circle; else its corners are on the circle.
 
     Returns:
         A mesh with the node sets bottom, top and mantle.
 
     Raises:
-        InputError: places that do not rise, radii that do not begin at 0.
+        InputError: places that do not increase, radii that do not begin at 0.
     """
     radii, heights = _rising("radii", radii), _rising("heights", heights)
     corners = _corners(radii)
@@ -76,23 +77,23 @@ class Sector(NamedTuple):
 
     mesh: TetMesh  # node sets bottom, top, mantle, axis, start (the plane y = 0) and end
     normal: np.ndarray  # normal (3,) of the plane `end`
-    parts: float  # how many such sectors make a cylinder
-    stretch: float  # distance of a ring's corners from the axis, over its radius
+    parts: float  # number of such sectors in a cylinder
+    stretch: float  # distance of a ring's corners from the axis, over the radius of the ring
 
 
 def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1) -> Sector:
     """The part of a cylinder between the plane y = 0 and another plane through the axis.
 
-    An axisymmetric problem needs no more than one slice: both planes are planes of symmetry. Every polygon has the area
-    of its circle.
+    An axisymmetric problem needs only one slice: both planes are planes of symmetry. Every polygon has the area of its
+    circle.
 
     Args:
         radii, heights: as in `graded_cylinder`.
         corners: number of corners of every ring of the whole cylinder, at least 3.
-        slices: number of edges of a ring in the sector; `corners` / 4 make a quarter of the cylinder.
+        slices: number of edges of a ring in the sector; `corners` / 4 gives a quarter of the cylinder.
 
     Raises:
-        InputError: as `graded_cylinder`; slices that fill half of the cylinder or more.
+        InputError: as `graded_cylinder`; a sector of half of the cylinder or more.
     """
     radii, heights = _rising("radii", radii), _rising("heights", heights)
     if not 0 < 2 * slices < corners:
@@ -101,7 +102,7 @@ def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1
     angle = step * np.arange(slices + 1)
     ring = stretch * np.column_stack([np.cos(angle), np.sin(angle)])
     plane = np.concatenate([np.zeros((1, 2)), *(r * ring for r in radii[1:])])
-    # Node 0 is the axis; a ring has slices + 1 nodes after it.
+    # Node 0 is on the axis. Each ring adds slices + 1 nodes.
     inner = np.zeros((len(radii) - 1, slices + 1), int)
     outer = 1 + np.arange((len(radii) - 1) * (slices + 1)).reshape(len(radii) - 1, slices + 1)
     inner[1:] = outer[:-1]
@@ -123,7 +124,7 @@ def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1
 
 
 def _stretch(corners: int) -> float:
-    """Radius of the corners of a regular polygon over that of the circle of the same area."""
+    """Radius of the corners of a regular polygon, over the radius of the circle with the same area."""
     step = 2 * np.pi / corners
     return float(np.sqrt(step / np.sin(step)))
 
@@ -135,7 +136,7 @@ def _corners(radii: np.ndarray) -> np.ndarray:
     found, last = [], 6
     for k, w in enumerate(width):
         wanted = round(2 * np.pi * radii[k + 1] / edge)
-        # At a ring thinner than half an edge, polygons with different numbers of corners would cut each other.
+        # If a ring is thinner than half an edge, polygons with different numbers of corners would intersect.
         if k == 0 or w > edge / 2:
             last = max(last, wanted)
         found.append(last)
@@ -143,7 +144,7 @@ def _corners(radii: np.ndarray) -> np.ndarray:
 
 
 def _rings(radii: np.ndarray, corners: np.ndarray, match_area: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and counter-clockwise triangles of a disc: one node in the middle, then ring after ring."""
+    """Nodes and counter-clockwise triangles of a disc: one node at the centre, then ring after ring."""
     points, triangles = [np.zeros((1, 2))], []
     inner = np.zeros(1, int)
     for radius, count in zip(radii[1:], corners, strict=True):
@@ -157,8 +158,10 @@ def _rings(radii: np.ndarray, corners: np.ndarray, match_area: bool) -> tuple[np
 
 
 def _ring_of_triangles(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
-    """Triangles between two rings. Each has the next edge of the inner or of the outer ring, the one whose middle comes
-    first around the axis.
+    """Triangles between two rings.
+
+    Each triangle contains the next edge of the inner or of the outer ring: the edge whose middle comes first around the
+    axis.
     """
     n, m = len(inner), len(outer)
     if n == 1:
@@ -177,7 +180,7 @@ def _ring_of_triangles(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
 def _rising(name: str, places: np.ndarray) -> np.ndarray:
     places = np.asarray(places, float)
     if places.ndim != 1 or len(places) < 2 or not np.all(np.isfinite(places)) or not np.all(np.diff(places) > 0):
-        raise InputError(f"{name} = {places} must be two or more places that rise: sort them")
+        raise InputError(f"{name} = {places} must be two or more increasing places: sort them")
     if name == "radii" and places[0] != 0:
         raise InputError(f"radii begin at {places[0]:g}: begin with the axis, 0")
     return places

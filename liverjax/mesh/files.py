@@ -1,4 +1,4 @@
-"""Mesh files, read and written by meshio: linear and quadratic tetrahedra, with their sets."""
+"""Read and write mesh files with meshio: linear and quadratic tetrahedra with their sets."""
 
 import contextlib
 import io
@@ -26,22 +26,22 @@ CELLS = {1: "tetra", 2: "tetra10"}
 _NAMES = {1: "linear", 2: "quadratic"}
 #: Edges of a quadratic element in the order of VTK and meshio.
 _VTK = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
-#: Middles of edges that are further off the straight edge than this part of its length are moved onto it.
+#: A middle of an edge is moved onto the straight edge if its distance is more than this fraction of the edge's length.
 _STRAIGHT = 1e-6
 
 
 def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     """Read a file with tetrahedra of 4 or 10 nodes, in any format of meshio, and its sets of nodes and elements.
 
-    With 10-node elements the vertices get the first numbers, in the file's order, then the middles of the edges. Curved
-    edges are made straight, with a warning.
+    In meshes of 10-node elements the vertices get the first numbers, in the order of the file. The middles of the edges
+    follow. Curved edges are made straight, with a warning.
 
     Args:
         path: mesh file.
         unit: length unit of the file, one of `UNITS`.
 
     Raises:
-        InputError: unreadable file, no or other cells, unit unknown, unusable mesh.
+        InputError: unreadable file, no tetrahedra or other cells, unknown unit, unusable mesh.
     """
     if as_word(unit, "mesh unit") not in UNITS:
         raise InputError(f"mesh unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
@@ -98,7 +98,9 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     middles = mesh.element_nodes_on_host[4:].T
     of_file = tets[:, [4 + _VTK.index(pair) for pair in PAIRS]]
     if np.any(np.isin(of_file, used)):
-        raise InputError(f"{name}: a node is a vertex of one element and a middle in another; export the mesh anew")
+        raise InputError(
+            f"{name}: a node is a vertex of one element and an edge middle of another; export the mesh again"
+        )
     new[of_file] = middles
     straight = np.asarray(mesh.points)
     low, high = np.asarray(mesh.pattern.edges)
@@ -121,13 +123,13 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
 
 
 def _permuted(points: np.ndarray, middles: np.ndarray, length: np.ndarray) -> bool:
-    """Whether the points (E, 6, 3) [m] of all elements are their edges' middles (E, 6, 3) in one other order."""
+    """Whether the points (E, 6, 3) [m] are the middles (E, 6, 3) of edges, in one other order for all elements."""
     apart = np.linalg.norm(points[:, :, None] - middles[:, None], axis=3)
     order = apart[0].argmin(axis=1)
     return bool(np.all(apart[:, np.arange(6), order] <= _STRAIGHT * length[:, order]))
 
 
-#: The beginning of a file that meshio cannot read -> what the file is, and the remedy.
+#: Pattern at the beginning of a file that meshio cannot read -> kind of the file, and a remedy.
 _FOREIGN = {
     r"\$NOD\b": "it is in Gmsh's format of version 1 ($NOD, $ELM); open it in Gmsh and save it as version 4 or VTK",
     r"DATASET\s+POLYDATA|type=.PolyData": "it holds VTK polygons, a surface; fill the surface with tetrahedra "
@@ -136,7 +138,7 @@ _FOREIGN = {
 
 
 def _read_quietly(path: Path) -> Any:
-    """Read with meshio, but print none of its messages: our own message says what was found."""
+    """Read with meshio without its printed messages. If it fails, the message of `InputError` gives the reason."""
     import meshio
 
     try:
@@ -151,18 +153,18 @@ def _read_quietly(path: Path) -> Any:
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
             return meshio.read(path)
-    except SystemExit:  # meshio exits if no reader accepts the file, and prints their reasons
+    except SystemExit:  # meshio exits if no reader accepts the file, and prints the reasons
         reason = " ".join(said.getvalue().split()) or f"its content is not what {path.suffix} files hold"
-    except KeyError as error:  # an attribute, or an entity that Gmsh's groups name
+    except KeyError as error:  # a missing attribute, or a missing entity of a Gmsh group
         reason = f"the entry {error.args[0]} is missing"
-    except Exception as error:  # meshio's readers raise whatever their parser meets
+    except Exception as error:  # meshio's readers raise many kinds of errors
         reason = " ".join(str(error).split()) or type(error).__name__
     raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh 2.2")
 
 
-#: Cells of surfaces and edges, which a file may have in addition to its tetrahedra.
+#: Cells of surfaces and edges. A file may have them in addition to its tetrahedra.
 _FLAT_CELLS = ("vertex", "line", "triangle", "quad", "polygon")
-#: A body longer than this [m] is likelier a mesh in millimetres.
+#: A body longer than this [m] is probably a mesh in millimetres.
 _LARGE = 10.0
 
 
@@ -186,24 +188,24 @@ def _node_sets(data: Any, tets: np.ndarray, name: str) -> dict[str, np.ndarray]:
     return sets
 
 
-#: A cell array with more different whole numbers than this is taken as numbers of cells, not of groups.
+#: A cell array of whole numbers is ignored if it has more different numbers than this: they are probably cell numbers.
 _MOST_GROUPS = 100
 
 
 def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
     """Sets of tetrahedra: meshio's cell sets, cell data ``set:NAME``, and groups given by whole numbers.
 
-    A group is named by the file (Gmsh's physical names), or by array and number, as in ``medit:ref=2``.
+    The name of a group is from the file (Gmsh's physical names), or made of array and number, e.g. ``medit:ref=2``.
     """
     return _cell_groups(data, (cell,), 3)
 
 
-#: Cells of surfaces whose named groups become node sets; the edges of a triangle.
+#: Types of surface cells whose named groups become node sets; then the edges of a triangle.
 _TRIANGLES, _EDGES = ("triangle", "triangle6"), ((0, 1), (1, 2), (0, 2))
 
 
 def _surface_sets(data: Any, tets: np.ndarray) -> dict[str, np.ndarray]:
-    """Nodes of each named group of triangles; 3-node triangles of a quadratic mesh get their edges' middles."""
+    """Nodes of each named group of triangles. In a quadratic mesh, middles of edges are added to 3-node triangles."""
     sets = {}
     for name, parts in _triangle_groups(data).items():
         nodes = [part.ravel() for part in parts]
@@ -220,7 +222,7 @@ def _named_triangles(data: "meshio.Mesh") -> dict[str, np.ndarray]:
 
 
 def _triangle_groups(data: "meshio.Mesh") -> dict[str, list[np.ndarray]]:
-    """Triangles of each named group, block by block, with 3 or 6 nodes."""
+    """Triangles of each named group, with 3 or 6 nodes: one array for each block of cells."""
     blocks = [block for block in data.cells if block.type in _TRIANGLES]
     first = np.cumsum([0, *(len(block.data) for block in blocks)])
     return {
@@ -245,7 +247,7 @@ def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str, np.ndarray]:
     """Name of a group -> numbers of its cells, counted over all blocks of the types `cells`.
 
-    A group with a number but no name is named by its number if it is a volume, and left out if it is a surface.
+    If a group has a number but no name, a group of volumes is named by its number. A group of surfaces is left out.
     """
     kinds = [block.type for block in data.cells]
     first = np.cumsum([0, *(len(block.data) if block.type in cells else 0 for block in data.cells)])
@@ -265,26 +267,26 @@ def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str,
             continue
         values = values.astype(int)
         if name.startswith("set:"):
-            if values.any() or all(kind in cells for kind in kinds):  # else it is a set of the other kind of cells
+            if values.any() or all(kind in cells for kind in kinds):  # else the set has other kinds of cells
                 sets[name.removeprefix("set:")] = np.flatnonzero(values)
             continue
         groups = np.unique(values)
         for group in groups if len(groups) <= _MOST_GROUPS else ():
             if dimension == 3 or (int(group), name) in names:
-                # A cell in several groups has only the first one's number here; sets of cells have them all.
+                # Here a cell in several groups has only the number of the first group; cell sets contain all groups.
                 sets.setdefault(names.get((int(group), name), f"{name}={group}"), np.flatnonzero(values == group))
     return sets
 
 
 def _are_whole(values: np.ndarray) -> bool:
-    """Whether all values are whole numbers, of any type: ParaView's filters write numbers of regions as floats."""
+    """Whether all values are whole numbers of any type, since ParaView's filters write region numbers as floats."""
     if np.issubdtype(values.dtype, np.floating):
         return bool(np.all(np.isfinite(values)) and np.all(values == np.rint(values)))
     return np.issubdtype(values.dtype, np.integer)
 
 
 def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, object] | None = None) -> None:
-    """Write a mesh [m] with meshio; sets are kept as 0/1 data ``set:NAME``, in formats that can store data."""
+    """Write a mesh [m] with meshio. Sets are written as 0/1 data ``set:NAME`` in formats that can store data."""
     import meshio
 
     data = {name: np.asarray(values) for name, values in (point_data or {}).items()}
@@ -306,7 +308,7 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, 
         f"set:{name}": [_mask(own.get(name, ()), len(nodes)) for own, (_, nodes) in zip(numbers, cells, strict=True)]
         for name in dict.fromkeys(name for own in numbers for name in own)
     }
-    # meshio would write .msh in the format of ANSYS; in this field it is Gmsh's.
+    # For .msh meshio would choose the format of ANSYS; here .msh means Gmsh.
     file_format = "gmsh" if Path(path).suffix == ".msh" else None
     meshio.Mesh(np.asarray(mesh.points), cells, point_data=data, cell_data=cell_data).write(
         path, file_format=file_format
@@ -314,7 +316,7 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, 
 
 
 def _mask(numbers: object, size: int) -> np.ndarray:
-    """1 at the numbers, 0 elsewhere (size,)."""
+    """An array (size,) with 1 at the given numbers and 0 elsewhere."""
     mask = np.zeros(size, dtype=np.int32)
     mask[np.asarray(numbers, int)] = 1
     return mask

@@ -1,4 +1,4 @@
-"""Points and lines inside a mesh: the tetrahedra that they lie in; host side."""
+"""Points and lines inside a mesh: the tetrahedra that contain them; host side."""
 
 from typing import NamedTuple
 
@@ -8,11 +8,11 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: A point counts as inside if its barycentric coordinates are above minus this.
+#: A point counts as inside if all its barycentric coordinates are above minus this number.
 _INSIDE = 1e-9
-#: Vertices nearer to each other than this part of the body's size are at one place.
+#: Two vertices are at the same place if their distance is below this fraction of the body's size.
 SAME_PLACE = 1e-9
-#: Pieces shorter than this part of the line's length are left out.
+#: A piece is left out if it is shorter than this fraction of the line.
 _SHORTEST = 1e-9
 
 
@@ -21,12 +21,12 @@ class Pieces(NamedTuple):
 
     element: np.ndarray  # (m,)
     line: np.ndarray  # (m,) number of the line
-    begin: np.ndarray  # (m,) where on the line, 0 to 1
-    end: np.ndarray  # (m,)
+    begin: np.ndarray  # (m,) beginning on the line, from 0 to 1
+    end: np.ndarray  # (m,) end on the line, from 0 to 1
 
 
 def doubled_vertices(mesh: TetMesh) -> int:
-    """How many vertices are at the place of another one: parts of a mesh that are not joined there."""
+    """Number of vertices at the place of another vertex: there, parts of the mesh are not joined."""
     points = np.asarray(mesh.points)
     steps = np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * float(np.ptp(points, axis=0).max())))
     return mesh.number_of_vertices - len(np.unique(steps, axis=0))
@@ -41,7 +41,7 @@ def barycentric(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
 
 
 def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Elements (n,) of points (n, 3) [m] and barycentric coordinates (4, n) there.
+    """Elements (n,) that contain points (n, 3) [m], and the barycentric coordinates (4, n) of the points.
 
     Raises:
         InputError: a point outside the mesh.
@@ -56,7 +56,7 @@ def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarra
 
 
 def around_a_point(corners: np.ndarray) -> np.ndarray:
-    """Whether tetrahedra with corners (E, 4, 3) hold the origin."""
+    """Whether tetrahedra with corners (E, 4, 3) contain the origin."""
     a, b, c, d = np.moveaxis(corners, 1, 0)
 
     def volume(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def around_a_point(corners: np.ndarray) -> np.ndarray:
 
 
 def around_a_point_in_plane(corners: np.ndarray) -> np.ndarray:
-    """Whether the shadows of tetrahedra, with corners (E, 4, 2) in a plane, hold the origin."""
+    """Whether the projections of tetrahedra to a plane, with corners (E, 4, 2), contain the origin."""
     met = np.zeros(len(corners), bool)
     for face in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]):
         a, b, c = np.moveaxis(corners[:, face], 1, 0)
@@ -76,14 +76,14 @@ def around_a_point_in_plane(corners: np.ndarray) -> np.ndarray:
     return met
 
 
-#: An element with middles of its edges as eight with straight edges: numbers of its nodes.
+#: Local node numbers of the eight tetrahedra with straight edges that make a 10-node element.
 _EIGHTHS = np.array(
     [[0, 4, 5, 6], [1, 4, 7, 8], [2, 5, 7, 9], [3, 6, 8, 9], [5, 8, 4, 6], [5, 8, 6, 9], [5, 8, 9, 7], [5, 8, 7, 4]]
 )
 
 
 def straight_corners(mesh: TetMesh, x: np.ndarray) -> np.ndarray:
-    """Corners (E, 4, 3), or (8 E, 4, 3) of elements with curved edges, at positions x (V, 3) [m]."""
+    """Corners of straight tetrahedra at positions x (V, 3) [m]: (E, 4, 3), or (8 E, 4, 3) for 10-node elements."""
     if mesh.order == 1:
         return x[np.asarray(mesh.tetrahedra)]
     nodes = mesh.element_nodes_on_host[:10].T
@@ -91,19 +91,19 @@ def straight_corners(mesh: TetMesh, x: np.ndarray) -> np.ndarray:
 
 
 def _all_alike(parts: np.ndarray) -> np.ndarray:
-    """Whether the parts (n, E) of sizes that are not 0 have one sign."""
+    """Whether the parts (n, E) of an element have the same sign, for elements whose sum is not 0."""
     whole = parts.sum(axis=0)
     return (whole != 0) & ((np.sign(whole) * parts).min(axis=0) >= -_INSIDE * np.abs(whole))
 
 
 def weights(mesh: TetMesh, element: np.ndarray, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (n, m) of elements (m,), and the values of their functions at barycentric coordinates L (4, m)."""
+    """Nodes (n, m) of elements (m,), and their shape functions at barycentric coordinates L (4, m)."""
     nodes = mesh.element_nodes_on_host[: 4 if mesh.order == 1 else 10, element]
     return nodes, L if mesh.order == 1 else functions(2, L)[0]
 
 
 def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
-    """Straight lines from `begin` to `end` (n, 3) cut at the faces of the tetrahedra, without the parts outside."""
+    """Straight lines from `begin` to `end` (n, 3), cut at the faces of the tetrahedra. Parts outside are left out."""
     found = []
     first, last = barycentric(mesh, begin), barycentric(mesh, end)
     for line in range(len(begin)):
@@ -117,7 +117,7 @@ def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
         least = (a[:, None] + b[:, None] * middle[None, :, None]).min(axis=0)
         element = least.argmax(axis=1)
         inside = least[np.arange(len(middle)), element] > -_INSIDE
-        # The planes of far elements cut lines too: neighbouring parts in one element are joined to one piece.
+        # Planes of distant elements also cut the lines: neighbouring parts in the same element are joined.
         start = np.flatnonzero(inside & ~np.concatenate([[False], (element[1:] == element[:-1]) & inside[:-1]]))
         for k in start:
             stop = k

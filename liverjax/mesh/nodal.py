@@ -1,4 +1,4 @@
-"""Integrals of fields times nodal functions, and values of nodal fields at the points of elements."""
+"""Integrals of fields times shape functions, and values of nodal fields at the integration points of elements."""
 
 from functools import cache, partial
 from itertools import product
@@ -15,7 +15,7 @@ from liverjax.tensors.places import given, taken
 
 
 def to_nodes(mesh: TetMesh, share: jax.Array) -> jax.Array:
-    """Sum (V,) at every vertex: each element gives `share` (E,) to each of its vertices."""
+    """Sums (V,) at the vertices: each element adds its `share` (E,) to each of its vertices."""
     total = jnp.zeros(mesh.number_of_vertices, share.dtype)
     for a in range(4):
         total = given(total, mesh.tetrahedra[:, a], share)
@@ -26,7 +26,7 @@ def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
     """Integrals over the reference volume of a density times the linear function of every vertex: (V,).
 
     Args:
-        density: one number for each quadrature point, (E,) or (Q, E), or one for each element (E,).
+        density: one number for each integration point, (E,) or (Q, E), or one for each element (E,).
     """
     if density.ndim == 1:
         return to_nodes(mesh, mesh.volumes * density / 4)
@@ -47,7 +47,7 @@ def summed(mesh: TetMesh, values: jax.Array) -> jax.Array:
 
 
 def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """Values at the points, (E,) or (Q, E), of a field that is linear in every element, from the vertices (V,)."""
+    """Values at the points, (E,) or (Q, E), of a field that is linear in elements, from its values at vertices (V,)."""
     corner = [taken(values, mesh.tetrahedra[:, a]) for a in range(4)]
     if mesh.order == 1:
         return (corner[0] + corner[1] + corner[2] + corner[3]) / 4
@@ -55,15 +55,16 @@ def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
     return sum((L[a][:, None] * corner[a][None] for a in range(1, 4)), L[0][:, None] * corner[0][None])
 
 
-#: Parts of an element's volume at its vertices and at the middles of its edges: of a lumped mass (Hinton, Rock and
-#: Zienkiewicz 1976: positive, in proportion to the integrals of squares), and integrals of the functions themselves.
+#: Order -> fraction of an element's volume at each vertex and at each middle of an edge. First for the lumped mass
+#: (Hinton, Rock and Zienkiewicz 1976: positive, in proportion to the integrals of squared functions), then for the
+#: integrals of the functions.
 _LUMPED = {1: (1 / 4,), 2: (1 / 36, 4 / 27)}
 _INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
 
 
 @partial(jax.jit, inline=True)
 def nodal_volumes(mesh: TetMesh) -> jax.Array:
-    """Lumped mass over density (V,) [m^3]: a quarter of every linear element at each of its nodes."""
+    """Lumped mass divided by density (V,) [m^3]; a node of linear elements gets a quarter of each element around it."""
     return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)])
 
 
@@ -85,10 +86,10 @@ def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
 
 @cache
 def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Consistent mass matrix of an element divided by its mass, in two parts: a diagonal (n,) and the rest (n, n).
+    """Consistent mass matrix of an element, divided by its mass, as a sum of a diagonal (n,) and another matrix (n, n).
 
-    The diagonal is the lumped mass. Functions of order 3 have no lumped mass: their entries are the integrals of their
-    squares.
+    The diagonal is the lumped mass. Functions of order 3 have no lumped mass: their diagonal entries are the integrals
+    of their squares.
     """
     whole = products(order)
     parts, lumped = np.diag(whole).copy(), _LUMPED[min(order, 2)]
@@ -98,7 +99,7 @@ def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def products(order: int) -> np.ndarray:
-    """Integrals (n, n) over an element of the products of two functions, divided by its volume; exact."""
+    """Exact integrals (n, n) of the products of two shape functions over an element, divided by its volume."""
     vertex = [tuple(int(k == a) for k in range(4)) for a in range(4)]
     if order == 1:
         functions: list[dict[tuple, float]] = [{v: 1.0} for v in vertex]

@@ -7,9 +7,9 @@ def stacked(plane: np.ndarray, triangles: np.ndarray, heights: np.ndarray) -> tu
     """Points (n L, 3) and tetrahedra (3 m (L - 1), 4) between planes of n nodes at L heights.
 
     Args:
-        plane: x and y of the nodes of every plane (n, 2) [m].
-        triangles: their triangles (m, 3), counter-clockwise.
-        heights: of the planes (L,) [m], rising.
+        plane: x and y of the nodes in every plane (n, 2) [m].
+        triangles: triangles of a plane (m, 3), counter-clockwise.
+        heights: heights of the planes (L,) [m], increasing.
     """
     n = len(plane)
     points = np.column_stack([np.tile(plane, (len(heights), 1)), np.repeat(heights, n)])
@@ -18,8 +18,11 @@ def stacked(plane: np.ndarray, triangles: np.ndarray, heights: np.ndarray) -> tu
 
 
 def _split(prisms: np.ndarray) -> np.ndarray:
-    """Cut prisms (bottom a b c, top d e f) in three; diagonals start at the lower node number, so faces match."""
-    # Rotate each prism so that its smallest bottom number comes first: then only one quadrilateral is left to decide.
+    """Cut each prism (bottom a b c, top d e f) in three.
+
+    Diagonals start at the lowest node, so neighbours' faces match.
+    """
+    # Rotate each prism so that its lowest bottom number comes first. Then only one diagonal has to be chosen.
     shift = np.argmin(prisms[:, :3], axis=1)
     turn = (np.arange(3)[None] + shift[:, None]) % 3
     a, b, c = np.take_along_axis(prisms[:, :3], turn, axis=1).T

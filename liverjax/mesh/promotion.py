@@ -1,4 +1,4 @@
-"""Quadratic tetrahedra from linear ones, with a node in the middle of every edge; and cubic functions."""
+"""Quadratic tetrahedra from linear ones, with a node at the middle of every edge; and additional cubic functions."""
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,10 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 
 def quadratic(mesh: TetMesh) -> TetMesh:
-    """The mesh with 10 nodes in each element; a quadratic mesh is returned as it is.
+    """The mesh with 10 nodes in each element. A quadratic mesh is returned unchanged.
 
-    The vertices keep their numbers, the middles of the edges follow in the order of `pattern.edges`. If a node set
-    contains the three vertices of a face, it also gets the middles of its edges, so that a fixed face stays fixed.
+    The vertices keep their numbers. The middles of the edges follow in the order of `pattern.edges`. If a node set
+    contains the three vertices of a face, the middles of the face's edges are added, so that a fixed face stays fixed.
     """
     if mesh.order > 1:
         return mesh
@@ -24,14 +24,14 @@ def quadratic(mesh: TetMesh) -> TetMesh:
     return replace(made, clusters=_all_clusters(made))
 
 
-@jax.jit  # one program for each mesh, not one for each operation
+@jax.jit  # one program for all operations, not one for each
 def _points_and_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
     low, high = edges
     return jnp.concatenate([points, 0.5 * (points[low] + points[high])])
 
 
 def of_faces(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Vertices `nodes` (n,) of a linear mesh, and the middles of the edges of the faces between them; host side."""
+    """Vertices `nodes` (n,) of a linear mesh, and the edge middles of all faces with only such vertices; host side."""
     inside = np.zeros(mesh.number_of_vertices, bool)
     inside[nodes] = True
     held = inside[np.asarray(mesh.tetrahedra)]
@@ -45,7 +45,7 @@ def of_faces(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
 
 
 def cubic(mesh: TetMesh) -> TetMesh:
-    """A quadratic mesh with functions of order 3 added; their unknowns are 0 in the reference shape."""
+    """A quadratic mesh with additional functions of order 3. Their unknowns are 0 in the reference shape."""
     tets = np.asarray(mesh.tetrahedra)
     triples = np.concatenate([np.sort(tets[:, face], axis=1) for face in map(list, FACES)])
     _, number = np.unique(triples, axis=0, return_inverse=True)
@@ -56,7 +56,7 @@ def cubic(mesh: TetMesh) -> TetMesh:
 
 
 def _all_clusters(mesh: TetMesh) -> Clusters | None:
-    """Clusters of all functions, each at the middle of its edge or face; None if vertices have none; host side."""
+    """Clusters of all functions, with each at the middle of its edge or face; None if vertices have none; host side."""
     if mesh.pattern.clusters is None or isinstance(mesh.points, jax.core.Tracer):
         return None
     points, tets, (low, high) = (np.asarray(a) for a in (mesh.points, mesh.tetrahedra, mesh.pattern.edges))
@@ -83,7 +83,10 @@ def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:
 
 
 def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
-    """Triangles (m, 3); in a mesh of order 3 (m, 4): vertices in order, then the number of the face; host side."""
+    """Triangles (m, 3).
+
+    In a mesh of order 3 (m, 4): vertices in increasing order, and number of the face; host side.
+    """
     if mesh.order < 3:
         return triangles
     vertices = np.sort(np.asarray(triangles), axis=1)
@@ -91,13 +94,12 @@ def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
 
 
 def _code(triples: np.ndarray, V: int) -> np.ndarray:
-    """One number for each sorted triple; it stays below 2^63 up to two million vertices."""
+    """A number for each sorted triple, different for different triples. It is below 2^63 up to two million vertices."""
     return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
 
 
 def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Nodes (n,) of the quadratic elements, then the functions of order 3 on the edges and faces between these nodes;
-    host side."""
+    """Nodes (n,) of quadratic elements, then the functions of order 3 on edges and faces between them; host side."""
     inside = np.zeros(mesh.number_of_nodes, bool)
     inside[nodes] = True
     V, N = mesh.number_of_vertices, mesh.pattern.edges.shape[1]
@@ -116,7 +118,7 @@ def _nodes_of_face(face: tuple[int, ...]) -> list[int]:
 
 
 def on_middles(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """Values at all nodes of a field that is linear along every edge, from its values (..., V) at the vertices."""
+    """Values at vertices and middles of edges of a field that is linear along edges, from (..., V) at vertices."""
     if mesh.order == 1:
         return values
     low, high = mesh.pattern.edges

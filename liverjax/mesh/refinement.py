@@ -1,4 +1,4 @@
-"""A finer mesh: every tetrahedron cut into eight of half its size, or those near some nodes cut in two."""
+"""A finer mesh: every tetrahedron is cut into eight of half its size, or tetrahedra near some nodes are cut in two."""
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,9 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     traced if `near` is not given and the mesh has no triangle sets.
 
     Args:
-        near: node numbers (n,). If given, only the edges at these nodes are halved, and the further edges that keep the
-            mesh conforming. An element is cut at its longest edge first (Rivara 1984), so elements do not become
-            flatter. `rim` gives the nodes around a clamp, where most of a mesh's error is.
+        near: node numbers (n,). If given, only edges at these nodes are halved, and other edges if the mesh would not
+            be conforming otherwise. An element is cut at its longest edge first (Rivara 1984), so elements do not
+            become flatter. `rim` gives the nodes around a clamp, where most of the mesh error is.
     """
     V = mesh.number_of_vertices
     points: Array = mesh.points if isinstance(mesh.points, jax.core.Tracer) else np.asarray(mesh.points)
@@ -83,7 +83,7 @@ def _triangles_in(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) 
 
 
 def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
-    """The nodes (m,) at the edge of the patch that surface nodes (n,) cover. Strain is largest there."""
+    """The nodes (m,) at the border of the surface region that nodes (n,) cover. Strain is largest there."""
     held = np.asarray(nodes)[np.asarray(nodes) < mesh.number_of_vertices]
     triangles = boundary_triangles(mesh, held)
     sides = np.sort(np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)
@@ -109,10 +109,10 @@ def _corners_of_parts(a: Array, b: Array, c: Array, d: Array, *middles: Array) -
 
 
 def _by_length(mesh: TetMesh) -> np.ndarray:
-    """Ranks (N,) of the edges by length. No two are equal, so two elements cut their common face in the same way."""
+    """Ranks (N,) of the edges by length. All ranks differ, so two elements cut their common face in the same way."""
     low, high = np.asarray(mesh.pattern.edges)
     points = np.asarray(mesh.points)
-    # Rounded, so that on every machine edges of equal length are ordered by their number.
+    # Lengths are rounded, so that on all machines edges of equal length are ordered by their number.
     lengths = np.linalg.norm(points[low] - points[high], axis=1).astype(np.float32)
     place = np.empty(len(low), int)
     place[np.argsort(lengths, kind="stable")] = np.arange(len(low))
@@ -120,8 +120,7 @@ def _by_length(mesh: TetMesh) -> np.ndarray:
 
 
 def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
-    """Which edges (N,) are halved: those at the nodes, and the longest edge of every element and face with a halved
-    edge."""
+    """Which edges (N,) are halved: edges at the nodes, and the longest edge of elements and faces with halved edges."""
     edges, place = np.asarray(mesh.pattern.element_edges), _by_length(mesh)
     groups = [edges, *(edges[[k for k, pair in enumerate(PAIRS) if set(pair) <= set(face)]] for face in FACES)]
     longest = [np.take_along_axis(g, place[g].argmax(axis=0)[None], axis=0)[0] for g in groups]
@@ -135,7 +134,7 @@ def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
 
 
 def _bisected(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
-    """Elements (m, 4), cut in two at their longest halved edge until no edge is left to cut."""
+    """Elements (m, 4): each is cut in two at its longest halved edge, until no halved edge is left."""
     V, place = mesh.number_of_vertices, _by_length(mesh)
     low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
     code = low * V + high  # in ascending order

@@ -1,4 +1,4 @@
-"""Parts of a mesh: nodes chosen by place or by name, triangles of its surface."""
+"""Parts of a mesh: nodes selected by place or by name, and triangles of the surface."""
 
 import warnings
 from collections.abc import Mapping
@@ -21,12 +21,12 @@ def select(
 
     Args:
         mesh: `TetMesh`.
-        where: x_min, x_max, y_min, … [m], inclusive within 1e-9 of the mesh's size.
+        where: x_min, x_max, y_min, … [m]. Bounds are inclusive, with a tolerance of 1e-9 of the mesh's size.
         set: name of a node set.
-        name: of the condition, for messages.
+        name: name of the condition, for messages.
 
     Raises:
-        InputError: both or neither given, unknown key or set, no node found.
+        InputError: `where` and `set` both given or both missing, unknown key or set, no node found.
     """
     if (where is None) == (set is None):
         raise InputError(f'{name}: give either where = {{z_max = 0.0}} or set = "name"')
@@ -60,7 +60,7 @@ def select(
 
 
 def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> None:
-    """Warn if a bound excludes nothing, but would lie within the mesh if it were in millimetres."""
+    """Warn if a bound excludes nothing, although it would lie within the mesh if it were in millimetres."""
     low, high = x.min(), x.max()
     idle = bound > high if key.endswith("max") else bound < low
     if idle and abs(bound) > 1 and low < 1e-3 * bound < high:
@@ -72,7 +72,7 @@ def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> No
 
 
 def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:
-    """Outer triangles (m, 3), normals outwards; with `nodes` only those between these nodes."""
+    """Outer triangles (m, 3) with outward normals; with `nodes`, only triangles with all vertices in `nodes`."""
     tets = np.asarray(mesh.tetrahedra)
     faces = np.concatenate([tets[:, f] for f in FACES])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
@@ -81,12 +81,12 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
 
 
 def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> np.ndarray:
-    """Outer triangles (m, 3) of a place: those between its nodes, or only those of the triangle set `set`.
+    """Outer triangles (m, 3) of a place: triangles between its nodes; if `set` is a triangle set, only its triangles.
 
     Args:
         mesh: `TetMesh`.
-        nodes: of the place, as `select` gives them; None: the whole surface.
-        set: the name by which the place was chosen, if any.
+        nodes: nodes of the place, from `select`; None: the whole surface.
+        set: name of the set with which the place was selected, if any.
     """
     triangles, groups = boundary_triangles(mesh, nodes), mesh.triangle_sets or {}
     if set is None or set not in groups:
@@ -103,7 +103,7 @@ def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> 
 
 
 def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
-    """Refuse anything but a list of node numbers (n,) below `count`; host side.
+    """Refuse a value that is not a list (n,) of node numbers below `count`; host side.
 
     Raises:
         InputError: one sentence that begins with `name`.

@@ -1,15 +1,15 @@
-"""Shape functions of straight tetrahedra, and the points they are integrated at.
+"""Shape functions of straight tetrahedra, and their integration points.
 
 With barycentric coordinates L_k and their constant gradients D_k, the shape vectors of the linear element,
 
     grad N_a = sum_k c_ak D_k,    c_ak = dN_a/dL_k,    so    F = sum_a x_a (x) grad N_a = sum_k y_k (x) D_k
 
-with y_k = sum_a c_ak x_a: at each point an element of any order is a linear element with corners y_k. So the terms of
-MJED hold at every point, and no matrix is inverted there either.
+with y_k = sum_a c_ak x_a. So at each point an element of any order is like a linear element with corners y_k. The terms
+of MJED hold at every point, and no matrix is inverted.
 
-Functions of order 2: L_k (2 L_k - 1) of the vertices and 4 L_i L_j of the edges (10 nodes). Order 3 adds to these L_i
-L_j (L_i - L_j) of the edges and 27 L_i L_j L_k of the faces; their unknowns are not positions. Order 3 is for the
-estimate of the mesh's error (`liverjax.simulation.mesh_error`).
+Functions of order 2: L_k (2 L_k - 1) of the vertices and 4 L_i L_j of the edges (10 nodes). Order 3 has in addition L_i
+L_j (L_i - L_j) of the edges and 27 L_i L_j L_k of the faces. The unknowns of these functions are not positions. Order 3
+is used to estimate the mesh error (`liverjax.simulation.mesh_error`).
 """
 
 from functools import cache
@@ -19,22 +19,22 @@ import numpy as np
 
 from liverjax.mesh.adjacency import PAIRS
 
-#: Corners of an element's faces, each opposite the corner of the same number.
+#: Corners of an element's faces; face k is opposite to corner k.
 FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 
 class Basis(NamedTuple):
-    """Functions at the points of an element; NumPy arrays, the same for all elements."""
+    """Functions at the integration points of an element: NumPy arrays that are the same for all elements."""
 
-    weights: np.ndarray  # (Q,), they add up to 1
+    weights: np.ndarray  # (Q,) with the sum 1
     L: np.ndarray  # (4, Q) linear functions
     N: np.ndarray  # (n, Q) all functions
-    c: np.ndarray  # (n, 4, Q) their derivatives by the linear functions
+    c: np.ndarray  # (n, 4, Q) derivatives of N with respect to L
 
 
 @cache
 def basis(order: int) -> Basis:
-    """The functions of `order` 2 or 3: products of two gradients are integrated exactly."""
+    """The functions of `order` 2 or 3, at points of a rule that integrates products of two gradients exactly."""
     weights, L = _four_points() if order == 2 else _fourteen_points()
     return Basis(weights, L, *functions(order, L))
 
@@ -75,8 +75,7 @@ def _fourteen_points() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def triangle_rule(degree: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (Q,) and barycentric coordinates (3, Q) on a triangle, exact to degree 4 (Dunavant 1985) or 5 (Radon
-    1948)."""
+    """Weights (Q,) and barycentric coordinates (3, Q) on a triangle, of degree 4 (Dunavant 1985) or 5 (Radon 1948)."""
     pairs = [(0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)]
     if degree == 5:
         root = np.sqrt(15)

@@ -11,12 +11,12 @@ from liverjax.mesh.cylinders import graded, graded_cylinder
 from liverjax.mesh.prisms import stacked
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: The most tetrahedra of a shape; a run with so many linear ones takes about 20 GB.
+#: Maximum number of tetrahedra of a shape. A run with this number of linear tetrahedra needs about 20 GB.
 MOST_TETRAHEDRA = 20_000_000
 
 
 def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
-    """A box with one corner at the origin, each brick cut into six tetrahedra along one diagonal (Kuhn).
+    """A box with one corner at the origin. Each brick is cut into six tetrahedra along one diagonal (Kuhn).
 
     Args:
         size: edge lengths (x, y, z) [m].
@@ -54,14 +54,14 @@ def cylinder(
     rings: Sequence[float] = (),
     match_area: bool = False,
 ) -> TetMesh:
-    """A cylinder about the z axis standing on z = 0: rings of 6 k nodes, layers of prisms cut into three tetrahedra.
+    """A cylinder about the z axis that stands on z = 0. Ring k has 6 k nodes; prisms are cut into three tetrahedra.
 
     Args:
-        radius, height: [m].
-        cell_size: target edge length [m]; at least two rings and one layer are made.
+        radius, height: radius and height [m].
+        cell_size: target edge length [m]; there are at least two rings and one layer.
         rim_cell: edge length [m] at the rims of both faces and at `rings`; cells grow from there to `cell_size`.
-        rings: radii [m] at which there is a ring of nodes, for instance that of a punch.
-        match_area: give the polygons the areas of their circles.
+        rings: radii [m] at which there is a ring of nodes, for example the radius of a punch.
+        match_area: whether each polygon has the area of its circle.
 
     Without `match_area` the mantle is a polygon of 6 n corners on the circle, so the volume is below pi r^2 h by
     O(cell_size^2).
@@ -91,14 +91,14 @@ def cylinder(
 def _graded(
     radius: float, height: float, cells: tuple[float, float], rings: Sequence[float], match_area: bool
 ) -> TetMesh:
-    """A cylinder with cells of two lengths, `cells`: the first anywhere, the second at its rims and rings."""
+    """A cylinder with two cell lengths, `cells`: the second one at its rims and rings, the first one elsewhere."""
     cell_size, rim_cell = cells
     _positive("rim_cell", [rim_cell])
     for ring in rings:
         if not (np.isfinite(ring) and 0 < ring < radius):
             raise InputError(f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: mend them")
     largest = min(cell_size, radius / 2)
-    # A ring of radius r has at least 2 pi r / largest cells: no fewer prisms than with cells of this length.
+    # A ring of radius r has at least 2 pi r / largest cells, so there are at least as many prisms as with such cells.
     _not_too_many(18 * math.ceil(radius / largest) ** 2 * math.ceil(height / cell_size), "radius, height and cell_size")
     _not_too_many(18 * math.ceil(min(radius, height) / rim_cell) ** 2 // 100, "rim_cell")
     radii = graded(radius, dict.fromkeys([*map(float, rings), float(radius)], rim_cell), largest)
@@ -107,7 +107,7 @@ def _graded(
 
 
 def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit disc: one node in the middle, 6 k on ring k; counter-clockwise triangles between neighbouring rings."""
+    """Unit disc: one node at the centre, 6 k nodes on ring k; counter-clockwise triangles between the rings."""
     points = [np.zeros((1, 2))]
     start = [0, 1]
     for k in range(1, rings + 1):
@@ -127,7 +127,7 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _not_too_many(tetrahedra: int, names: str) -> None:
-    """Refuse a mesh that is too large for any memory, before it is made."""
+    """Refuse a mesh that is too large for the memory, before it is made."""
     if tetrahedra > MOST_TETRAHEDRA:
         raise InputError(
             f"shape {names} ask for about {tetrahedra:.2g} tetrahedra, more than {MOST_TETRAHEDRA:.0e}: are the "

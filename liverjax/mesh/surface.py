@@ -1,4 +1,4 @@
-"""Integrals over triangles of the surface: nodal shares of tractions, pressures and springs."""
+"""Integrals over triangles of the surface, which distribute tractions, pressures and springs to nodes."""
 
 from functools import partial
 
@@ -11,16 +11,16 @@ from liverjax.core.struct import Indices
 from liverjax.mesh.shape_functions import triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Edges of a triangle, in the order of its middles.
+#: Edges of a triangle, in the order of the middles of its edges.
 _EDGES = ((0, 1), (1, 2), (2, 0))
-#: The same edges in the direction of their functions of order 3, for vertices in rising order.
+#: The same edges, in the direction of their functions of order 3, if the vertices are in increasing order.
 _THIRD = ((0, 1), (1, 2), (0, 2))
 
 
 def triangle_nodes(mesh: TetMesh, triangles: Indices) -> list[Indices]:
     """Numbers (m,) of the nodes of triangles (m, 3): their vertices and, in quadratic meshes, middles of edges.
 
-    For triangles (m, 4) of a mesh of order 3 the functions of order 3 of their edges and of their face follow.
+    For triangles (m, 4) of a mesh of order 3, the functions of order 3 of the edges and of the face follow.
     """
     vertices = [triangles[:, a] for a in range(3)]
     if mesh.order == 1:
@@ -39,7 +39,7 @@ def _middle(mesh: TetMesh, a: Indices, b: Indices) -> jax.Array:
     return mesh.number_of_vertices + jnp.sum(edge, axis=0)
 
 
-@partial(jax.jit, inline=True)  # outside of programs one program, not one for each operation
+@partial(jax.jit, inline=True)  # outside of a program: one program for all operations
 def areas(points: jax.Array, triangles: Indices) -> jax.Array:
     """Areas times normals (m, 3) [m^2] of flat triangles."""
     corner = points[triangles]
@@ -47,11 +47,11 @@ def areas(points: jax.Array, triangles: Indices) -> jax.Array:
 
 
 def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float]]:
-    """Nodes (m,) of flat triangles that share a uniform load, and the share of each.
+    """Nodes (m,) of flat triangles that share a uniform load, and the share of each node.
 
-    In a linear element each vertex has a third. In a quadratic element the functions of the vertices have the integral
-    0, and the middle of each edge has a third. Triangles (m, 4) of a mesh of order 3 name their face in the last
-    column.
+    In a linear element each vertex has a third. In a quadratic element the integrals of the vertices' functions are 0,
+    and the middle of each edge has a third. Triangles (m, 4) of a mesh of order 3 have the number of their face in the
+    last column.
     """
     nodes = triangle_nodes(mesh, triangles)
     if mesh.order == 1:
@@ -68,7 +68,7 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
         nodes, own = triangles.T, jnp.broadcast_to(-1 / 6 * twice, (3, *twice.shape))
     else:
         nodes = jnp.stack(triangle_nodes(mesh, triangles))
-        # Exact for quadratic positions; so is the derivative in the reference shape.
+        # The rule is exact for quadratic positions; the derivative in the reference shape is exact, too.
         weights, l = triangle_rule(4 if mesh.order == 2 else 5)
         N, along = (_quadratic if mesh.order == 2 else _ten_functions)(l)
         signs = None if mesh.order == 2 else _signs_of_functions(triangles, x.dtype)
@@ -80,9 +80,10 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
 
 
 def _signs_of_functions(triangles: Indices, dtype: DTypeLike) -> jax.Array:
-    """Signs (10, m, 1) of the ten functions of triangles (m, 4), whose vertices are in the order of the normal.
+    """Signs (10, m, 1) of the ten functions of triangles (m, 4) with vertices in the order of the normal.
 
-    A function of order 3 on an edge points to the higher vertex: its sign is -1 if the triangle runs to the lower one.
+    A function of order 3 on an edge points to the vertex with the higher number. If the triangle goes along this edge
+    to the vertex with the lower number, the sign is -1.
     """
     signs = jnp.ones((10, len(triangles), 1), dtype)
     for k, (a, b) in enumerate(_THIRD):
@@ -91,7 +92,7 @@ def _signs_of_functions(triangles: Indices, dtype: DTypeLike) -> jax.Array:
 
 
 def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (Q,) of points on a triangle; slopes (2, Q, n) of its functions towards its second and third vertex."""
+    """Weights (Q,) of points on a triangle; slopes (2, Q, n) of its functions towards the second and third vertex."""
     if mesh.order == 1:
         return np.ones(1), np.array([[[-1.0, 1.0, 0.0]], [[-1.0, 0.0, 1.0]]])
     weights, l = triangle_rule()
@@ -102,14 +103,14 @@ def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 def triangle_functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
     """Functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q).
 
-    In a mesh of order 3 the functions on edges point to the higher vertex, so triangles must name their vertices in
-    order (`liverjax.mesh.promotion.with_faces`).
+    In a mesh of order 3 the functions on edges point to the vertex with the higher number. So the vertices of triangles
+    must be in increasing order (`liverjax.mesh.promotion.with_faces`).
     """
     return l if mesh.order == 1 else (_quadratic if mesh.order == 2 else _ten_functions)(l)[0]
 
 
 def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Six functions (6, Q) at barycentric coordinates l (3, Q), and their slopes towards the last vertices."""
+    """Six functions (6, Q) at barycentric coordinates l (3, Q); their slopes towards the second and third vertex."""
     N = [l[k] * (2 * l[k] - 1) for k in range(3)] + [4 * l[a] * l[b] for a, b in _EDGES]
     zero = np.zeros_like(l[0])
     by = [[4 * l[k] - 1 if m == k else zero for m in range(3)] for k in range(3)]
@@ -119,7 +120,7 @@ def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def _ten_functions(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The functions of `_quadratic`, then those of order 3 of the edges and of the face: (10, Q); and their slopes."""
+    """Ten functions (10, Q), those of `_quadratic` and those of order 3 on the edges and the face; their slopes."""
     N, slopes = _quadratic(l)
     zero = np.zeros_like(l[0])
     more, by = [], []

@@ -1,6 +1,6 @@
-"""Meshes of straight tetrahedra: positions, constant shape vectors, node sets.
+"""Meshes of straight tetrahedra: positions, constant shape vectors, and sets of nodes and elements.
 
-An element has 4 nodes, or 10: vertices and the middles of its edges (`liverjax.mesh.promotion`).
+An element has 4 nodes, or 10 nodes: its vertices and the middles of its edges (`liverjax.mesh.promotion`).
 """
 
 import dataclasses
@@ -25,10 +25,10 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 
 @struct
 class TetMesh:
-    """Straight tetrahedra with their reference geometry; a pytree whose arrays are leaves.
+    """Straight tetrahedra with their reference geometry: a pytree with arrays as leaves.
 
-    Made by `tet_mesh`; `shape_vectors` and `volumes` follow from points and tetrahedra, also under `jax.grad`. With
-    `order` 2 the nodes are the vertices and then the middles of the edges, in the order of `pattern.edges`.
+    `tet_mesh` makes it. `shape_vectors` and `volumes` are computed from points and tetrahedra, also under `jax.grad`.
+    With `order` 2 the nodes are the vertices, followed by the middles of the edges in the order of `pattern.edges`.
     """
 
     points: jax.Array = param("m", "reference positions (V, 3)")
@@ -47,12 +47,12 @@ class TetMesh:
 
     @property
     def number_of_nodes(self) -> int:
-        """Number of nodes V: vertices and middles of edges."""
+        """Number of nodes V: vertices, middles of edges, and functions of order 3."""
         return self.points.shape[0]
 
     @property
     def number_of_vertices(self) -> int:
-        """Number of corners of elements, which are the first nodes."""
+        """Number of vertices of elements. They are the first nodes."""
         return self.pattern.row_nodes.shape[1]
 
     @property
@@ -62,18 +62,18 @@ class TetMesh:
 
     @property
     def weights(self) -> jax.Array:
-        """Reference volume [m^3] of every point of integration: (E,) for linear elements, else (Q, E)."""
+        """Reference volume [m^3] of every integration point: (E,) for linear elements, else (Q, E)."""
         if self.order == 1:
             return self.volumes
         return jnp.asarray(basis(self.order).weights, self.volumes.dtype)[:, None] * self.volumes[None]
 
     @property
     def gradients(self) -> jax.Array:
-        """`shape_vectors` in a shape that broadcasts over the points: (3, 3, E), or (3, 3, 1, E)."""
+        """`shape_vectors` in a shape that broadcasts over the integration points: (3, 3, E), or (3, 3, 1, E)."""
         return self.shape_vectors if self.order == 1 else self.shape_vectors[:, :, None]
 
     def at_points(self, numbers: T) -> T:
-        """A pytree, such as a law, with its numbers by element (E,) or (E, 3) shaped to broadcast over the points."""
+        """A pytree, for example a law, with an axis for the points added to its arrays (E,) or (E, 3) over elements."""
         if self.order == 1:
             return numbers
         by_element = ((self.number_of_elements,), (self.number_of_elements, 3))
@@ -81,12 +81,12 @@ class TetMesh:
 
     @property
     def element_nodes(self) -> list[jax.Array]:
-        """Numbers (E,) of the nodes of every element: 4, or 10 with the middles of `liverjax.mesh.adjacency.PAIRS`."""
+        """Numbers (E,) of the nodes of every element: 4, or 10 with the middles of edges `PAIRS`; more in order 3."""
         return self._nodes(self.tetrahedra, self.pattern.element_edges, self.faces)
 
     @property
     def element_nodes_on_host(self) -> np.ndarray:
-        """`element_nodes` in NumPy, (n, E): JAX would compile a program for each of them."""
+        """`element_nodes` as a NumPy array (n, E). JAX would compile a program for each of them."""
         faces = None if self.faces is None else np.asarray(self.faces)
         return np.stack(self._nodes(np.asarray(self.tetrahedra), np.asarray(self.pattern.element_edges), faces))
 
@@ -104,8 +104,8 @@ class TetMesh:
     def edges(self, columns: Sequence[jax.Array]) -> list[tuple[jax.Array, ...]]:
         """y_k - y_0 of a nodal field with columns (V,): for k = 1, 2, 3 one array per column, (E,) or (Q, E).
 
-        y_k are the corners of `liverjax.mesh.shape_functions`; with shape vectors D_k the field's gradient is the sum
-        of (y_k - y_0) D_k.
+        y_k are the corners of `liverjax.mesh.shape_functions`. The gradient of the field is the sum of (y_k - y_0) D_k
+        with the shape vectors D_k.
         """
         if self.order == 1:
             corners = [taken(column, self.tetrahedra.T) for column in columns]
@@ -116,7 +116,7 @@ class TetMesh:
         return [tuple(y[k, :, i] for i in range(len(columns))) for k in range(3)]
 
     def spread(self, forces: Sequence[Sequence[jax.Array]]) -> list[jax.Array]:
-        """The transpose of `edges`: nodal columns (V,) from forces at corners 1, 2, 3, which corner 0 balances."""
+        """The transpose of `edges`: nodal columns (V,) from forces at corners 1, 2, 3; corner 0 has minus their sum."""
         count = len(forces[0])
         if self.order == 1:
             forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(count)], *forces]
@@ -134,12 +134,12 @@ class TetMesh:
         return columns
 
     def _slopes(self) -> jax.Array:
-        """c_ak - c_a0 as the matrix (3 Q, n) of `edges`: a product with it keeps the program small."""
+        """c_ak - c_a0 as a matrix (3 Q, n) for `edges`. A product with a matrix keeps the program small."""
         c = basis(self.order).c
         return jnp.asarray((c[:, 1:] - c[:, :1]).reshape(len(c), -1).T, self.volumes.dtype)
 
     def oriented(self, values: jax.Array) -> jax.Array:
-        """Values (n, C, E) with the signs of order-3 functions on edges, which point to the higher vertex."""
+        """Values (n, C, E) times the signs of the functions: those of order 3 on edges point to the higher vertex."""
         if self.order < 3:
             return values
         t, first = self.tetrahedra, 4 + len(PAIRS)
@@ -153,13 +153,13 @@ def tet_mesh(
     node_sets: Mapping[str, object] | None = None,
     element_sets: Mapping[str, object] | None = None,
 ) -> TetMesh:
-    """A mesh from positions (V, 3) [m] and node numbers (E, 4), without any check (see `check_mesh`).
+    """A mesh from positions (V, 3) [m] and node numbers (E, 4). Nothing is checked (see `check_mesh`).
 
-    The positions may be traced, the node numbers may not.
+    The positions may be traced, but not the node numbers.
     """
     if isinstance(tetrahedra, jax.core.Tracer):
         raise InputError("tet_mesh: the node numbers are traced: make the mesh outside jit, grad and vmap")
-    # Copies: asarray may alias the caller's NumPy arrays, and the mesh would change with them. NumPy compiles nothing.
+    # Copies are made: `asarray` may share memory with the caller's arrays. NumPy makes them, since it compiles nothing.
     points = jnp.array(points, float) if isinstance(points, jax.core.Tracer) else _float_copy(points)
     neighbours = pattern(tetrahedra, points)
     tetrahedra = node_numbers(tetrahedra)
@@ -181,9 +181,9 @@ def _float_copy(points: Numbers) -> jax.Array:
 
 
 def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:
-    """The mesh with other reference positions (V, 3) [m], which may be traced; its patches do not change.
+    """The mesh with other reference positions (V, 3) [m], which may be traced. Its patches do not change.
 
-    Edges stay straight: in a quadratic mesh the positions of their middles follow from the vertices.
+    Edges stay straight: in a quadratic mesh the middles of edges are computed from the vertices.
     """
     points = jnp.array(points, mesh.points.dtype)
     if points.shape != mesh.points.shape:
@@ -197,7 +197,7 @@ def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:
 
 @jax.jit
 def _geometry(points: jax.Array, tetrahedra: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Shape vectors, the rows of the inverse edge matrix as cross products over six times the volume, and volumes."""
+    """Shape vectors and volumes. A shape vector is a cross product of edges divided by six times the volume."""
     corner = points[tetrahedra]
     e = corner[:, 1:] - corner[:, :1]
     normals = jnp.stack([jnp.cross(e[:, 1], e[:, 2]), jnp.cross(e[:, 2], e[:, 0]), jnp.cross(e[:, 0], e[:, 1])])
@@ -210,7 +210,7 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
 
     Raises:
         InputError: no elements, node numbers out of range, positions that are not finite, flat or inverted elements,
-            elements that occur twice or overlap at a face, nodes that belong to no element.
+            elements that occur twice or overlap at a face, vertices that belong to no element.
     """
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     if tets.size == 0:
@@ -246,7 +246,7 @@ FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 
 
 def _refuse_overlaps(tets: np.ndarray, name: str) -> None:
-    """Raise `InputError` if two elements are on the same side of a face: then they overlap."""
+    """Raise `InputError` if two elements are on the same side of a face, because they overlap then."""
     faces = tets[:, FACES].reshape(-1, 3)
     first = faces.argmin(axis=1)[:, None]
     turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1).astype(np.int64)

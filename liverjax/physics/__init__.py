@@ -1,1 +1,1 @@
-"""The physics, one file each: viscosity, porosity, averaged volumes, supports, loads and prescribed motion."""
+"""The physics of a scene, mostly one file each: elasticity, viscosity, porosity, contact, supports, loads, motions."""

@@ -1,15 +1,17 @@
-"""The base of every physics: one frozen struct of numbers, and a second struct that acts during a step.
+"""The base class of all physics: one frozen struct of numbers, and a second struct that acts during a step.
 
-A scene has a tuple of physics. Each has a memory between steps, and parts that act during a step:
+A scene has a tuple of physics. Each physics has a memory between steps, and a part that acts during a step:
 
 * `begin(start)` -> memory: its memory at the beginning of a run, any pytree;
 * `freeze(memory, step)` -> the acting part, with everything that is constant during the step;
-* `advance(memory, acting, end)` -> memory: after an accepted step;
+* `advance(memory, acting, end)` -> memory: its memory after an accepted step;
 * `check(...)`: refuses numbers that no step can use, with one sentence.
 
-Loads and motions change during a step: they are evaluated at part s of it, 0 at its beginning and 1 at its end.
+Loads and motions change during a step: they are evaluated at a fraction s of the step (0 at its beginning, 1 at its
+end).
 
-The acting parts are of three kinds. Step, tangent and energy are sums over them and know nothing else.
+There are three kinds of acting parts. The step, its tangent and its energy are sums over these parts and need nothing
+else.
 
 * `Solid` and `VolumeStress` act in elements, before assembly: stress and blocks of the stiffness.
 * `NodalForce` acts at nodes, after assembly: forces and blocks of the diagonal.
@@ -34,32 +36,38 @@ from liverjax.solvers.attached import definite as without_negative
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.tensors.matrices import Matrix, Vector
 
-#: Blocks of the stiffness to compute, as pairs of indices into a list of shape vectors.
+#: Which blocks of the stiffness to compute: pairs of indices into a list of shape vectors.
 Pairs = tuple[tuple[int, int], ...]
 
 
 class Tied(Protocol):
-    """Nodes that move together in a step. A few numbers give their motion; these are stored in a field of the nodes."""
+    """Nodes that move together in a step. A few unknowns give their motion; they are stored in a field of the nodes."""
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
         """The part of a field (V, 3) along the free motions. For forces it depends on the positions x (V, 3)."""
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Write the numbers of the motion to positions x (V, 3) into a field (V, 3). `placed` inverts this."""
+        """Write the unknowns of the motion to positions x (V, 3) into a field (V, 3).
+
+        `placed` is the inverse of this.
+        """
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Positions (V, 3) from a field, at part s of the step."""
+        """Positions (V, 3) from a field, at fraction s of the step."""
 
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
-        """Where motion is not given: the mask (V, 3) with 0 at nodes whose motion is, and (V, 3) the only direction
-        that such nodes have free, 0 elsewhere; None: there is none."""
+        """Where motion is not given: the mask (V, 3), with 0 at nodes with a given motion, and directions (V, 3).
+
+        A direction is the only free direction of a node with a given motion, and 0 at other nodes. None: there is no
+        such node.
+        """
 
 
 class Free(NamedTuple):
-    """Where the body can move: a projection of nodal vectors onto the free directions."""
+    """The directions in which the body can move, as a projection of nodal vectors."""
 
-    mask: jax.Array  # (V, 3) 0 along the axes that are held or prescribed
-    normals: jax.Array | None = None  # (V, 3) unit normals that nodes may not move along, 0 elsewhere
+    mask: jax.Array  # (V, 3) 0 along held or prescribed axes, else 1
+    normals: jax.Array | None = None  # (V, 3) unit normals; nodes may not move along them; 0 elsewhere
     tied: tuple[Tied, ...] = ()  # nodes that move together
 
     def vectors(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
@@ -72,7 +80,7 @@ class Free(NamedTuple):
         return field
 
     def columns(self, columns: Sequence[jax.Array]) -> list[jax.Array]:
-        """The free part of a field given by its columns x, y, z (V,)."""
+        """The free part of a field that is given as its columns x, y, z (V,)."""
         if self.tied:
             return list(self.vectors(jnp.stack(columns, axis=-1)).T)
         masked = [m * c for m, c in zip(self.mask.T, columns, strict=True)]
@@ -90,16 +98,16 @@ class Start(NamedTuple):
     x: jax.Array  # (V, 3) [m]
     free: Free
     force: Callable[[], jax.Array]  # (V, 3) [N] forces of the nodes at x, without inertia
-    moved: bool = False  # whether the body was brought to x at this moment; if not, x is at rest or only a guess
+    moved: bool = False  # whether the body was just moved to x; if not, it rests at x or x is only a guess
 
 
 class Step(NamedTuple):
-    """The state at the beginning of a step; constant during it."""
+    """The state at the beginning of a step. It is constant during the step."""
 
     mesh: TetMesh
-    x: jax.Array  # (V, 3) [m] at its beginning
-    k: Number  # its number, from 1
-    steps: int  # of the run
+    x: jax.Array  # (V, 3) [m] positions at the beginning of the step
+    k: Number  # number of the step, from 1
+    steps: int  # number of steps of the run
     dt: Any  # [s] or None: load steps without time
     inertia: bool  # whether there is inertia: then loads act at once
     tolerance: Any  # of the residual, without derivative
@@ -110,19 +118,19 @@ class End(NamedTuple):
     """The state at the end of an accepted step."""
 
     x: jax.Array  # (V, 3) [m]
-    F: Matrix  # deformation gradients (E,), or (Q, E) where elements have Q points
+    F: Matrix  # deformation gradients (E,), or (Q, E) if elements have Q points
     pressure: Any  # (V,) [Pa] of the nodes, or None
 
 
 class Solid:
-    """A part that acts in elements and depends on the deformation gradient only."""
+    """An acting part whose stress in an element depends only on the deformation gradient."""
 
     def stress(self, F: Matrix) -> Matrix:
         """First Piola-Kirchhoff stress [Pa]."""
         raise TypeError(f"{type(self).__name__} lacks stress(F)")
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
-        """d2W/dx_i dx_j per reference volume for shape vectors D [1/m]."""
+        """Blocks d2W/dx_i dx_j per reference volume, for shape vectors D [1/m] and pairs (i, j)."""
         raise TypeError(f"{type(self).__name__} lacks blocks(F, D, pairs)")
 
     def energy(self, F: Matrix) -> jax.Array:
@@ -130,20 +138,20 @@ class Solid:
         raise TypeError(f"{type(self).__name__} lacks energy(F)")
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix | None]:
-        """Weighted laws, and a constant second Piola-Kirchhoff stress [Pa], that add up to the stress."""
+        """Pairs (weight, law), and a constant second Piola-Kirchhoff stress [Pa]. Their sum is the stress."""
         raise TypeError(f"{type(self).__name__} lacks parts()")
 
 
 class VolumeStress:
-    """A part that acts on the volume of elements, with pressures at the nodes."""
+    """An acting part that depends on the volume of elements, with pressures at the nodes."""
 
-    #: Whether pressures depend on the end of the step: then they are unknowns of the mixed system.
+    #: Whether pressures depend on the positions at the end of the step: then they are in the mixed system.
     coupled: ClassVar[bool] = True
-    #: Whether pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`), not eliminated.
+    #: Whether pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`) and not eliminated.
     unknown: ClassVar[bool] = False
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: Guess | None = None) -> jax.Array:
-        """Pressures (V,) [Pa] of a step that ends with volume ratios J (E,); `guess` to begin a solve with."""
+        """Pressures (V,) [Pa] of a step that ends with volume ratios J (E,). A solve for them begins with `guess`."""
         raise TypeError(f"{type(self).__name__} lacks pressure(mesh, J)")
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
@@ -155,11 +163,11 @@ class VolumeStress:
         raise TypeError(f"{type(self).__name__} lacks scalars(mesh, pressure, F)")
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Energy [J] at volume ratios J (E,), with the pressures in balance."""
+        """Energy [J] at volume ratios J (E,), with the pressures that belong to them."""
         raise TypeError(f"{type(self).__name__} lacks energy(mesh, J)")
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """Matrix of the pressures [m^3/Pa]; `positive`: with no negative eigenvalue."""
+        """Matrix of the pressures [m^3/Pa]. If `positive`, it has no negative eigenvalue."""
         raise TypeError(f"{type(self).__name__} lacks matrix(mesh, J, positive)")
 
     #: The equation of pressures that flow (`liverjax.physics.darcy.Flow`); None: there is no flow between nodes.
@@ -167,17 +175,17 @@ class VolumeStress:
 
 
 class NodalForce:
-    """A part that acts at nodes."""
+    """An acting part with forces at nodes."""
 
-    #: Whether it acts on every node: then slow motions do not slow down the linear solver.
+    #: Whether it has a stiffness at every node: then slowly varying motions do not slow down the linear solver.
     everywhere: ClassVar[bool] = False
-    #: Whether the force has an energy; one that follows the body has none, and its stiffness is not symmetric.
+    #: Whether the force has an energy. A force that follows the body has none, and its stiffness is not symmetric.
     conservative: bool = True
-    #: Whether the force has kinks, as at the beginning of contact.
+    #: Whether the derivative of the force jumps, for example where contact begins.
     kinked: ClassVar[bool] = False
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Gradient of the energy (V, 3) [N] at positions x (V, 3) [m], at part s of the step."""
+        """Gradient of the energy (V, 3) [N] at positions x (V, 3) [m], at fraction s of the step."""
         raise TypeError(f"{type(self).__name__} lacks force(mesh, x, s)")
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
@@ -185,18 +193,19 @@ class NodalForce:
         raise TypeError(f"{type(self).__name__} lacks energy(mesh, x)")
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """An energy [J] at x whose gradient at `start` (V, 3) is the force there, for a search that begins there.
+        """An energy [J] at x for a search that begins at `start` (V, 3). Its gradient at `start` is the force there.
 
-        It is the energy itself if the force has one. Otherwise the part without an energy keeps its value at `start`.
+        If the force has an energy, this is that energy. Otherwise the part of the force that has no energy keeps its
+        value at `start`.
         """
         return self.energy(mesh, x)
 
     def stiffness(self) -> Block | None:
-        """Diagonal blocks 3 x 3 of (V,) [N/m], with None for entries that are 0; None: the force is constant."""
+        """Diagonal blocks: 3 x 3 entries (V,) [N/m], None for an entry that is 0. None: there are no such blocks."""
         return None
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
-        """Stiffness at x of further elements between nodes, added to `stiffness`; None: there are none."""
+        """Stiffness at x of elements between nodes, in addition to `stiffness`; None: there are no such elements."""
         return None
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
@@ -205,32 +214,34 @@ class NodalForce:
         return without_negative(own) if isinstance(own, Attached) else own
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
-        """The loss of stiffness by an unknown that follows the motion, such as an obstacle's travel (`definite`: that
-        of the form without negative eigenvalues); None: there is no such unknown.
+        """The loss of stiffness that an eliminated unknown causes, for example the travel of an obstacle.
+
+        With `definite` it is the loss for `definite` above, without negative eigenvalues. None: there is no such
+        unknown.
         """
         return None
 
     def predicted(self) -> jax.Array | None:
-        """Positions (V, 3) [m] that the body would reach without forces, Newton's first guess; None: it stays."""
+        """Positions (V, 3) [m] that the body would reach without forces, as a guess for Newton; None: no such guess."""
         return None
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
-        """Change (V, 3) [N] of a force that is not conservative, with a motion dx (V, 3) [m]."""
+        """Change (V, 3) [N] of a force that is not conservative, for a motion dx (V, 3) [m]."""
         return jax.jvp(lambda x: self.force(mesh, x, s), (x,), (dx,))[1]
 
 
 class Physics:
-    """One physics of a scene: a struct of numbers; see the module."""
+    """One physics of a scene: a struct of numbers. The module explains its methods."""
 
     #: Every physics is a struct, so `dataclasses.replace` takes it.
     __dataclass_fields__: ClassVar[Content]
-    #: Table of the scene file that it is read from, and the keys of that table.
+    #: Name of its table in scene files; `keys` are the keys of this table.
     section: ClassVar[str] = ""
-    #: Whether it makes nodes move together: the factorisation cannot treat them.
+    #: Whether it makes nodes move together. The factorisation cannot treat such nodes.
     ties: ClassVar[bool] = False
-    #: Whether it needs the time step, `step.dt`: a scene without one is then refused.
+    #: Whether it needs the time step `step.dt`. Then a scene without a time step is refused.
     in_time: ClassVar[bool] = False
-    #: Whether its forces have an energy; those of friction have none.
+    #: Whether its forces have an energy. Friction forces have none.
     conservative: ClassVar[bool] = True
     keys: ClassVar[tuple[str, ...]] = ()
 
@@ -251,14 +262,14 @@ class Physics:
         """
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Refuse a mesh that it cannot begin with; host side. A loaded mesh is not checked: no run begins there.
+        """Refuse a mesh with which it cannot begin; host side. A loaded mesh is not checked: no run begins with it.
 
         Raises:
             InputError: one sentence that begins with `name`.
         """
 
     def in_body(self, mesh: TetMesh, law: Any) -> "Physics":
-        """The same physics with the numbers that follow from this law."""
+        """The same physics, with the numbers that follow from the law of the body."""
         return self
 
     def at_beginning(self) -> "Physics":
@@ -266,12 +277,12 @@ class Physics:
         return self
 
     def begin(self, start: Start) -> Any:
-        """Memory at the beginning of a run; None: it remembers nothing."""
+        """Memory at the beginning of a run; None: this physics has no memory."""
         return None
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """Whether `freeze` takes None for the memory of a body at rest, at the beginning of a run."""
+        """Whether `freeze` accepts None as the memory of a body at rest at the beginning of a run."""
         return cls.begin is Physics.begin
 
     def freeze(self, memory: Any, step: Step) -> Any:
@@ -283,30 +294,33 @@ class Physics:
         return memory
 
     def constrain(self, free: Free) -> Free:
-        """The free directions, without those that this physics takes away."""
+        """The free directions without the directions that this physics holds."""
         return free
 
     def tied(self, step: Step) -> Tied | None:
-        """Nodes that this physics makes move together during a step."""
+        """Nodes that move together during a step because of this physics; None: there are none."""
         return None
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Node numbers (n,) and directions (n, 3) along which the body is held against rigid motion."""
+        """Node numbers (n,) and directions (n, 3) along which this physics holds the body against rigid motions."""
         return np.zeros(0, int), np.zeros((0, 3))
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Physics":
-        """The same physics on a mesh of richer elements: `more` adds the nodes between given node numbers (n,)."""
+        """The same physics on a mesh of richer elements.
+
+        `more` adds the new nodes between nodes (n,) to their numbers.
+        """
         return self
 
     def bulk_modulus(self) -> Any:
-        """Bulk modulus [Pa] that acts in place of the law's; None: the law's acts."""
+        """Bulk modulus [Pa] that replaces the bulk modulus of the law; None: it is not replaced."""
         return None
 
     def output(self, memory: Any) -> dict[str, jax.Array]:
-        """Further fields of the vertices (V,) for the result, besides positions and reactions."""
+        """Fields of the vertices (V,) for the result, in addition to positions and reactions."""
         return {}
 
 
 def diagonal(value: jax.Array) -> Block:
-    """Blocks of a value (V,) along every axis."""
+    """Diagonal 3 x 3 blocks with the same value (V,) for every axis."""
     return ((value, None, None), (None, value, None), (None, None, value))

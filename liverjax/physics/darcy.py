@@ -1,8 +1,8 @@
-"""Darcy's law (chapter, section 4.3): the fluid's pressure at the nodes, stored and conducted.
+"""Darcy's law (book chapter, section 4.3): storage and flow of the fluid, with its pressure at the nodes.
 
     (1/K_lim) dP/dt = kappa lap P - (dJ/dt)/J
 
-Volumes are those at the beginning of a step, so that the equation is linear in P: A P = b.
+The equation uses the volumes at the beginning of a step, so that it is linear in P: A P = b.
 """
 
 from typing import Any, NamedTuple
@@ -20,19 +20,19 @@ from liverjax.solvers.krylov import Known, chebyshev, differentiable_solve
 from liverjax.solvers.preconditioner import Coarse
 from liverjax.tensors.matrices import Matrix, dot
 
-#: Flat and inverted elements store and conduct fluid as elements of this J.
+#: Elements with a smaller J (flat or inverted) store and conduct fluid as if they had this J.
 LEAST_J = 1e-3
 
 
 class Flow(NamedTuple):
-    """dt times storage rate plus Darcy's Laplacian, at the positions of a step's beginning: made once per step."""
+    """The pressure equation of a step at its initial positions: storage plus dt times Darcy's Laplacian."""
 
     matrix: block_matrix.BlockMatrix  # symmetric positive definite, 1 x 1 blocks
     store: jax.Array  # (V,) [m^3/Pa]
     mask: jax.Array  # (V,) 0 where P is given
     slow: Coarse  # coarse space of the matrix
-    low: jax.Array  # about the least eigenvalue of D^-1 A beyond the coarse space
-    high: jax.Array  # no eigenvalue of D^-1 A is above it
+    low: jax.Array  # estimated minimum eigenvalue of D^-1 A outside the coarse space
+    high: jax.Array  # upper bound of the eigenvalues of D^-1 A
     tolerance: jax.Array  # of a solve, relative to its right-hand side
     given: jax.Array | None = None  # (V,) [Pa] pressures where they are given, 0 elsewhere; None: they are 0
     enters: jax.Array | None = None  # (V,) [m^3] fluid that enters during the step; None: none enters
@@ -42,7 +42,7 @@ def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Arr
     """1 at vertices (V,) whose pressure is unknown, 0 where it is drained or given."""
     mask = jnp.ones(mesh.number_of_vertices, dtype)
     if porosity.drained is not None:
-        # Pressures belong to vertices: the middles of edges among the nodes are left out.
+        # Only vertices have pressures: middles of edges among these nodes are ignored.
         mask = mask.at[porosity.drained].set(0.0, mode="drop")
     for inlet in porosity.inlet:
         if inlet.nodes is not None:
@@ -71,13 +71,13 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tole
 
 
 def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: jax.Array) -> jax.Array:
-    """About the least eigenvalue of D^-1 A beyond the coarse space, at rates dt kappa, one or one per element."""
+    """Estimated minimum eigenvalue of D^-1 A outside the coarse space; `rate` is dt kappa, one or one per element."""
     stored, total = jnp.sum(store), jnp.sum(diagonal)
     if jnp.ndim(rate):
-        # It is least where the fluid flows fastest: treat the whole body as if it flowed so everywhere.
+        # It is smallest where the fluid flows fastest: treat the whole body as if it flowed everywhere as fast.
         fastest, mean = jnp.max(rate), jnp.sum(jnp.ravel(rate) * mesh.volumes) / jnp.sum(mesh.volumes)
         total, rate = stored + (total - stored) * fastest / jnp.where(mean > 0, mean, 1.0), fastest
-    # Storage, and Darcy flow at the wave number 5 / width: the coarse space treats slower waves (measured: 4.9 to 5.4).
+    # Storage, and flow at the wave number 5 / width: the coarse space treats longer waves (measured: 4.9 to 5.4).
     waves = rate * (5 / mesh.pattern.patch_width) ** 2 * jnp.sum(mesh.volumes)
     return (stored + waves) / total
 
@@ -90,33 +90,36 @@ def right_side(flow: Flow, b: jax.Array) -> jax.Array:
 
 
 def lack(flow: Flow, b: jax.Array, pressure: jax.Array) -> jax.Array:
-    """Residual b - A P (V,) for pressures P (V,) [Pa]; where a pressure is given, its error. A solution has 0."""
+    """Residual b - A P (V,) for pressures P (V,) [Pa]. At nodes with a given pressure it is the error of P.
+
+    It is 0 at a solution.
+    """
     own = flow.mask * pressure
     error = own - pressure if flow.given is None else own - pressure + flow.given
     return right_side(flow, b) - flow.mask * flow_product(flow, own) + error
 
 
 class Guess(NamedTuple):
-    """Pressures to begin a solve with, and the accuracy that it needs."""
+    """Pressures at which a solve begins, and the accuracy that it needs."""
 
     pressure: jax.Array  # (V,) [Pa], without derivative
-    looser: Number  # tolerance over that of the flow
+    looser: Number  # tolerance of the solve, over `Flow.tolerance`
 
 
 def with_given(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) -> jax.Array:
-    """All pressures (V,) [Pa], with the given ones."""
+    """All pressures (V,) [Pa]: the computed and the given ones."""
     P = solved(mesh, flow, right_side(flow, b), guess)
     return P if flow.given is None else P + flow.given
 
 
 def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) -> jax.Array:
-    """A^-1 b for b (V,), A the matrix of the pressure, to the tolerance of the flow; has derivatives.
+    """A^-1 b for b (V,), with A the matrix of the pressures, to the tolerance of the flow. It has derivatives.
 
-    A `guess` saves iterations; derivatives are as exact as without it.
+    A `guess` saves iterations; the derivatives are as accurate as without a guess.
     """
 
     def apply(p):
-        # A unit row where drained: adjoint loads need not vanish there.
+        # Rows of given pressures are unit rows: adjoint loads may be different from 0 there.
         return flow.mask * flow_product(flow, flow.mask * p) + (1 - flow.mask) * p
 
     diagonal = flow.mask * flow.matrix.diagonal[0][0] + (1 - flow.mask)
@@ -144,21 +147,21 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) 
 
 
 def flow_product(flow: Flow, p: jax.Array) -> jax.Array:
-    """The product A p, made of differences between neighbours. So a uniform p gives no flow at all, for every dt and
-    precision."""
+    """The product A p, from differences between neighbours: a uniform p gives exactly no flow, in any precision."""
     rows, nodes = flow.matrix.rows[0][0], flow.matrix.nodes
-    # One kernel for all neighbours: a third of the time of a loop over them, on small and on large meshes.
+    # One kernel for all neighbours takes a third of the time of a loop over them, on small and on large meshes.
     return flow.store * p + jnp.sum(rows * (p[nodes] - p[None]), axis=0)
 
 
-#: Error of the polynomial that replaces the inverse of the pressure's matrix in Newton's direction.
+#: Error of the polynomial that replaces the inverse of the matrix of the pressures in Newton's direction.
 _POLYNOMIAL_ERROR = 0.1
 
 
 def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
-    """Approximate A^-1 b for b (V,), with A the matrix of the pressure: linear, symmetric, positive definite.
+    """Approximate A^-1 b for b (V,), with A the matrix of the pressures.
 
-    The coarse space solves the slow waves exactly; a polynomial treats the others.
+    The approximation is linear in b, symmetric and positive definite. The coarse space solves exactly for long waves; a
+    polynomial treats the other waves.
     """
     d = flow.matrix.diagonal[0][0]
     degree = jnp.ceil(0.5 * jnp.sqrt(flow.high / flow.low) * jnp.log(2 / _POLYNOMIAL_ERROR)).astype(jnp.int32)

@@ -1,9 +1,9 @@
 """An elastic support: springs between the body and a wall that does not move, on nodes or on a part of the surface.
 
-Springs on a surface have a stiffness per area, one along the normal of the reference surface and one along the surface
-(a Winkler foundation). They begin without tension. A history of factors changes their stiffness in time. A history of
-displacements moves the wall, and the springs with it. In linear elements each node of a triangle gets a third of its
-stiffness. In other elements the springs are integrated over the triangle.
+Springs on a surface (a Winkler foundation) have two stiffnesses per area: one along the normal of the reference
+surface, and one along the surface. They begin without tension. A history of factors changes their stiffness with time.
+A history of displacements moves the wall, and the springs with it. In linear elements each node of a triangle gets a
+third of the triangle's stiffness. In other elements the springs are integrated over the triangle.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from liverjax.physics.base import NodalForce, Physics, Step
 from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block
 
-#: Degree of the rule on triangles, by the order of the mesh.
+#: Order of the mesh -> degree of the integration rule on triangles.
 _DEGREE = {2: 4, 3: 5}
 
 
@@ -47,7 +47,7 @@ class ElasticSupport(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "ElasticSupport":
-        """Read [[support]]: a place, and stiffnesses."""
+        """Read [[support]]: a place and the stiffnesses."""
         nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
         given: Content = {k: table[k] for k in ("normal", "tangential", "stiffness") if k in table}
         if ("stiffness" in given) == bool({"normal", "tangential"} & set(given)):
@@ -84,7 +84,10 @@ class ElasticSupport(Physics):
             bounds.check_bound(f"{name} history", {"lower": 0.0}, self.history)
 
     def freeze(self, memory: None, step: Step) -> "Springs | Foundation":
-        """The springs: one symmetric block per node, or one per point of a triangle if the mesh is not linear."""
+        """The springs during a step: one symmetric block per node.
+
+        On surfaces of meshes that are not linear there is one block per integration point.
+        """
         kind: Any = Foundation if self.triangles is not None and step.mesh.order > 1 else Springs
         own = point_blocks(self, step.mesh) if kind is Foundation else blocks(self, step.mesh)
         given = {"triangles": self.triangles} if kind is Foundation else {}
@@ -102,7 +105,7 @@ class ElasticSupport(Physics):
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held along the axes in which their block has a stiffness."""
+        """Nodes are held along the principal axes in which their block has a stiffness."""
         K = np.moveaxis(np.array([[np.asarray(e) for e in row] for row in blocks(self, mesh)]), -1, 0)
         size, axes = np.linalg.eigh(K)
         node, axis = np.nonzero(size > 1e-9 * max(size.max(), 1e-300))
@@ -110,7 +113,7 @@ class ElasticSupport(Physics):
 
 
 def _refuse_idle(support: ElasticSupport, keys: tuple[str, ...], name: str, instead: str) -> None:
-    """Refuse stiffnesses of the other kind of springs, which would change nothing."""
+    """Refuse stiffnesses of the other kind of springs: they would have no effect."""
     for key in keys:
         if np.any(np.asarray(getattr(support, key)) != 0):
             raise InputError(f"{name}.{key} = {getattr(support, key)} changes nothing: {instead}")
@@ -134,13 +137,13 @@ def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
 
 
 def point_blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
-    """Stiffness of the points of triangles: 3 x 3 blocks of arrays (Q, m) [N/m]."""
+    """Stiffness at the integration points of triangles: 3 x 3 blocks of arrays (Q, m) [N/m]."""
     weights = triangle_rule(_DEGREE[mesh.order])[0]
     return _each(support, mesh, lambda whole: jnp.asarray(weights, whole.dtype)[:, None] * whole[None])
 
 
 def _each(support: ElasticSupport, mesh: TetMesh, shared: Callable[[jax.Array], jax.Array]) -> Block:
-    """3 x 3 blocks, to which `shared` distributes the stiffness (m,) [N/m] of triangles."""
+    """3 x 3 blocks of stiffness. `shared` distributes the stiffness (m,) [N/m] of triangles to nodes or points."""
     normal = surface.areas(mesh.points, support.triangles)
     area = jnp.sqrt(jnp.sum(normal * normal, axis=1))
     n = normal / area[:, None]
@@ -184,7 +187,7 @@ class Springs(NodalForce):
 
 @struct
 class Foundation(NodalForce):
-    """Springs during a step at the points of triangles, integrated over triangles."""
+    """Springs on a surface during a step, integrated over its triangles."""
 
     triangles: Indices = param("1", "(m, 3), or (m, 4) of order 3 as in `liverjax.mesh.promotion.with_faces`")
     blocks: Block = param("N/m", "3 x 3 of (Q, m)")
@@ -193,7 +196,7 @@ class Foundation(NodalForce):
     )
 
     def _at_points(self, mesh: TetMesh, x: jax.Array, s: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Nodes (n, m), their functions (n, Q), and stretch of the springs (3, Q, m) [m]."""
+        """Nodes (n, m), their shape functions (n, Q), and the stretch of the springs (3, Q, m) [m]."""
         nodes = jnp.stack(surface.triangle_nodes(mesh, self.triangles))
         N = jnp.asarray(surface.triangle_functions(mesh, triangle_rule(_DEGREE[mesh.order])[1]), x.dtype)
         u = jnp.einsum("aq,ami->iqm", N, (x - mesh.points)[nodes])
@@ -202,7 +205,7 @@ class Foundation(NodalForce):
         return nodes, N, u
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Forces of the points, shared out by the functions."""
+        """Forces at the integration points, distributed to the nodes by the shape functions."""
         nodes, N, u = self._at_points(mesh, x, s)
         own = jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks])
         return jnp.zeros_like(x).at[nodes].add(jnp.einsum("aq,iqm->ami", N, own))

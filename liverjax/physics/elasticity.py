@@ -29,11 +29,11 @@ class Elastic(Solid):
     law: Law = param("1", "the law")
 
     def stress(self, F: Matrix) -> Matrix:
-        """First Piola-Kirchhoff stress by the hand-derived terms."""
+        """First Piola-Kirchhoff stress, from hand-derived terms."""
         return invariant_terms.first_piola(self.law, F)
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
-        """Blocks of the stiffness by the hand-derived terms."""
+        """Blocks of the stiffness, from hand-derived terms."""
         return invariant_terms.blocks(invariant_terms.state(self.law, F), D, pairs)
 
     def energy(self, F: Matrix) -> jax.Array:

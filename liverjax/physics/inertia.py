@@ -1,4 +1,4 @@
-"""Inertia of lumped or consistent masses, by implicit Euler or by Newmark's average acceleration."""
+"""Inertia of lumped or consistent masses, with implicit Euler or Newmark's average acceleration."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -21,22 +21,25 @@ _EXACT = 1e-12
 
 
 class Motion(NamedTuple):
-    """Velocity and acceleration, handed from step to step."""
+    """Velocity and acceleration at the end of a step: the memory of inertia."""
 
     velocity: jax.Array  # (V, 3) [m/s]
-    acceleration: jax.Array | None  # (V, 3) [m/s^2], of Newmark's method
+    acceleration: jax.Array | None  # (V, 3) [m/s^2]; only for Newmark's method
 
 
 @struct
 class Inertia(Physics):
-    """Mass of the body, at its nodes or as the integrals of the products of its functions."""
+    """Mass of the body: lumped at its nodes, or consistent (integrals of products of the shape functions)."""
 
     density: Any = param("kg/m^3", "per reference volume, one number or one per node (V,)", above=0.0)
     integrator: str = static(default="euler", about="euler (first order) or newmark (second order)")
     mass: str = static(default="lumped", about="lumped: at the nodes; or consistent")
 
     def begin(self, start: Start) -> Motion:
-        """Begin at rest, with the acceleration m a = f: Newmark's method keeps its order from the first step."""
+        """Begin at rest.
+
+        For Newmark's method the acceleration solves m a = f, so that the first step has full order.
+        """
         acceleration = None
         if self.integrator == "newmark":
             acceleration = _accelerations(*self._masses(start.mesh), start.free, start.free.vectors(-start.force()))
@@ -44,7 +47,7 @@ class Inertia(Physics):
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """At rest its force is 0, but it has a stiffness."""
+        """True: at rest its force is 0, but it has a stiffness."""
         return True
 
     def freeze(self, memory: Motion | None, step: Step) -> "Moving":
@@ -60,7 +63,7 @@ class Inertia(Physics):
         return Moving(mass=mass, shared=shared, axes=axes, **own)
 
     def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
-        """Masses (V,) [kg] of the nodes, and the rest of the elements' consistent mass (None if lumped)."""
+        """Masses (V,) [kg] of the nodes, and the other part of the elements' consistent mass (None if lumped)."""
         if self.mass == "lumped":
             return self.density * nodal_volumes(mesh), None
         density, (parts, matrix) = jnp.asarray(self.density), mass_parts(mesh.order)
@@ -76,7 +79,7 @@ class Inertia(Physics):
 
 
 def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: jax.Array) -> jax.Array:
-    """a (V, 3) [m/s^2] of m a = f."""
+    """Solution a (V, 3) [m/s^2] of m a = f."""
     if shared is None:
         return force / mass[:, None]
 
@@ -102,10 +105,8 @@ class Moving(NodalForce):
     dt: jax.Array = param("s", "time step")
     mask: jax.Array = param("1", "(V, 3) 1 where the motion is not given")
     integrator: str = static(default="euler")
-    shared: Masses | None = param("kg", "rest of the elements' consistent mass; None: lumped", default=None)
-    axes: jax.Array | None = param(
-        "1", "(V, 3) axis of a plate with a given turn that lifts, 0 elsewhere", default=None
-    )
+    shared: Masses | None = param("kg", "other part of the consistent mass; None: lumped", default=None)
+    axes: jax.Array | None = param("1", "(V, 3) axis of a lifting plate with a given angle, 0 elsewhere", default=None)
 
     everywhere: ClassVar[bool] = True
 
@@ -115,14 +116,14 @@ class Moving(NodalForce):
         velocity = (x - self.x) / dt
         acceleration = (velocity - before.velocity) / dt
         if before.acceleration is not None:
-            # Free degrees only: where motion is prescribed the average acceleration would oscillate without end.
+            # Only for free degrees: where motion is prescribed, the average acceleration would oscillate without end.
             average = 4 * acceleration - before.acceleration
             velocity = self._where_free(before.velocity + 0.5 * dt * (before.acceleration + average), velocity)
             acceleration = self._where_free(average, acceleration)
         return velocity, acceleration
 
     def _where_free(self, own: jax.Array, given: jax.Array) -> jax.Array:
-        """A field (V, 3) from that of free motion and that of given motion."""
+        """A field (V, 3): `own` in free directions, `given` in directions of given motion."""
         out = jnp.where(self.mask > 0, own, given)
         return out if self.axes is None else out + jnp.sum(self.axes * (own - given), axis=1, keepdims=True) * self.axes
 
@@ -144,7 +145,7 @@ class Moving(NodalForce):
         return diagonal(FACTOR[self.integrator] / self.dt**2 * self.mass)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Masses | None:
-        """k/dt^2 times the rest of the consistent mass, between the nodes of an element."""
+        """k/dt^2 times the other part of the consistent mass, between the nodes of an element."""
         if self.shared is None:
             return None
         return self.shared._replace(size=FACTOR[self.integrator] / self.dt**2 * self.shared.size)

@@ -16,7 +16,7 @@ from liverjax.physics.base import NodalForce, Physics, Step
 
 @struct
 class Traction:
-    """A load on boundary triangles: dead (`value`), or a pressure that follows them."""
+    """A load on boundary triangles: a dead load (`value`), or a pressure that follows the triangles."""
 
     triangles: Indices = param("1", "node numbers (m, 3), normals outwards", lower=0)
     value: Any = param("Pa", "force per reference area (3,), in a fixed direction", default=None)
@@ -35,7 +35,7 @@ class Traction:
 
 @partial(jax.jit, inline=True)
 def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
-    """Dead nodal forces (V, 3) [N]: the nodes' shares of reference area times traction."""
+    """Dead nodal forces (V, 3) [N]: reference area times traction, distributed to the nodes."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for load in tractions:
         if load.value is None:
@@ -49,12 +49,12 @@ def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
 
 
 def follows(tractions: tuple) -> bool:
-    """Whether a load follows the body: then the tangent is not symmetric."""
+    """Whether a load is a pressure, which follows the body: then the tangent is not symmetric."""
     return any(load.pressure is not None for load in tractions)
 
 
 def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
-    """Nodal forces (V, 3) [N] of the pressures at positions x (V, 3) [m] of a mesh, linear by default: of -p n da."""
+    """Nodal forces (V, 3) [N] of the pressures, -p n da, at positions x (V, 3) [m]. By default the mesh is linear."""
     force = jnp.zeros_like(x)
     for load in tractions:
         if load.pressure is not None:
@@ -63,10 +63,11 @@ def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None)
 
 
 def dead_loads(mesh: TetMesh, density: Number, gravity: Numbers, tractions: tuple) -> jax.Array:
-    """Nodal forces (V, 3) [N] that do not follow the body: weight (none if `density` is None) and tractions."""
+    """Nodal forces (V, 3) [N] that do not follow the body: tractions, and weight if `density` is not None."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     if density is not None:
-        # A node's own density weighs its share of the elements; in quadratic elements a vertex's share is negative.
+        # The density of a node multiplies the node's share of volume. In quadratic elements a vertex has a negative
+        # share.
         mass = density * load_volumes(mesh)
         force = force + mass[:, None] * jnp.asarray(gravity, force.dtype)[None]
     return force + nodal_tractions(mesh, tractions) if tractions else force
@@ -83,7 +84,7 @@ class Loads(Physics):
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
 
     def freeze(self, memory: None, step: Step) -> "Loading":
-        """Dead loads are summed once; the fraction of them that acts depends on the part of the step."""
+        """Sum the dead loads once. Which fraction of them acts depends on the step and on the fraction s."""
         if self.history is not None or any(load.history is not None for load in self.traction):
             begin, end = (self.at(n * step.dt)._loading(step, "none") for n in (step.k - 1, step.k))
             return replace(end, before=begin)
@@ -117,7 +118,7 @@ class Loading(NodalForce):
         return not follows(self.traction)
 
     def fraction(self, s: Number) -> Any:
-        """The fraction of the loads that acts at part s of the step (0: its beginning, 1: its end)."""
+        """The fraction of the loads that acts at fraction s of the step (0: its beginning, 1: its end)."""
         if self.growth == "steps":
             return (self.k - 1 + s) / self.steps
         dtype = self.dead.dtype
@@ -138,13 +139,13 @@ class Loading(NodalForce):
         return -jnp.vdot(self.fraction(jnp.ones((), x.dtype)) * self.dead, x - mesh.points)
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """Energy with pressures that follow the body kept at their values at `start`."""
+        """Energy of the loads. Pressures keep the nodal forces that they have at `start`."""
         if self.conservative:
             return self.energy(mesh, x)
         return jnp.vdot(self.force(mesh, start, jnp.ones((), x.dtype)), x - start)
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
-        """Change of the pressures alone: dead loads do not change."""
+        """Change of the forces of the pressures only: dead loads do not change."""
         if self.before is not None:
             end = replace(self, before=None)
             return s * end.product(mesh, x, s, dx) + (1 - s) * self.before.product(mesh, x, s, dx)

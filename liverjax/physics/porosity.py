@@ -1,15 +1,16 @@
-"""Porosity in parallel (chapter, section 4.3): Kerdok-Hencky volumetric stress, nodal fluid pressure, Darcy diffusion.
+"""A sponge in parallel to the law: Kerdok-Hencky volumetric stress and Darcy diffusion (book chapter, section 4.3).
 
     sigma_p = sigma_Heq(J) - P,   (1/K_lim) dP/dt = kappa lap P - (dJ/dt)/J
 
-sigma_Heq = K0 r_w ln((r_w + J - 1)/r_w), and below J0 = 1 - r_w + r_w K0/K_lim its tangent line of slope K_lim (the
-chapter prints J0 without the factor r_w: then the slope would be r_w K_lim). Volumes of the pressure equation are those
-at the beginning of a step, so that it is linear in P:
+The fluid has a pressure P at the nodes. sigma_Heq = K0 r_w ln((r_w + J - 1)/r_w). Below J0 = 1 - r_w + r_w K0/K_lim it
+is the tangent line at J0, of slope K_lim. (The chapter prints J0 without the factor r_w: then the slope would be r_w
+K_lim.) The pressure equation uses the volumes at the beginning of a step, so that it is linear in P. There are two
+schemes:
 
-* "implicit": P belongs to the end of the step, with the volume change of the step itself. P is eliminated, P(x), which
-  leaves a symmetric problem in x alone: stable at any step. Newton's direction comes from the coupled matrix of (x, P).
-* "lagged": P follows from the volume change of the step before, as in the chapter; conditionally stable. Its old name,
-  "chapter", is accepted.
+* "implicit": P at the end of the step follows from the volume change of the same step. P = P(x) is eliminated. The
+  problem in x is symmetric, and it is stable for any step. Newton's direction comes from the coupled matrix of (x, P).
+* "lagged": P follows from the volume change of the previous step, as in the chapter. It is conditionally stable. The
+  old name "chapter" is accepted.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -37,7 +38,7 @@ SCHEMES = ("implicit", "lagged")
 
 @struct
 class Inlet:
-    """A part of the body with a given pressure of the fluid, or a given flux through its surface."""
+    """A place with a given pressure of the fluid, or a part of the surface with a given flux."""
 
     nodes: Indices | None = param("1", "nodes with the given pressure (n,)", lower=0, default=None)
     pressure: Number | None = param("Pa", "of the fluid at the nodes", default=None)
@@ -53,7 +54,7 @@ class Inlet:
 
 @struct
 class Porosity(Physics):
-    """A sponge of bulk modulus K0 filled with a fluid that makes up the part r_w of its volume."""
+    """A sponge of bulk modulus K0, filled with a fluid. The fluid fills the fraction r_w of its volume."""
 
     bulk: Number = param("Pa", "K0, bulk modulus of the drained sponge at rest", above=0.0)
     limit_bulk: Number = param("Pa", "K_lim, bulk modulus of the compressed sponge and for the pressure", above=0.0)
@@ -63,19 +64,19 @@ class Porosity(Physics):
     inlet: tuple[Inlet, ...] = param("1", "given pressures and fluxes", default=())
     initial_pressure: Number | None = param("Pa", "of the fluid at the beginning; None: 0", default=None)
     scheme: str = static(default="implicit", about="implicit or lagged (the chapter's)", words=SCHEMES)
-    keep_bulk: bool = static(default=False, about="keep the law's own volumetric energy in addition to the sponge's")
+    keep_bulk: bool = static(default=False, about="keep the law's volumetric energy in addition to the sponge")
 
     def __post_init__(self) -> None:
-        """The old name of a scheme becomes the new one."""
+        """Replace the old name of a scheme by the new one."""
         if self.scheme == "chapter":
             object.__setattr__(self, "scheme", "lagged")
 
     def begin(self, start: Start) -> "Fluid":
-        """The fluid at the beginning of a run: initial pressure, reference volumes."""
+        """The fluid at the beginning of a run: the initial pressure and the reference volumes."""
         return initial_fluid(self, start.mesh)
 
     def freeze(self, memory: "Fluid", step: Step) -> "Sponge":
-        """Make the equation of the pressure. It is solved here if it does not depend on the step's end."""
+        """Make the pressure equation. It is solved here if it does not depend on the end of the step."""
         F = deformation_gradient(step.mesh, step.x)
         found = darcy.flow(self, step.mesh, memory.J, F, step.dt, 1e-2 * step.tolerance)
         if self.inlet:
@@ -99,18 +100,18 @@ class Porosity(Physics):
 
 
 class Fluid(NamedTuple):
-    """Pressure and volumes, handed from step to step."""
+    """Pressure and volume ratios at the end of a step: the memory of the fluid."""
 
     pressure: jax.Array  # P of the vertices (V,) [Pa]
-    J: jax.Array  # at every point
-    J_before: jax.Array | None  # of the step before; the lagged scheme
+    J: jax.Array  # volume ratios at every integration point
+    J_before: jax.Array | None  # J one step earlier; only for the lagged scheme
 
 
 def check_porosity(porosity: Porosity) -> None:
     """Refuse values that no step can use; host side.
 
     Raises:
-        InputError: unknown scheme, values out of bounds, K_lim not above K0.
+        InputError: unknown scheme, values out of bounds, K_lim not above K0, an inlet without a complete condition.
     """
     check_sponge(porosity)
     for k, inlet in enumerate(porosity.inlet):
@@ -123,7 +124,7 @@ def check_porosity(porosity: Porosity) -> None:
 
 
 def check_sponge(porosity: Porosity) -> None:
-    """Refuse numbers of a sponge that no step can use; traced ones pass.
+    """Refuse parameters of a sponge that no step can use. Traced parameters pass.
 
     Raises:
         InputError: values out of bounds, K_lim not above K0.
@@ -133,7 +134,7 @@ def check_sponge(porosity: Porosity) -> None:
 
 
 def check_limit(porosity: Porosity) -> None:
-    """Refuse a sponge that softens as it is compressed; traced numbers pass.
+    """Refuse a sponge that does not stiffen under compression. Traced parameters pass.
 
     Raises:
         InputError: K_lim not above K0.
@@ -149,8 +150,10 @@ def check_limit(porosity: Porosity) -> None:
 
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:
-    """The law that acts in parallel to the sponge. Its summands have no volumetric energy U(J), unless `keep_bulk` is
-    set, since bulk would count twice. A law that does not separate volume change from shear stays whole.
+    """The law that acts in parallel to the sponge.
+
+    Its summands have no volumetric energy U(J), since the bulk modulus would count twice. With `keep_bulk` they keep
+    it. A law that does not separate volume change from shear is not changed.
     """
     if porosity is None or porosity.keep_bulk:
         return law
@@ -173,7 +176,7 @@ def bulk_in_force(porosity: Porosity, law: Law) -> str:
 
 
 def volumetric_stress(porosity: Porosity, J: Number) -> Number:
-    """sigma_Heq(J) [Pa]: Hencky's logarithm above J0, its tangent line below; finite for every J."""
+    """sigma_Heq(J) [Pa]: Hencky's logarithm above J0, and its tangent line below J0. It is finite for every J."""
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
     logarithm = K0 * r_w * jnp.log1p((jnp.maximum(J, J0) - 1) / r_w)
@@ -188,8 +191,10 @@ def volumetric_slope(porosity: Porosity, J: Number) -> jax.Array:
 
 
 def volumetric_energy(porosity: Porosity, J: Number) -> Number:
-    """The integral of sigma_Heq from 1 to J [Pa]: K0 r_w^2 (u ln u - u + 1) with u = (r_w + J - 1)/r_w; a parabola
-    below J0."""
+    """The integral of sigma_Heq from 1 to J [Pa].
+
+    It is K0 r_w^2 (u ln u - u + 1) with u = (r_w + J - 1)/r_w, and a parabola below J0.
+    """
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
     u = 1 + (jnp.maximum(J, J0) - 1) / r_w
@@ -198,14 +203,14 @@ def volumetric_energy(porosity: Porosity, J: Number) -> Number:
 
 
 def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
-    """The initial pressure (0 if None), and reference volumes."""
+    """The fluid with the initial pressure (0 if None) and the reference volumes."""
     J = jnp.ones_like(mesh.weights)
     start = 0.0 if porosity.initial_pressure is None else porosity.initial_pressure
     return Fluid(jnp.full(mesh.number_of_vertices, start, J.dtype), J, J if porosity.scheme == "lagged" else None)
 
 
 def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple[jax.Array, jax.Array]:
-    """Inlets at a time [s], for `darcy.Flow`: given pressures (V,) [Pa], and the inflow (V,) [m^3] in dt."""
+    """Given pressures (V,) [Pa] at a time [s], and the inflow (V,) [m^3] during dt, for `darcy.Flow`."""
     given = enters = jnp.zeros(mesh.number_of_vertices, mesh.points.dtype)
     for inlet in porosity.inlet:
         if inlet.nodes is not None:
@@ -221,7 +226,7 @@ def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple
 def pressure(
     porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: jax.Array, guess: darcy.Guess | None = None
 ) -> jax.Array:
-    """P (V,) [Pa] at the end of a step that ends with volumes J_end (E,)."""
+    """P (V,) [Pa] at the end of a step with volume ratios J_end (E,) at its end."""
     before: Any = fluid.J_before
     increment = fluid.J - before if porosity.scheme == "lagged" else J_end - fluid.J
     b = flow.store * fluid.pressure - integrals(mesh, increment)
@@ -229,7 +234,7 @@ def pressure(
 
 
 def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: jax.Array) -> jax.Array:
-    """b . P / 2 [J] with P = A^-1 b the pressure at the end of a step that ends with volumes J_end (E,)."""
+    """b . P / 2 [J], with P = A^-1 b the pressure at the end of a step and J_end (E,) the volume ratios there."""
     b = flow.store * fluid.pressure - integrals(mesh, J_end - fluid.J)
     P = pressure(porosity, mesh, fluid, flow, J_end)
     if flow.given is None:
@@ -238,7 +243,7 @@ def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_
 
 
 def first_piola(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Matrix:
-    """(sigma_Heq(J) - P) cof F [Pa], P linear in every element."""
+    """(sigma_Heq(J) - P) cof F [Pa], with P linear in every element."""
     sigma = volumetric_stress(porosity, determinant(F)) - interpolated(mesh, P)
     return tuple(tuple(sigma * c for c in row) for row in cofactor(F))
 
@@ -262,7 +267,7 @@ class Sponge(VolumeStress):
 
 @struct
 class CoupledSponge(Sponge):
-    """Sponge and fluid, with the pressure of the end of the step."""
+    """Sponge and fluid during a step, with the pressure at the end of the step as an unknown."""
 
     porosity: Porosity = param("1", "its numbers")
     fluid: Fluid = param("1", "at the beginning of the step")
@@ -278,7 +283,10 @@ class CoupledSponge(Sponge):
         return free if self.flow.given is None else free + self.flow.given
 
     def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
-        """Residual (V,) [m^3] of the pressure equation, 0 at a solution; where a pressure is given, minus its error."""
+        """Residual (V,) [m^3] of the pressure equation, 0 at a solution.
+
+        At nodes with a given pressure: minus its error.
+        """
         b = self.flow.store * self.fluid.pressure - integrals(mesh, J - self.fluid.J)
         return darcy.lack(self.flow, b, pressure)
 
@@ -294,7 +302,7 @@ class CoupledSponge(Sponge):
 
 @struct
 class LaggedSponge(Sponge):
-    """Sponge and fluid, with a pressure that is known from the beginning of the step."""
+    """Sponge and fluid during a step, with a pressure that is known at the beginning of the step."""
 
     coupled: ClassVar[bool] = False
     porosity: Porosity = param("1", "its numbers")

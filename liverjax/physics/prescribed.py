@@ -21,7 +21,7 @@ class Fixed:
 
 @struct
 class Displaced:
-    """Nodes that move in proportion, up to `by` at the last step; or along a history, which may scale `by`."""
+    """Nodes with a prescribed motion: it grows linearly to `by` at the last step, or follows a history."""
 
     nodes: Indices = param("1", "node numbers (n,)", lower=0)
     by: Numbers | None = param("m", "displacement (3,), or one per node (n, 3), reached at the last step", default=None)
@@ -54,7 +54,7 @@ def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
 
 
 def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
-    """`free_degrees` on the host (V, 3), for checks: True if unknown."""
+    """`free_degrees` as a host array (V, 3), for checks: True if unknown."""
     free = np.ones(mesh.points.shape, bool)
     for condition in (*fixed, *displaced):
         for axis in condition.axes:
@@ -63,11 +63,11 @@ def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
 
 
 def prescribed(mesh: TetMesh, displaced: tuple, time: Number, fraction: Number) -> jax.Array:
-    """Displacements (V, 3) [m] of prescribed degrees of freedom, zero elsewhere.
+    """Displacements (V, 3) [m] of prescribed degrees of freedom; 0 for other degrees.
 
     Args:
-        time: [s], for histories.
-        fraction: of the whole run, for `by`.
+        time: time [s], for histories.
+        fraction: finished fraction of the run, for `by`.
     """
     u = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for condition in displaced:

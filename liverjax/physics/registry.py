@@ -1,4 +1,4 @@
-"""The physics of a scene, in order, and the further ones that a scene file may name."""
+"""The physics that act in a scene, in order, and the physics that scene files can add."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.physics.volumes.averaged import AveragedVolume
 from liverjax.physics.volumes.mixed import MixedVolume
 
-#: Physics with a table of their own in scene files: a new one needs a line here.
+#: Physics that have a table in scene files. A new physics needs a line here.
 NAMED: tuple[type[Physics], ...] = (
     ElasticSupport,
     SlidingSupport,
@@ -34,7 +34,7 @@ NAMED: tuple[type[Physics], ...] = (
 
 
 def law_at_rest(scene: Any) -> Law:
-    """The law of the body at rest; with a sponge, the law without its own volumetric energy."""
+    """The law of the body at rest. With a sponge it has no volumetric energy, unless the sponge has `keep_bulk`."""
     return porosity.law_in_force(scene.porosity, scene.law)
 
 

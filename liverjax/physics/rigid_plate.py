@@ -1,9 +1,9 @@
-"""A rigid plate: nodes that turn about an axis as one body, by an angle or a torque given over time.
+"""A rigid plate: nodes that rotate about an axis as one body. The angle or the torque is given over time.
 
-The nodes of the plate keep two motions only: the turn, and the displacement along the axis if that is free. Unknowns
-stay nodal vectors. The field b = e x (x - c) / R, for the plate's nodes at the beginning of a step, represents the
-turn. R^2 is the sum of their squared distances from the axis. A field a b means the angle a / R. Positions follow
-the circle exactly, so angles may be large.
+The nodes of the plate have only two motions: the rotation, and the displacement along the axis if it is free. The
+unknowns stay nodal vectors. The field b = e x (x - c) / R of the plate's nodes represents the rotation. Here x are the
+positions of the nodes at the beginning of a step, and R^2 is the sum of their squared distances from the axis. A field
+a b means the angle a / R. The positions follow circles exactly, so angles may be large.
 """
 
 from collections.abc import Callable
@@ -21,25 +21,25 @@ from liverjax.physics.base import NodalForce, Physics, Step
 
 @struct
 class RigidPlate(Physics):
-    """Nodes that turn about an axis as one body."""
+    """Nodes that rotate about an axis as one body."""
 
     nodes: jax.Array = param("1", "node numbers (n,)", lower=0)
     turn: Number = param("rad or N m", "angle or torque; a number, or at times of a history (T,), linear in between")
     times: Numbers | None = param(
         "s",
-        "times of the history (T,), ascending; None: the turn stays, or a torque grows with load steps",
+        "increasing times of the history (T,); None: the turn is constant; a torque grows with load steps",
         default=None,
     )
     axis: jax.Array = param("1", "direction of the axis (3,), of length 1", default=(0.0, 0.0, 1.0))
     centre: jax.Array = param("m", "a point of the axis (3,)", default=(0.0, 0.0, 0.0))
     by: str = static(default="angle", about="what is given: angle or torque", words=("angle", "torque"))
-    lifts: bool = static(default=False, about="free to move along the axis, under no axial force")
+    lifts: bool = static(default=False, about="free to move along the axis, without axial force")
 
     section: ClassVar[str] = "plate"
     ties: ClassVar[bool] = True
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse wrong node numbers, axis or history."""
+        """Refuse wrong node numbers, a wrong axis and a wrong history."""
         numbers, turn = np.asarray(self.nodes), np.asarray(self.turn)
         times = np.zeros(()) if self.times is None else np.asarray(self.times)
         if numbers.size < 2 or numbers.max() >= mesh.number_of_nodes:
@@ -49,7 +49,7 @@ class RigidPlate(Physics):
         if abs(np.linalg.norm(np.asarray(self.axis)) - 1) > 1e-6:
             raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
         if times.shape != turn.shape or (times.ndim and (np.diff(times) <= 0).any()):
-            raise InputError(f"{name} needs ascending times and as many values of turn: correct its history")
+            raise InputError(f"{name} needs ascending times and the same number of values of turn: correct its history")
         arms = self.at_rest(mesh).arms(mesh.points)
         if not np.abs(np.asarray(arms)).max() > 1e-9 * np.ptp(np.asarray(mesh.points)):
             raise InputError(f"{name} has all its nodes on its axis: name more nodes, or move the centre")
@@ -63,24 +63,24 @@ class RigidPlate(Physics):
         """The plate's nodes during a step."""
         before = after = jnp.asarray(self.turn)
         if self.times is None and self.by == "torque" and step.dt is None:
-            # A torque grows with the load steps, as other loads do.
+            # A torque grows with the load steps like other loads.
             before, after = (jnp.asarray(n / step.steps * after) for n in (step.k - 1, step.k))
         if self.times is not None:
             before, after = (jnp.interp(step.dt * n, jnp.asarray(self.times), after) for n in (step.k - 1, step.k))
         return Plate(self, step.mesh.points[self.nodes], step.x[self.nodes], before, after)
 
     def freeze(self, memory: None, step: Step) -> "Torque | None":
-        """The torque; an angle adds no force."""
+        """The torque of the step; None if the angle is given, since an angle adds no force."""
         if self.by == "angle":
             return None
         return Torque(plate=self.tied(step))
 
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "RigidPlate":
-        """The plate with the nodes in between."""
+        """The plate with the nodes that the richer mesh adds between its nodes."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held across the axis, along it if the plate cannot lift, and about it if the angle is given."""
+        """The plate is held across its axis; along it if `lifts` is false; against rotation if the angle is given."""
         nodes, arms = np.asarray(self.nodes), np.asarray(self.at_rest(mesh).arms(mesh.points))
         across = np.linalg.svd(np.asarray(self.axis)[None], full_matrices=True)[2][1:]
         first = [nodes[:1], nodes[:1]] + ([] if self.lifts else [nodes[:1]])
@@ -97,8 +97,8 @@ class Plate(NamedTuple):
     plate: RigidPlate
     reference: jax.Array  # (n, 3) [m]
     carrier: jax.Array  # (n, 3) [m] positions at the beginning of the step, which define the field b
-    before: jax.Array  # angle [rad] or torque [N m] at the beginning
-    after: jax.Array  # and at the end
+    before: jax.Array  # angle [rad] or torque [N m] at the beginning of the step
+    after: jax.Array  # angle or torque at the end of the step
 
     def arms(self, x: jax.Array) -> jax.Array:
         """e x (x - c) of the plate's nodes (n, 3) [m] in positions x (V, 3)."""
@@ -145,7 +145,7 @@ class Plate(NamedTuple):
         return field.at[self.plate.nodes].set(rows)
 
     def amplitudes(self, field: jax.Array, arms: jax.Array) -> tuple[Number, Number]:
-        """R times the turn (by `arms` (n, 3)) and sqrt(n) times the displacement along the axis, of a field (V, 3)."""
+        """R times the rotation (with `arms` (n, 3)) and sqrt(n) times the axial displacement of a field (V, 3)."""
         rows = field[self.plate.nodes]
         turn = jnp.sum(arms * rows) / self.radius if self.plate.by == "torque" else 0.0
         return turn, jnp.sum(rows @ self._axis(field)) / len(self.reference) ** 0.5
@@ -155,24 +155,24 @@ class Plate(NamedTuple):
         return self.spread(field, *self.amplitudes(field, self._arms(self.carrier) if x is None else self.arms(x)))
 
     def given(self, s: Number) -> jax.Array:
-        """Angle or torque at part s of the step."""
+        """Angle or torque at fraction s of the step."""
         return self.before + s * (self.after - self.before)
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Put the plate's numbers at positions x (V, 3) into the field (V, 3)."""
+        """Write the plate's unknowns at positions x (V, 3) into the field (V, 3)."""
         turn = self.radius * self.angle(x) if self.plate.by == "torque" else 0.0
         return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Positions (V, 3) [m] from a field, at part s of the step."""
+        """Positions (V, 3) [m] from a field, at fraction s of the step."""
         turn, lift = self.amplitudes(field, self._arms(self.carrier))
         angle = turn / self.radius if self.plate.by == "torque" else self.given(s)
         return self.moved(field, angle, lift / len(self.reference) ** 0.5)
 
     def moved(self, field: jax.Array, angle: Number, lift: Number) -> jax.Array:
-        """The field (V, 3) with the plate's rows at the positions of an angle [rad] and an axial displacement [m]."""
+        """The field (V, 3) with the positions of the plate's nodes at an angle [rad] and an axial displacement [m]."""
         axis, arms = self._axis(field)[None], self._arms(self.reference)
-        # x - c turns in its plane: it changes by sin(a) of its arm and by cos(a) - 1 of its part across the axis.
+        # The rotation adds to x - c: sin(a) times its arm, and cos(a) - 1 times its part across the axis.
         rows = self.reference + jnp.sin(angle) * arms + (jnp.cos(angle) - 1) * jnp.cross(arms, axis)
         if self.plate.lifts:
             rows = rows + lift * axis
@@ -181,12 +181,12 @@ class Plate(NamedTuple):
 
 @struct
 class Torque(NodalForce):
-    """The torque of a plate during a step: forces on its nodes along their circles."""
+    """The torque of a plate during a step, as forces on its nodes along their circles."""
 
     plate: Plate = param("1", "its nodes")
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Minus the forces whose moment is the torque."""
+        """Minus the forces on the nodes; the moment of these forces is the torque."""
         rows = -self.plate.given(s) * self.plate.arms(x) / self.plate.radius**2
         return jnp.zeros_like(x).at[self.plate.plate.nodes].set(rows)
 

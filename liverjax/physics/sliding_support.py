@@ -1,4 +1,4 @@
-"""A sliding support: nodes of a plane part of the body that stay in that plane, and move in it without friction."""
+"""A sliding support: nodes in a plane part of the surface stay in this plane and move in it without friction."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -13,13 +13,13 @@ from liverjax.mesh import selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Physics
 
-#: Largest distance from the plane that counts as in it, over the extent of the nodes.
+#: Nodes count as in one plane if their distance from it, over the extent of the nodes, is at most this.
 _FLAT = 1e-6
 
 
 @struct
 class SlidingSupport(Physics):
-    """Nodes that do not move along a normal, which is a coordinate axis or any direction."""
+    """Nodes that do not move along the normal of a plane. The normal is a coordinate axis or any direction."""
 
     nodes: Indices = param("1", "node numbers (n,)", lower=0)
     normal: Numbers | None = param("1", "of the plane (3,), of length 1; not used with an axis", default=None)
@@ -46,17 +46,17 @@ class SlidingSupport(Physics):
             raise InputError(f"{name} normal = {self.normal} must be of length 1: divide it by its length")
 
     def constrain(self, free: Free) -> Free:
-        """Take the normal direction away at the nodes."""
+        """The free directions without the normal direction at the nodes."""
         if self.axis:
             return free._replace(mask=free.mask.at[self.nodes, selection.AXES.index(self.axis)].set(0.0))
         normals = jnp.zeros_like(free.mask) if free.normals is None else free.normals
         normal = jnp.asarray(self.normal, free.mask.dtype)[None]
-        # A node that is held along all axes of the normal has no direction left to take away.
+        # A node that is held along all axes of the normal is already held along the normal.
         loose = jnp.max(free.mask[self.nodes] * (jnp.abs(normal) > 1e-12), axis=1, keepdims=True)
         return free._replace(normals=normals.at[self.nodes].set(loose * normal))
 
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "SlidingSupport":
-        """The support with the nodes in between."""
+        """The support with the nodes that the richer mesh adds between its nodes."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -67,10 +67,10 @@ class SlidingSupport(Physics):
 
 
 def on_plane(mesh: TetMesh, nodes: np.ndarray, name: str = "support") -> SlidingSupport:
-    """A sliding support of nodes (n,) that lie in one plane, with the normal of that plane.
+    """A sliding support of nodes (n,) that lie in one plane. The normal is computed from the nodes.
 
     Raises:
-        InputError: fewer than three nodes, or nodes that do not lie in one plane.
+        InputError: nodes that span no plane, or that do not lie in one plane.
     """
     points = np.asarray(mesh.points)[nodes]
     size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[1:]

@@ -1,14 +1,14 @@
-"""Prony viscohyperelasticity (chapter, section 4.2): S_v = S_h - sum_k gamma_k. Mode k remembers the symmetric tensor
-gamma_k.
+"""Prony viscohyperelasticity (book chapter, section 4.2): S_v = S_h - sum_k gamma_k.
 
-Both recursions have the form gamma^n = a S^n + c S^(n-1) + b gamma^(n-1):
+The memory of mode k is the symmetric tensor gamma_k. Two schemes advance it. Both have the form gamma^n = a S^n + c
+S^(n-1) + b gamma^(n-1):
 
-* ``"exponential"``: exact for a stress linear over the step. e = exp(-dt/tau), q = (1 - e) tau/dt, a = g (1 - q),
-  c = g (q - e), b = e. Second order in dt.
-* ``"backward_euler"``: as printed, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). First order in dt. Its old name,
-  "chapter", is accepted.
+* ``"exponential"``: exact if the stress is linear over the step. e = exp(-dt/tau), q = (1 - e) tau/dt, a = g (1 - q),
+  c = g (q - e), b = e. It is of second order in dt.
+* ``"backward_euler"``: as printed in the chapter, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). It is of first order
+  in dt. The old name "chapter" is accepted.
 
-The memory advances once per accepted step; inside a step `recall` is a constant.
+The memory advances once per accepted step. During a step `recall` is constant.
 """
 
 from typing import Any, NamedTuple
@@ -44,7 +44,7 @@ PARTS = ("all", "isochoric")
 
 @struct
 class Prony:
-    """alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): the instantaneous law relaxes to 1 - sum g_k of its stress."""
+    """alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): the stress relaxes from the law's stress to 1 - sum g_k of it."""
 
     ratios: Any = param("1", "g_k, the part of the stress that mode k relaxes (N,), or (N, E)", lower=0.0, upper=1.0)
     relaxation_times: Any = param("s", "tau_k (N,), or one per element (N, E)", above=0.0)
@@ -62,35 +62,35 @@ class Prony:
 
 
 class History(NamedTuple):
-    """Memory of every element at the end of a step; (…, Q, E) where elements have Q points."""
+    """Memory of every element at the end of a step; arrays are (…, Q, E) if elements have Q points."""
 
     gamma: jax.Array  # (N, 6, E) [Pa]
     stress: jax.Array | None  # S^n (6, E) [Pa]; backward Euler does not need it
 
 
 class Recall(NamedTuple):
-    """Contribution of the memory to a step; constant during Newton's iterations."""
+    """Contribution of the memory to the stress in a step. It is constant during Newton's iterations."""
 
     past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
-    now: jax.Array  # 1 - sum_k a_k, () or with the axes of the points
+    now: jax.Array  # 1 - sum_k a_k, () or with the axes of arrays over the points
 
 
 def check_viscosity(prony: Prony, law: Law) -> None:
     """Refuse a viscosity that no step can use; host side.
 
     Raises:
-        InputError: unknown scheme or part, lengths that differ, values out of bounds, ratios adding up to 1 or more,
-            isochoric relaxation of a law without isochoric split.
+        InputError: unknown scheme or part, lengths that differ, values out of bounds, ratios with a sum of 1 or more,
+            isochoric relaxation of a law without an isochoric part.
     """
     check_series(prony)
     check_part(prony.part, law, "viscosity")
 
 
 def check_part(part: str, law: Law, section: str) -> None:
-    """Refuse a part that the law does not have; numbers are not checked.
+    """Refuse a part that the law does not have. Numbers are not checked.
 
     Raises:
-        InputError: isochoric relaxation of a law without isochoric split.
+        InputError: isochoric relaxation of a law without an isochoric part.
     """
     if part == "isochoric" and isochoric_part(law) is None:
         raise InputError(
@@ -100,10 +100,10 @@ def check_part(part: str, law: Law, section: str) -> None:
 
 
 def check_series(prony: Prony) -> None:
-    """Refuse ratios and times that form no Prony series; host side. If they are traced, only their counts are checked.
+    """Refuse ratios and times that form no Prony series; host side. If they are traced, only their number is checked.
 
     Raises:
-        InputError: lengths that differ, values out of bounds, ratios adding up to 1 or more.
+        InputError: lengths that differ, values out of bounds, ratios with a sum of 1 or more.
     """
     bounds.check_fields(prony, "viscosity")
     both = (prony.ratios, prony.relaxation_times)
@@ -125,7 +125,7 @@ def check_series(prony: Prony) -> None:
 
 
 def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """a, b, c, shaped as the ratios, of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1) for a step dt [s]."""
+    """a, b and c of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1) for a step dt [s], in the shape of the ratios."""
     g, tau = jnp.asarray(prony.ratios), jnp.asarray(prony.relaxation_times)
     r = dt / tau
     if prony.scheme == "backward_euler":
@@ -135,23 +135,24 @@ def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array
 
 
 def lasting(prony: Prony, order: int = 1) -> jax.Array:
-    """The part of the stress that never relaxes: one number (), or one per element with an axis for the points if
-    `order` is above 1.
+    """The fraction of the stress that never relaxes.
+
+    It is one number (), or one per element; if `order` is above 1, with an axis for the points.
     """
     left = 1 - jnp.sum(jnp.asarray(prony.ratios), axis=0)
     return left[None] if left.ndim and order > 1 else left
 
 
 def _beside(numbers: jax.Array, ndim: int) -> jax.Array:
-    """Numbers (N,) or (N, E), shaped to broadcast with arrays (N, 6, …, E) of `ndim` dimensions."""
+    """Numbers (N,) or (N, E) with axes added, so that they broadcast with arrays (N, 6, …, E) of `ndim` dimensions."""
     if numbers.ndim == 1:
         return numbers[(slice(None), *(None,) * (ndim - 1))]
     return numbers[(slice(None), *(None,) * (ndim - 2))]
 
 
 def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """1 - q and q - e without cancellation; below r = 1 by the Taylor series of 1 - q (truncated at 1/20!)."""
-    # Not minimum and maximum: at r = 1, where the time step is a relaxation time, they halve the derivative.
+    """1 - q and q - e without cancellation. Below r = 1 the Taylor series of 1 - q is used (truncated at 1/20!)."""
+    # Minimum and maximum would halve the derivative at r = 1, where the time step is equal to a relaxation time.
     small, large = jnp.where(r < 1, r, 1.0), jnp.where(r < 1, 1.0, r)
     series = jnp.zeros_like(r)
     for k in range(18, 0, -1):
@@ -162,10 +163,10 @@ def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax.Array:
-    """gamma_k / S_h at angular frequency omega [rad/s] on the steady cycle, complex, shape (N, ...).
+    """Complex ratios gamma_k / S_h in a steady cycle at angular frequency omega [rad/s], of shape (N, ...).
 
-    With `dt` [s] it is the exact ratio of the discrete recursion; without `dt` that of continuous time, g/(1 + i omega
-    tau). The modulus is G*/G0 = 1 - sum over modes.
+    With `dt` [s] it is the exact ratio for the discrete recursion. Without `dt` it is the ratio in continuous time,
+    g/(1 + i omega tau). The complex modulus is G*/G0 = 1 - the sum of the ratios over the modes.
     """
     omega = jnp.asarray(omega)[None]
     column = (-1,) + (1,) * (omega.ndim - 1)
@@ -179,14 +180,14 @@ def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax
 
 
 def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: DTypeLike = float) -> History:
-    """Zero memory of a body at rest, for E points or the shape (Q, E)."""
+    """Memory of a body at rest: zeros, for E points or for the shape (Q, E)."""
     shape = (points,) if isinstance(points, int) else points
     gamma = jnp.zeros((jnp.asarray(prony.ratios).shape[0], 6, *shape), dtype)
     return History(gamma, None if prony.scheme == "backward_euler" else jnp.zeros((6, *shape), dtype))
 
 
 def relaxed_history(prony: Prony, stress: jax.Array) -> History:
-    """Memory of a body that has been held under `stress` (6, …) [Pa] until nothing relaxes any more."""
+    """Memory of a body that has been held under `stress` (6, …) [Pa] until it has relaxed completely."""
     gamma = _beside(jnp.asarray(prony.ratios), 1 + stress.ndim) * stress[None]
     return History(gamma, None if prony.scheme == "backward_euler" else stress)
 
@@ -224,14 +225,17 @@ def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Number) -> 
 
 
 def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
-    """The second Piola-Kirchhoff stress that relaxes, (6, E) [Pa]: S_h, or its isochoric part."""
+    """The second Piola-Kirchhoff stress (6, E) [Pa] that relaxes: S_h, or its isochoric part."""
     s = invariant_terms.state(relaxing(prony, law), F)
     S = invariant_terms.second_piola(F, invariant_terms.stress(s))
     return jnp.stack([S[i][j] for i, j in SIX])
 
 
 def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
-    """P_v = (1 - sum a) P_h - F past (part "all"), or with the volumetric stress added in full ("isochoric")."""
+    """P_v = (1 - sum a) P_h - F past.
+
+    With part = "isochoric", P_h is the isochoric stress, and the complete volumetric stress is added.
+    """
     P = invariant_terms.first_piola(relaxing(prony, law), F)
     remembered = matmul(F, memory.past)
     P = tuple(tuple(memory.now * P[i][j] - remembered[i][j] for j in range(3)) for i in range(3))
@@ -245,7 +249,7 @@ def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
 def blocks(
     prony: Prony, memory: Recall, law: Law, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
 ) -> list[Matrix]:
-    """Derivative of `first_piola`, as `invariant_terms.blocks`: (1 - sum a) K_h - (D_i . past D_j) Id, per volume."""
+    """Derivative of `first_piola` in the form of `invariant_terms.blocks`: (1 - sum a) K_h - (D_i . past D_j) Id."""
     K = invariant_terms.blocks(invariant_terms.state(relaxing(prony, law), F), D, pairs)
     K = [scale_matrix(memory.now, block) for block in K]
     result = []
@@ -274,12 +278,15 @@ class Viscoelasticity(Physics):
     prony: Prony = param("1", "how it relaxes")
 
     def begin(self, start: Start) -> History:
-        """An empty memory; if the body has just been brought to its positions, with the stress that it has there."""
+        """A memory of zeros.
+
+        If the body has just been moved to its positions, the memory has the stress at these positions.
+        """
         memory = initial_history(self.prony, start.mesh.weights.shape, start.x.dtype)
         if memory.stress is None or not start.moved:
             return memory
         F = deformation_gradient(start.mesh, start.x)
-        # Inverted elements have no stress to begin with.
+        # Inverted elements begin with the stress 0.
         whole = determinant(F) > 0
         F = tuple(tuple(jnp.where(whole, F[i][j], float(i == j)) for j in range(3)) for i in range(3))
         return memory._replace(stress=relaxing_stress(self.prony, self.law, F))
@@ -311,7 +318,7 @@ class Viscoelastic(Solid):
         return blocks(self.prony, self.recall, self.law, F, D, pairs)
 
     def energy(self, F: Matrix) -> jax.Array:
-        """Incremental potential: (1 - sum a) W - past : C/2. U is added in full if it does not relax."""
+        """Incremental potential: (1 - sum a) W - past : C/2. If U does not relax, the complete U is added."""
         law, past = relaxing(self.prony, self.law), self.recall.past
         C = right_cauchy_green(F)
         stored = sum(past[i][j] * C[i][j] for i in range(3) for j in range(3))

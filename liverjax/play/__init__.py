@@ -1,1 +1,1 @@
-"""A body that is pulled by hand in a browser while it moves."""
+"""A body in a browser that the user can pull while it moves."""

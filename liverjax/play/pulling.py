@@ -1,6 +1,6 @@
 """A scene that is run step by step, while a spring pulls at one of its nodes.
 
-The spring is a `Ligament` whose numbers change from step to step, so that one compiled program serves all pulls.
+The spring is a `Ligament`. Only its numbers change from step to step, so that one compiled program is enough.
 """
 
 from collections.abc import Callable
@@ -23,21 +23,21 @@ from liverjax.simulation.run import prepared, simulate_part
 
 #: Number of steps of a run without end.
 STEPS = 10**9
-#: Rest length of the spring, over the size of the body: a spring without length would have no direction.
+#: Rest length of the spring, over the size of the body: a spring of length 0 would have no direction.
 SLACK = 1e-3
-#: Stiffness of a spring that does not pull, over the stiffness of one that does.
+#: Stiffness of the spring while nobody pulls, over its stiffness during a pull.
 NOTHING = 1e-12
 
 
 class Playing(NamedTuple):
-    """A body at one instant, and the program of its next step."""
+    """A body at one instant, and the compiled program for the next step."""
 
     scene: Scene
     program: Callable[..., Any]
     state: State
     step: int  # number of finished steps
     size: float  # diagonal of the body's box [m]
-    nodes: np.ndarray  # (n,) of the surface: numbers in the mesh
+    nodes: np.ndarray  # (n,) node numbers of the surface
     triangles: np.ndarray  # (m, 3) numbers in `nodes`
     positions: np.ndarray  # (V, 3) [m]
     code: int = status.CONVERGED  # of the last step
@@ -50,7 +50,7 @@ class Playing(NamedTuple):
 
     @property
     def stiffness(self) -> float:
-        """Stiffness [N/m] of the pulling spring: shear modulus times a twentieth of the size."""
+        """Stiffness [N/m] of the spring during a pull: shear modulus times a twentieth of the size."""
         return float(np.mean(np.asarray(self.scene.law.shear_modulus()))) * self.size / 20
 
 
@@ -81,7 +81,7 @@ def at_rest(scene: Scene) -> Playing:
 
 
 def _with_histories(scene: Scene) -> Scene:
-    """The scene whose motions and forces that grow until the last step follow a history: a play has no last step."""
+    """The scene with a history for motions and forces that otherwise grow until the last step: here is no last step."""
     if scene.solve.dt is None:
         return scene
     table = {"times": scene.solve.steps * scene.solve.dt * jnp.array([0.0, 1.0]), "history": jnp.array([0.0, 1.0])}
@@ -106,16 +106,16 @@ def _after_load_steps(scene: Scene) -> State:
 
 
 def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = None, stiffness: float = 0.0) -> Playing:
-    """The body after one more step. If the step fails, it stays as it was, with the code of the failure.
+    """The body after one more step. If the step fails, only the code changes.
 
     Args:
         playing: the body before.
         node: number in the mesh of the node that is pulled; None: no pull.
         to: end of the spring (3,) [m].
-        stiffness: of the spring [N/m].
+        stiffness: stiffness of the spring [N/m].
 
     Raises:
-        InputError: no such node, a place or a stiffness that is not a number.
+        InputError: no such node, or an end or a stiffness that is not usable.
     """
     *others, spring = playing.scene.physics
     if node is None:
@@ -123,7 +123,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
     else:
         end = _end_of_spring(playing, node, to, stiffness)
         off = playing.positions[node] - end
-        if np.linalg.norm(off) < 0.5 * SLACK * playing.size:  # a spring of no length has no direction
+        if np.linalg.norm(off) < 0.5 * SLACK * playing.size:  # a spring of length 0 has no direction
             end = end + 0.5 * SLACK * playing.size * np.array([1.0, 0.0, 0.0])
         spring = replace(
             spring, nodes=jnp.full((1, 1), node, jnp.int32), to=jnp.asarray(end), stiffness=jnp.asarray(stiffness)
@@ -131,7 +131,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
     # In the precision of the compiled program.
     spring = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), spring, playing.scene.physics[-1])
     scene = replace(playing.scene, physics=(*others, spring))
-    first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # without time: under the whole load
+    first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # STEPS means the full load
     result, state = jax.block_until_ready(playing.program(scene, playing.state, float(first)))
     code = int(result.status[0])
     if code not in (status.CONVERGED, status.ONE_STEP):

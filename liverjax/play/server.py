@@ -1,4 +1,4 @@
-"""The body in a browser: a page, its surface, and a step for every picture. Only this machine can reach it."""
+"""A server for the body in a browser: a page, the surface, and one step per picture. Only this machine has access."""
 
 import json
 import threading
@@ -15,7 +15,7 @@ from liverjax.play.pulling import Playing, pulled
 
 
 class PlayServer(ThreadingHTTPServer):
-    """Serves one body to all pages that are open."""
+    """Serves one body to all open pages."""
 
     daemon_threads = True
 
@@ -47,7 +47,7 @@ class Answer(BaseHTTPRequestHandler):
             self._send(404, "text/plain", b"there is /, /surface, /step and /rest")
 
     def do_POST(self) -> None:
-        """A step of the body, or the body as it was in the beginning: float32 positions (n, 3) of the surface."""
+        """Make a step, or go back to the beginning. The answer is float32 positions (n, 3) of the surface."""
         try:
             asked = json.loads(self.rfile.read(int(self.headers.get("Content-Length") or 0)) or b"{}")
         except ValueError:
@@ -72,11 +72,11 @@ class Answer(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Print nothing: there would be thirty lines a second."""
+        """Print nothing: otherwise there would be thirty lines per second."""
 
 
 def stepped(playing: Playing, asked: Content) -> Playing:
-    """The body after a step that a page requested."""
+    """The body after a step that a page has requested."""
     return pulled(playing, asked.get("node"), asked.get("to"), asked.get("stiffness", playing.stiffness))
 
 

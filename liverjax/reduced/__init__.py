@@ -1,1 +1,1 @@
-"""Reduced models: a scene's motions as sums of a few modes, its stresses at a few points, and the error of both."""
+"""Reduced models: motions of a scene as sums of a few modes, stresses at a few points, and the error of both."""

@@ -1,9 +1,9 @@
-"""Bias of numbers that were identified with a reduced model, against those that the full model would give.
+"""Bias of parameters that were identified with a reduced model, relative to an identification with the full model.
 
-Data y are fitted by the reduced model: its answer u(p) is nearest to y at numbers p. The full model's answer there is
-u(p) + d, and one full run gives d. The full model meets the same data at p - b, where to first order J b = d in the
-least squares, with J the derivative of u. So b is the bias due to the reduced model, and p - b is free of it to first
-order.
+The reduced model is fitted to data y: at the parameters p its result u(p) is closest to y. At p the full model has the
+result u(p) + d, and one full run gives d. The full model fits the same data at p - b. To first order J b = d in the
+least-squares sense, with the derivative J of u. So b is the bias that the reduced model causes, and p - b has no such
+bias to first order.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,12 +23,14 @@ from liverjax.simulation.run import simulate
 def reduced_bias(
     model: ReducedModel, scene: Scene, values: Mapping[str, Any], observed: Callable[[jax.Array], jax.Array]
 ) -> dict[str, np.ndarray]:
-    """Bias of identified numbers, in their own units and shapes: subtract it from them. One full run; host side.
+    """Bias of identified parameters, in their units and shapes.
+
+    Subtract it from them. It needs one full run; host side.
 
     Args:
         model, scene: as in `simulate_reduced`.
-        values: dotted names -> numbers that were identified through the model.
-        observed: the function of positions (T, V, 3) [m] that was fitted to data, with the weights of that fit.
+        values: dotted names -> values that were identified with the model.
+        observed: the function of positions (T, V, 3) [m] that was fitted to data, with the weights of the fit.
 
     Raises:
         InputError: as `simulate_reduced`; a full run that fails.
@@ -42,7 +44,7 @@ def reduced_bias(
     full = simulate(with_parameters(scene, shaped(flat))).check()
     off = np.asarray(jnp.ravel(observed(full.positions)) - jax.jit(answer)(flat))
     J = np.asarray(jax.jit(jax.jacfwd(answer))(flat))
-    # Numbers have different units, so columns are scaled to length 1.
+    # The parameters have different units, so the columns are scaled to length 1.
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
     found = np.linalg.lstsq(J / size, off, rcond=None)[0] / size

@@ -1,15 +1,16 @@
-"""The error of modes and points, learnt from the full runs of the training: a closure of the reduced model.
+"""Correction of the error of modes and points, learnt from the full runs of the training: a closure of the reduced
+model.
 
-The reduced model is run with the rows of its training, whose full runs are known. The difference is a sum of fields,
-and the part of each field is a polynomial of the coordinates: linear in all, quadratic in the first few. In time, rates
-of the coordinates are terms too. The factors come from least squares with a small ridge (closures of reduced models:
-Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys. Fluids 33, 091301). Differences count in proportion to the
-largest motion of their run.
+The reduced model is run with the rows of its training, for which full runs exist. The difference of both is represented
+by a sum of fields. The coefficient of each field is a polynomial of the coordinates: linear in all coordinates, and
+quadratic in the first few. In scenes with time, the rates of the coordinates are terms, too. The factors are found by
+least squares with a small ridge (closures of reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys.
+Fluids 33, 091301). The differences of a run are weighted by 1 over its largest displacement.
 
-Groups of runs are left out in turn. The errors of the runs left out decide how many coordinates have products. The same
-runs give the error of the corrected motion: its logarithm is linear in the logarithms of three numbers that are known
-without the full run. They are the size of the correction, the largest displacement, and the leverage of the terms: the
-variance of the least squares there, over that of the data (Hoaglin, Welsch 1978).
+Groups of runs are left out in turn. The errors of these runs decide how many coordinates have products. The same runs
+give the error of the corrected motion: its logarithm is linear in the logarithms of three numbers, which are known
+without a full run. The numbers are the size of the correction, the largest displacement, and the leverage of the terms.
+The leverage is the variance of the least-squares prediction over the variance of the data (Hoaglin, Welsch 1978).
 """
 
 from functools import partial
@@ -22,46 +23,47 @@ import numpy as np
 from liverjax.core.struct import Number, param, static, struct
 from liverjax.tensors.principal_fields import principal_fields
 
-#: Groups of runs that are left out in turn, and the fewest runs that are corrected.
+#: Number of groups of runs that are left out in turn, and minimum number of runs for a correction.
 GROUPS, FEWEST_RUNS = 12, 6
-#: Numbers of coordinates that have products; at most `RATES` of them have products with rates.
+#: Tried numbers of coordinates with products. At most `RATES` coordinates have products with rates.
 PRODUCTS, RATES = (0, 6, 12, 20), 8
-#: The ridge over the squares of the features; part of the differences outside of the fields, and the most fields.
+#: The ridge, relative to the mean squares of the terms; fraction of the differences that the fields may leave out;
+#: maximum number of fields.
 RIDGE, OUTSIDE, MOST_FIELDS = 1e-6, 0.02, 150
-#: The most differences from which fields are made.
+#: Maximum number of differences from which the fields are made.
 FIELD_STATES = 1500
-#: Exponents of the stated error if too few runs determine them: the root of the leverage times a constant.
+#: Exponents of the stated error if there are too few runs to determine them: a constant times the root of the leverage.
 FEW_RUNS_EXPONENTS = np.array([0.0, -1.0, 0.5])
-#: Weight of these exponents, as a number of runs.
+#: Weight of these exponents, expressed as a number of runs.
 FEW_RUNS = 10.0
 
 
 @struct
 class Correction:
-    """Polynomials with k terms for m fields, and numbers that state the error that remains."""
+    """Polynomials with k terms for m fields, and numbers that give the remaining error."""
 
     fields: jax.Array = param("1", "(m, V, 3), orthonormal with the lumped volumes of the nodes")
     factors: jax.Array = param("m^2.5", "factors of every term in every field (k, m)")
     inverse: jax.Array = param("1", "inverse of the normal equations of the terms (k, k)")
     scale: jax.Array = param("m", "size of the first coordinate")
     statement: jax.Array = param("1", "logarithm of the stated error: constant and exponents (4,), see `_logarithms`")
-    left: jax.Array = param("1", "error of each run left out, over its largest displacement (R,)")
-    ratios: jax.Array = param("1", "stated over true error of each run left out (R,)")
+    left: jax.Array = param("1", "error of each left-out run, over its largest displacement (R,)")
+    ratios: jax.Array = param("1", "stated error over true error of each left-out run (R,)")
     products: int = static(default=0, about="number of coordinates that have products")
 
 
 class Learnt(NamedTuple):
-    """Runs that a correction is learnt from."""
+    """Runs from which a correction is learnt."""
 
     q: np.ndarray  # coordinates of the reduced runs (R, T, n) [m]
     missing: np.ndarray  # full minus reduced motion (R, T, V, 3) [m]
     moved: np.ndarray  # largest displacement of each run (R,) [m]
-    volumes: np.ndarray  # of the nodes (V,) [m^3]
+    volumes: np.ndarray  # lumped volumes of the nodes (V,) [m^3]
     dt: Number | None  # [s], None without time
 
 
 def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.Array:
-    """The polynomial's terms at coordinates q (T, n) of a run from rest: (T, k)."""
+    """Terms (T, k) of the polynomial at coordinates q (T, n) of a run that begins at rest."""
     x = q / scale
     i, j = np.triu_indices(min(products, x.shape[-1]))
     found = [jnp.ones_like(x[:, :1]), x, x[:, i] * x[:, j]]
@@ -78,12 +80,12 @@ def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array
 
 
 def size_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Largest distance by which the correction moves a node up to each step: (T,) [m]."""
+    """Maximum distance (T,) [m] by which the correction moves a node, up to each step."""
     return jax.lax.cummax(_largest_of_steps(correction_at(own, q, dt)))
 
 
 def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None) -> jax.Array:
-    """Stated largest distance of a node from the full model up to each step, after the correction: (T,) [m].
+    """Stated maximum distance (T,) [m] of a node from the full model up to each step, after the correction.
 
     Args:
         own: `Correction`.
@@ -104,33 +106,33 @@ def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None
 
 
 def _largest_of_steps(u: jax.Array) -> jax.Array:
-    """Largest length of vectors (T, V, 3) at each step (T,)."""
+    """Maximum length (T,) of vectors (T, V, 3) at each step."""
     square = jnp.max(jnp.sum(u**2, axis=-1), axis=-1)
     # The square root has no derivative at zero.
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def _leverage(a: jax.Array, inverse: jax.Array) -> jax.Array:
-    """Variance of the least squares at terms a (T, k), over that of the data: (T,)."""
+    """Variance (T,) of the least-squares prediction at terms a (T, k), over the variance of the data."""
     return jnp.sum((a @ inverse) * a, axis=1)
 
 
 def _logarithms(corrected: jax.Array, moved: jax.Array, leverage: jax.Array) -> jax.Array:
-    """Logarithms (R, 3) that give the stated error: of the relative correction, the displacement and the leverage."""
+    """Logarithms (R, 3) of the relative correction, the displacement and the leverage; they give the stated error."""
     tiny = jnp.finfo(moved.dtype).tiny
     return jnp.log(jnp.maximum(jnp.stack([corrected / moved, moved, leverage], axis=1), tiny))
 
 
 class _LeftOut(NamedTuple):
-    """Errors of every run (R,), by the polynomial that is learnt without its group."""
+    """Errors of every run (R,), with the polynomial that is learnt without the group of this run."""
 
-    off: np.ndarray  # largest error [m]
-    corrected: np.ndarray  # largest correction [m]
-    leverage: np.ndarray  # largest [1]
+    off: np.ndarray  # maximum error [m]
+    corrected: np.ndarray  # maximum correction [m]
+    leverage: np.ndarray  # maximum leverage [1]
 
 
 def learnt_correction(runs: Learnt) -> Correction | None:
-    """The correction with the smallest errors of runs left out; None with too few runs or if none is better."""
+    """The correction with the smallest errors of left-out runs; None with too few runs or if no correction helps."""
     R = len(runs.q)
     if R < FEWEST_RUNS or not np.any(runs.q):
         return None
@@ -144,7 +146,7 @@ def learnt_correction(runs: Learnt) -> Correction | None:
     for products in PRODUCTS:
         of_run = partial(terms, scale=scale, products=products, dt=runs.dt)
         A = np.asarray(jax.vmap(of_run)(jnp.asarray(runs.q)))
-        if 2 * A.shape[2] > A.shape[0] * A.shape[1]:  # so many terms cannot be found from so few states
+        if 2 * A.shape[2] > A.shape[0] * A.shape[1]:  # too many terms for this number of states
             break
         sums = _least_squares(A, parts, runs.moved, group)
         out = _left_out(A, sums, group, runs.missing, fields.reshape(-1, *runs.missing.shape[2:]) / roots)
@@ -169,7 +171,7 @@ def learnt_correction(runs: Learnt) -> Correction | None:
 def _left_out(
     A: np.ndarray, sums: "_LeastSquares", group: np.ndarray, missing: np.ndarray, fields: np.ndarray
 ) -> _LeftOut:
-    """Errors of every run, by the polynomial that is learnt without its group; terms A (R, T, k)."""
+    """Errors of every run, with the polynomial that is learnt without its group. A (R, T, k) are the terms."""
     found = np.zeros((3, len(A)))
     for g in range(len(sums.squares)):
         own = group == g
@@ -181,10 +183,10 @@ def _left_out(
 
 
 def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Constant and exponents (4,) of the stated error, and stated over true error of the runs left out (R,).
+    """Constant and exponents (4,) of the stated error, and the ratios (R,) of stated and true errors of left-out runs.
 
-    The exponents are those of least squares of logarithms; few runs leave them near `FEW_RUNS_EXPONENTS`. With the
-    constant, stated errors of the runs left out are as far above the true ones as below.
+    The exponents come from least squares of logarithms; with few runs they stay close to `FEW_RUNS_EXPONENTS`. The
+    constant is chosen so that the ratios are as far above 1 as below 1 (quantiles of 1 % and 99 %).
     """
     x = np.asarray(_logarithms(*(jnp.asarray(a) for a in (out.corrected, moved, out.leverage))))
     y = np.log(np.maximum(out.off / moved, np.finfo(float).tiny)) - x @ FEW_RUNS_EXPONENTS
@@ -197,17 +199,17 @@ def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _farthest(u: np.ndarray) -> np.ndarray:
-    """Largest length of vectors (R, T, V, 3) of each run (R,)."""
+    """Maximum length (R,) of vectors (R, T, V, 3) in each run."""
     return np.linalg.norm(u, axis=-1).max(axis=(1, 2))
 
 
 def _error_fields(weighted: np.ndarray) -> np.ndarray:
-    """Orthonormal fields (m, 3 V) of differences (N, 3 V), both times the roots of the volumes."""
+    """Orthonormal fields (m, 3 V) for differences (N, 3 V); both are multiplied by the roots of the volumes."""
     return principal_fields(weighted[:: max(1, len(weighted) // FIELD_STATES)], OUTSIDE)[:MOST_FIELDS]
 
 
 class _LeastSquares(NamedTuple):
-    """Normal equations of factors, one set per group of runs."""
+    """Normal equations for the factors, one set for each group of runs."""
 
     squares: np.ndarray  # (g, k, k)
     products: np.ndarray  # (g, k, m)
@@ -215,7 +217,7 @@ class _LeastSquares(NamedTuple):
     states: int
 
     def without(self, *groups: int) -> tuple[np.ndarray, np.ndarray]:
-        """Factors (k, m) from all runs but those of some groups, and the inverse (k, k) of their normal equations."""
+        """Factors (k, m) from all runs except some groups, and the inverse (k, k) of their normal matrix."""
         kept = np.setdiff1d(np.arange(len(self.squares)), groups)
         H = self.squares[kept].sum(axis=0) + RIDGE * self.states * np.eye(len(self.size))
         inverse = np.linalg.inv(H) / np.outer(self.size, self.size)
@@ -223,7 +225,7 @@ class _LeastSquares(NamedTuple):
 
 
 def _least_squares(A: np.ndarray, parts: np.ndarray, moved: np.ndarray, group: np.ndarray) -> _LeastSquares:
-    """Normal equations of terms A (R, T, k) and parts (R, T, m); each run counts by its largest displacement (R,)."""
+    """Normal equations of terms A (R, T, k) and parts (R, T, m), weighted by 1 over the largest displacement (R,)."""
     size = np.sqrt(np.mean(A**2, axis=(0, 1)))
     size = np.where(size > 0, size, 1.0)
     weight = (1 / moved / np.sqrt(np.mean(1 / moved**2)))[:, None, None]

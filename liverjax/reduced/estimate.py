@@ -1,19 +1,19 @@
-"""How far a reduced run is from the full model: the residual on the whole mesh, and the motion that it would cause.
+"""Estimated error of a reduced run: the residual on the whole mesh, and the motion that this residual would cause.
 
-The reduced motion is put into the equations of the full model, step by step, with the memories of all elements. The
-forces out of balance, r, drive the error e. To first order e follows the linear equations of the same body,
+The equations of the full model are evaluated along the reduced motion, step by step, with the memories of all elements.
+The out-of-balance forces r cause the error e. To first order e follows the linear equations of the same body,
 
     M a(e) + K e - memory(e) = -r,
 
-with the stiffness K of the reference shape and the same recursions in time. K and M are factorised once per run, so a
-step costs the forces of the full mesh and one solve, and no iterations of Newton's method. In the static case the
-energy norm of e is the dual norm of r. The estimate leaves out terms of second order in e and the change of the
-stiffness by the deformation.
+with the stiffness K of the reference shape and the same recursions in time. The matrix of the left side is factorised
+once per run. So a step needs the forces of the full mesh and one solve, but no iterations of Newton's method. In
+statics the energy norm of e is the dual norm of r. The estimate leaves out terms of second order in e, and the change
+of the stiffness with the deformation.
 
-In a porous scene the pressures of the full mesh are solved for along the reduced motion, so that only forces are out of
-balance. These drive the errors of motion and pressure (`liverjax.reduced.physics.fluid_error`). The pressure's own
-error is the distance of the reduced pressure from the one that was solved for, plus the part due to the error of the
-motion.
+In a porous scene the pressures of the full mesh are computed along the reduced motion, so that only forces are out of
+balance. These forces cause errors of motion and pressure (`liverjax.reduced.physics.fluid_error`). The error of the
+pressure is the difference of the reduced pressure and the computed one, plus the part that the error of the motion
+causes.
 """
 
 from collections.abc import Callable
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 
 class _Body(NamedTuple):
-    """The linear body that the error moves: sparse matrices (f, f) of the free degrees of freedom."""
+    """The linear body for the error: sparse matrices (f, f) of the free degrees of freedom."""
 
     relaxing: jax.Array  # stiffness of the part that relaxes [N/m]
     rest: Any  # stiffness of the part that does not relax, or None
@@ -61,8 +61,7 @@ class _Body(NamedTuple):
 
 
 def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ReducedResult:
-    """The result with its estimated errors (T,) [m], [Pa] and reactions (T, V, 3) [N]; host side, after the run of one
-    scene.
+    """The result with estimated errors (T,) [m] and [Pa], and with reactions (T, V, 3) [N]; host side, for one run.
 
     Args:
         model, scene, result: as in `simulate_reduced`.
@@ -79,8 +78,10 @@ def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> R
 
 @jax.jit
 def _out_of_balance(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Out-of-balance forces and reactions (T, V, 3) [N] of the full model along given positions (T, V, 3), and the
-    fluid's pressure there (T, V) [Pa]."""
+    """Out-of-balance forces and reactions (T, V, 3) [N] of the full model along given positions (T, V, 3).
+
+    The third result is the fluid's pressure there (T, V) [Pa].
+    """
     sizes = force_sizes(scene)
 
     def advance(state: State, given: tuple) -> tuple[State, tuple]:
@@ -105,7 +106,7 @@ def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
     if prony is not None and prony.part == "isochoric":
         own = volumetric_part(law)
         rest, law = None if own is None else stiffness(own), relaxing(prony, law)
-    if has_springs(scene):  # they do not relax
+    if has_springs(scene):  # springs do not relax
         springs = spring_matrix(scene)[free][:, free].tocsc()
         rest = springs if rest is None else rest + springs
     mass = None
@@ -116,7 +117,7 @@ def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
 
 
 def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Motions (T, V, 3) [m] of the linear body under minus the residuals (T, V, 3) [N], and pressures (T, V) [Pa]."""
+    """Motions (T, V, 3) [m] and pressures (T, V) [Pa] of the linear body under minus the residuals (T, V, 3) [N]."""
     import scipy.sparse
 
     free = np.flatnonzero(np.asarray(free_directions(scene).mask).ravel())
@@ -153,7 +154,7 @@ def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid | None
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """As `coupled_solver`, or with K alone if there is no fluid."""
+    """The solver of `coupled_solver`; without a fluid, a solver with K only."""
     from scipy.sparse.linalg import splu
 
     if fluid is not None:
@@ -163,7 +164,7 @@ def _solver(
 
 
 def _recursion(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """a, b, c (N,) of the viscosity; empty if there is none."""
+    """Coefficients a, b, c (N,) of the viscosity; empty arrays without viscosity."""
     if scene.viscosity is None:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     a, b, c = coefficients(scene.viscosity, scene.solve.dt)

@@ -1,4 +1,4 @@
-"""Reduced models on disk: one HDF5 file with modes, points, weights and where they come from."""
+"""Reduced models on disk: one HDF5 file with modes, points, weights and their origin."""
 
 import json
 from pathlib import Path
@@ -29,14 +29,14 @@ def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") ->
     Args:
         model: `ReducedModel`.
         file: HDF5 file, replaced if it exists.
-        scene_text: content of the scene file it was made from, stored with it.
+        scene_text: content of the scene file from which the model was made; it is stored in the file.
     """
     import h5py
 
     with whole(Path(file)) as new, h5py.File(new, "w") as out:
         for name, unit in _UNITS.items():
             array = np.asarray(getattr(model, name))
-            # In files the modes come first.
+            # In files the first axis is the mode.
             out[name] = np.moveaxis(array, -1, 0) if name == "slopes" else array
             out[name].attrs["unit"] = unit
         if model.correction is not None:
@@ -83,7 +83,7 @@ def load_reduced(file: str | Path) -> ReducedModel:
 
 
 def _wrong(model: ReducedModel) -> str:
-    """A text on the first array whose shape does not fit the others or that is not finite; empty: there is none."""
+    """A text on the first array that has a wrong shape or is not finite; an empty text if there is none."""
     n, V, S = *jnp.shape(model.modes)[:2], *jnp.shape(model.weights)[:1]
     shapes: dict[str, tuple] = {"modes": (n, V, 3), "slopes": (9, S, n), "weights": (S,), "points": (S,)}
     arrays = {name: getattr(model, name) for name in shapes}
@@ -106,7 +106,7 @@ def _wrong(model: ReducedModel) -> str:
 
 
 def _correction(stored: "h5py.File") -> Correction | None:
-    """Read the correction from an open file; None if it has none."""
+    """Read the correction from an open file; None if the file has no correction."""
     if "correction" not in stored:
         return None
     own = stored["correction"]
@@ -115,7 +115,7 @@ def _correction(stored: "h5py.File") -> Correction | None:
 
 
 def _pressures(stored: "h5py.File") -> PressureModes | None:
-    """Read the modes of the pressure from an open file; None if it has none."""
+    """Read the modes of the pressure from an open file; None if the file has no such modes."""
     if "pressures" not in stored:
         return None
     return PressureModes(**{name: jnp.asarray(stored["pressures"][name][()]) for name in _PRESSURES})

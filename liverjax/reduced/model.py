@@ -1,9 +1,9 @@
 """A reduced model: modes of motion, and weighted points of elements at which stresses are evaluated.
 
-Positions are x = X + u_D(t) + sum_k q_k phi_k with prescribed motion u_D, and modes phi_k that vanish where the body is
-held or moved. The energy is W(q) = sum_p w_p W(F_p(q)) over the sampled points p, with weights w_p >= 0. Its gradient,
-sum_p w_p P(F_p) : grad phi_k, is the reduced force. So a sum over points keeps the structure of the full model
-(energy-conserving sampling and weighting: Farhat, Avery, Chapman, Cortial 2014; here by points of elements).
+Positions are x = X + u_D(t) + sum_k q_k phi_k, with the prescribed motion u_D. The modes phi_k are 0 where the body is
+held or moved. The energy is W(q) = sum_p w_p W(F_p(q)) over the sampled points p, with weights w_p >= 0. The gradient
+of W, sum_p w_p P(F_p) : grad phi_k, is the reduced force. So the sum over points keeps the structure of the full model
+(energy-conserving sampling and weighting: Farhat, Avery, Chapman, Cortial 2014; here with points instead of elements).
 """
 
 import hashlib
@@ -34,17 +34,17 @@ from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.tensors.matrices import Matrix, deformation_gradient
 from liverjax.tensors.places import taken
 
-#: Part of the width of a range by which a number may leave it.
+#: A parameter may be outside of its range by this fraction of the range's width.
 BEYOND = 0.5
-#: Parts of a scene whose numbers decide its motion.
+#: Parts of a scene with numbers that determine its motion.
 _PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction", "physics")
-#: Numbers that lead through states which the rows may have shown too.
+#: Names of numbers that may differ: they can lead through states that also occur in the rows.
 _FREE = ("times", "history")
 
 
 @struct
 class PressureModes:
-    """m modes of the fluid's pressure, which vanish where it is drained, and their values at the points."""
+    """m modes of the fluid's pressure and their values at the points. The modes are 0 where the body is drained."""
 
     modes: jax.Array = param("1", "(m, V), orthonormal with the lumped volumes of the vertices")
     values: jax.Array = param("1", "values at the points (S, m)")
@@ -54,7 +54,7 @@ class PressureModes:
 
 @struct
 class ReducedModel:
-    """n modes and S points of one scene; numbers of its law, viscosity and loads stay free."""
+    """n modes and S points of one scene. Parameters of its law and viscosity, and its loads, can be changed."""
 
     modes: jax.Array = param("1", "(n, V, 3), orthonormal with the lumped volumes of the nodes")
     slopes: jax.Array = param("1/m", "gradients of the modes at the points (9, S, n), row by row")
@@ -68,7 +68,7 @@ class ReducedModel:
 
     @property
     def number_of_modes(self) -> int:
-        """The number n of unknowns of a step."""
+        """Number n of modes: the unknowns of a step."""
         return self.modes.shape[0]
 
 
@@ -99,9 +99,7 @@ def pressure_modes(mesh: TetMesh, modes: jax.Array) -> PressureModes:
 
 
 def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None = None) -> ReducedModel:
-    """The model of these modes (n, V, 3), and (m, V) of pressures, that evaluates the stress at every point: Galerkin's
-    projection.
-    """
+    """The model with modes (n, V, 3), and modes (m, V) of pressures, and with all points: Galerkin's projection."""
     mesh = scene.mesh
     slopes = jnp.moveaxis(jax.lax.map(lambda mode: flat_gradient(mesh, mode), modes), 0, -1)
     w = mesh.weights.ravel()
@@ -117,7 +115,7 @@ def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None 
 
 
 def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
-    """The physics in the elements of the full model; its law has the numbers of the sampled points."""
+    """The physics in the elements of the full model, with the parameters of the law at the sampled points."""
     E = scene.mesh.number_of_elements
     law = law_of_elements(law_at_rest(scene), scene.region, E)
     elements = model.points % E
@@ -127,7 +125,10 @@ def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
 
 
 def reduced_identity(scene: Scene) -> str:
-    """Digest of mesh, held, moved and drained nodes, kind of law, viscosity, porosity and run, not of numbers."""
+    """Digest of the mesh, of held, moved and drained nodes, and of the kinds of law, viscosity, porosity and run.
+
+    It does not depend on the parameters.
+    """
     whole = hashlib.sha256()
     for array in (scene.mesh.points, scene.mesh.tetrahedra):
         whole.update(np.ascontiguousarray(np.asarray(array)).tobytes())
@@ -145,11 +146,11 @@ def reduced_identity(scene: Scene) -> str:
 
 
 def refuse_unknown_physics(scene: Scene) -> None:
-    """Refuse a scene whose physics reduced models do not have.
+    """Refuse a scene with physics that reduced models do not have.
 
     Raises:
-        InputError: inlets of a fluid, named physics other than supports, a loaded mesh, pressures that follow, averaged
-            or mixed volumes.
+        InputError: viscosity or laws of regions, inlets of a fluid, physics other than supports, a loaded mesh,
+            pressures that follow the surface, averaged or mixed volumes, consistent mass, other precision or Newton.
     """
     if any(region.viscosity for region in scene.region):
         raise InputError("a reduced model has one viscosity: leave the viscosity of regions out, or run the full model")
@@ -175,7 +176,7 @@ def refuse_unknown_physics(scene: Scene) -> None:
 
 
 def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
-    """Refuse a scene that the model was not made for.
+    """Refuse a scene for which the model was not made.
 
     Raises:
         InputError: as `refuse_unknown_physics`, or another mesh, held nodes, law, viscosity or kind of run.
@@ -192,18 +193,18 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
 
 
 def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) -> str:
-    """Digests of the numbers that the rows do not vary, by their names, as JSON text.
+    """Names and digests of the numbers that the rows do not vary, as JSON text.
 
     Args:
         scene: `Scene`, not traced.
-        varied: dotted names -> a value of each number that the rows vary.
+        varied: dotted names -> one value of each number that the rows vary.
     """
     scene = with_parameters(scene, {name: np.zeros_like(np.asarray(value, float)) for name, value in varied.items()})
     found = {}
     for part in _PARTS:
         for path, leaf in jax.tree_util.tree_flatten_with_path(getattr(scene, part))[0]:
             words = [str(getattr(key, "name", getattr(key, "idx", key))) for key in path]
-            if part == "physics":  # by the names of a scene file: support.0
+            if part == "physics":  # with the names of a scene file: support.0
                 part_of = scene.physics[: int(words[0]) + 1]
                 section = part_of[-1].section
                 words = [str(sum(own.section == section for own in part_of) - 1), *words[1:]]
@@ -218,17 +219,18 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
 
 
 def _course(scene: Scene) -> Content:
-    """How a scene runs in time, by names."""
+    """Names and values of the settings for time."""
     solve = scene.solve
     duration = None if solve.dt is None else float(solve.dt) * solve.steps
     return {"solve.integrator": solve.integrator, "solve.dt x solve.steps": duration}
 
 
 def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
-    """Refuse numbers that the rows of a model have not shown; those of a traced scene pass.
+    """Refuse numbers that do not occur in the rows of the model. A traced scene passes.
 
     Raises:
-        InputError: a number far out of its range in the rows, or another number than that of the rows' scene.
+        InputError: a varied number far outside of its range in the rows, or another number that differs from the scene
+            of the rows.
     """
     parts = [*(getattr(scene, part) for part in _PARTS), scene.solve.dt]
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((parts, model.ranges))):
@@ -260,5 +262,5 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
 
 
 def without_rows(model: ReducedModel) -> ReducedModel:
-    """The model without what only its error needs: models that differ in this alone share one program."""
+    """The model without the data that only its error needs. Models that differ only in these data share one program."""
     return replace(model, correction=None, ranges={}, others="")

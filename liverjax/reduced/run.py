@@ -1,4 +1,4 @@
-"""Runs of a reduced model: its loads, its beginning, and step after step (`liverjax.reduced.step`)."""
+"""Runs of a reduced model: loads, initial state, and the loop over the steps (`liverjax.reduced.step`)."""
 
 from collections.abc import Callable
 from functools import partial
@@ -58,26 +58,26 @@ class ReducedResult:
     coordinates: jax.Array = param("m", "of the modes (T, n)")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
     iterations: jax.Array = param("1", "(T,) of Newton's method")
-    residual: jax.Array = param("1", "(T,) of the reduced equations over the forces at work")
+    residual: jax.Array = param("1", "(T,) of the reduced equations, over the size of all forces")
     pressures: jax.Array | None = param("Pa", "coordinates of the pressure's modes (T, m)", default=None)
     error: jax.Array | None = param(
-        "m", "(T,) estimated largest distance of a node from the full model; None: not estimated", default=None
+        "m", "(T,) estimated maximum distance of a node from the full model; None: not estimated", default=None
     )
-    reactions: jax.Array | None = param("N", "(T, V, 3) of the full model, given with error", default=None)
+    reactions: jax.Array | None = param("N", "(T, V, 3) of the full model; only together with error", default=None)
     pressure_error: jax.Array | None = param(
-        "Pa", "(T,) estimated largest error of the fluid's pressure, given with error if porous", default=None
+        "Pa", "(T,) estimated maximum error of the fluid's pressure; only with error, if porous", default=None
     )
 
 
 class _Given(NamedTuple):
-    """Prescribed loads and motion at the end of every step."""
+    """Loads and prescribed motion at the end of every step."""
 
     load: jax.Array  # (T, n) [N]
     gradient: jax.Array  # deformation gradient of the prescribed motion (T, 9, S), or (1, 9, S) without motion
 
 
 def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
-    """Loads and prescribed motion of every step, and the load (n,) at the beginning of the run."""
+    """Loads and prescribed motion of all steps, and the load (n,) at the beginning of the run."""
     mesh, solve, body = scene.mesh, scene.solve, scene.body
     weight = {} if body is None else {k: getattr(body, k) for k in ("density", "gravity", "times", "history")}
     loads = Loads(traction=scene.traction, **weight)
@@ -124,8 +124,10 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
-    """The beginning of a run: coordinates, memory, fluid, motion at rest, an empty inverse, mass matrix. Without
-    inertia motion and mass are None."""
+    """The beginning of a run: coordinates, memory, fluid, motion at rest, an empty inverse, and the mass matrix.
+
+    Without inertia, motion and mass are None.
+    """
     n, S = model.number_of_modes, model.weights.shape[0]
     q = jnp.zeros(n, model.modes.dtype)
     inverse = jnp.zeros((n, n), q.dtype)
@@ -155,8 +157,9 @@ def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> 
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
-    """A function for one step: (coordinates, memory, motion) before it and its loads -> the same after it, and a row of
-    the result.
+    """A function for one step: (state before the step, loads) -> (state after the step, row of the result).
+
+    The state consists of coordinates, memory, fluid, motion and inverse.
     """
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
@@ -210,14 +213,15 @@ def _reduced_run(model: ReducedModel, scene: Scene) -> ReducedResult:
 
 
 def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
-    """Run a scene by its reduced model; may be differentiated, vmapped and jitted.
+    """Run a scene with its reduced model. This function may be differentiated, vmapped and jitted.
 
     Args:
         model: `ReducedModel`, from `reduce_scene` or `load_reduced`.
-        scene: the scene it was made for; numbers of law, regions, viscosity, body, loads and time step may differ.
+        scene: the scene for which the model was made. Parameters of law, regions, viscosity and body, loads and the
+            time step may differ.
 
     Raises:
-        InputError: another scene, or numbers that `simulate` refuses too.
+        InputError: another scene, or numbers that `simulate` also refuses.
     """
     refuse_another_scene(model, scene)
     check_before_run(scene)
@@ -225,7 +229,7 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
 
 
 def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
-    """Positions (T, V, 3) [m] of the nodes, with the correction that the model has learnt, or without it."""
+    """Positions (T, V, 3) [m] of the nodes, with or without the learnt correction of the model."""
     u = _free_motion(model if corrected else replace(model, correction=None), scene, result)
     if scene.displaced:
         u = u + _prescribed_steps(scene)
@@ -244,7 +248,7 @@ def reduced_pressure(model: ReducedModel, scene: Scene, result: ReducedResult) -
 
 
 def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
-    """Displacements (T, V, 3) [m] of the nodes by modes and correction, without prescribed ones."""
+    """Displacements (T, V, 3) [m] of the nodes from modes and correction, without the prescribed motion."""
     u = jnp.tensordot(result.coordinates, model.modes, axes=1)
     if model.correction is not None:
         u = u + correction_at(model.correction, result.coordinates, scene.solve.dt)
@@ -252,19 +256,19 @@ def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> ja
 
 
 def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
-    """Estimated largest distance of a node from the full model up to each step (T,) [m].
+    """Estimated maximum distance (T,) [m] of a node from the full model, up to each step.
 
-    It needs no full mesh, and may be differentiated, vmapped and jitted. `reduced_error` uses the full mesh. The error
-    of the corrected motion is learnt from the runs left out. Without the correction the motion is less exact, but the
-    size of the correction states its error well (`experiments/TABLES.md` has both).
+    Other than `reduced_error`, it does not use the full mesh, and it may be differentiated, vmapped and jitted. The
+    error of the corrected motion is learnt from left-out runs. Without the correction the motion is less accurate, but
+    the size of the correction is a good estimate of its error (`experiments/TABLES.md` has both).
 
     Args:
         model, scene, result: as in `simulate_reduced`.
-        corrected: of `reduced_positions` with, or without the correction.
+        corrected: whether the estimate is for `reduced_positions` with the correction.
 
     Raises:
-        InputError: a model without a correction: made from few rows, or none made its errors smaller; numbers that
-            the rows have not shown (those of a traced scene pass).
+        InputError: a model without a correction (made from too few rows, or no correction reduced the errors); numbers
+            that do not occur in the rows (a traced scene passes).
     """
     if model.correction is None:
         raise InputError("this reduced model has no correction: make it from more rows, or take lj.reduced_error")

@@ -1,8 +1,10 @@
-"""Sampled points, and non-negative weights with which they give the reduced forces of the training runs.
+"""Selection of points, and of non-negative weights with which these points give the reduced forces of the training
+runs.
 
-The contributions of all points to the reduced forces are a matrix G (rows, P); the forces are the sums of its rows.
-Weights xi >= 0 with few entries above 0 are the least-squares solution of G xi = G 1 by Lawson and Hanson's method, on
-the largest singular vectors of G alone: there are at most as many points as vectors (Hernandez, Caicedo, Ferrer 2017).
+The contributions of all points to the reduced forces are a matrix G (rows, P). The forces are the sums of its rows. G
+is reduced to its largest singular vectors. Then the least-squares problem G xi = G 1 with xi >= 0 is solved by the
+method of Lawson and Hanson. Its solution has few entries above 0: at most as many points as singular vectors
+(Hernandez, Caicedo, Ferrer 2017).
 """
 
 from collections.abc import Callable, Mapping
@@ -33,9 +35,9 @@ from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.tensors.matrices import determinant
 from liverjax.tensors.principal_fields import principal_fields
 
-#: The most states whose forces are used: memory and time grow with their number.
+#: Maximum number of states with forces that are used: memory and time grow with it.
 MOST_STATES = 240
-#: States whose forces move less than this part of the largest coordinate are left out: roundoff [1].
+#: A state is left out if its forces cause a motion below this fraction of the largest coordinate: roundoff [1].
 LEAST_MOTION = 1e-9
 
 
@@ -49,26 +51,26 @@ class Coordinates(NamedTuple):
 def sampled(
     whole: ReducedModel, scene: Scene, values: Mapping[str, Any], runs: Coordinates, tolerance: float
 ) -> ReducedModel:
-    """The model with few points, from a model with all points and coordinates of runs with R rows of values.
+    """The model with few points, from a model with all points and the coordinates of runs of R rows.
 
-    States are left out if they are at rest, or if an element is inverted there and its law then has no force.
+    States at rest are left out. States with an inverted element are left out, too, if the law has no force there.
 
     Args:
-        whole: as `with_all_points` makes it.
+        whole: model from `with_all_points`.
         scene: `Scene`.
-        values: dotted names -> (R, …).
+        values: dotted names -> values (R, …).
         runs: coordinates of these runs.
-        tolerance: part of the motions by these forces that may be left out [1].
+        tolerance: fraction of the motions that these forces cause that may be left out [1].
     """
     compliance, rows, q = _reduced_compliance(whole, scene), [], runs.q
     for r, times in states_of(*q.shape[:2]):
         own = with_parameters(scene, {name: jnp.asarray(v[r]) for name, v in values.items()})
         p = None if runs.p is None else jnp.asarray(runs.p[r])
         forces, volumes = _contributions(whole, own, (jnp.asarray(q[r]), p), jnp.asarray(times))
-        # Forces count as motions, since forces of stiff modes are large but move little.
+        # Forces are converted to motions, since forces of stiff modes are large but cause little motion.
         G = compliance @ np.asarray(forces)
         size = np.linalg.norm(G.sum(axis=2), axis=1)
-        # If modes alone invert an element, some laws have no force there; a state at rest has no forces.
+        # If the modes invert an element, some laws have no force there. A state at rest has no forces.
         good = np.isfinite(G).all(axis=(1, 2)) & (size > LEAST_MOTION * np.abs(q).max())
         rows.append((G[good] / size[good, None, None]).reshape(-1, whole.weights.size))
         if volumes is not None:
@@ -79,8 +81,9 @@ def sampled(
 
 
 def _balances(volumes: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Rows (…, P) of both sides of the fluid's balance (2, K, m, P), as pressures, divided by their size plus that of p
-    (K, m).
+    """Rows (…, P) of both sides of the fluid's balance (2, K, m, P), as pressures.
+
+    They are divided by the norm of their sum over the points plus the norm of p (K, m).
     """
     size = np.linalg.norm(volumes[0].sum(axis=2), axis=1) + np.linalg.norm(p, axis=1)
     return (volumes / np.where(size > 0, size, 1.0)[:, None, None]).reshape(-1, volumes.shape[-1])
@@ -97,8 +100,10 @@ def _at(whole: ReducedModel, points: np.ndarray, weights: jax.Array) -> ReducedM
 
 
 def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
-    """Runs, and the steps of each whose forces are used. Steps are evenly spaced and begin at another place in every
-    run. So all times are used, also if each run gives few steps; the first steps alone have no large motion.
+    """Runs, and for each run the steps of which forces are used.
+
+    The steps are evenly spaced, with another first step in every run. So all times are used, even if each run gives few
+    steps: the first steps of a run have no large motion.
     """
     chosen = np.unique(np.linspace(0, runs - 1, min(runs, MOST_STATES)).round().astype(int))
     each = min(steps, max(1, MOST_STATES // len(chosen)))
@@ -120,8 +125,9 @@ def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
 def _contributions(
     whole: ReducedModel, scene: Scene, run: tuple[jax.Array, jax.Array | None], times: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Contributions of each point along a run (T, n), (T, m), at some times: to each reduced force (K, n, P), and in a
-    porous scene those of `_balance`.
+    """Contributions of each point to the reduced forces (K, n, P), at some times of a run.
+
+    `run` has its coordinates (T, n) and (T, m). In a porous scene the second result is the one of `_balance`.
     """
     solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
     F0, (q, p) = prescribed_gradients(whole, scene), run
@@ -149,12 +155,13 @@ def _contributions(
 def _balance(
     whole: ReducedModel, scene: Scene, gradient: Callable[[jax.Array], jax.Array], p: jax.Array, times: jax.Array
 ) -> jax.Array:
-    """Contributions of each point to both sides of the fluid's balance, as pressures (2, K, m, P): by the change of
-    volume, and by storage and flow.
+    """Contributions of each point to both sides of the fluid's balance, as pressures (2, K, m, P).
+
+    One side is the change of volume, the other one storage and flow.
 
     Args:
         whole, scene: as in `sampled`.
-        gradient: number of a step, from 0 -> deformation gradients (9, P) at its end.
+        gradient: function (number of a step, from 0) -> deformation gradients (9, P) at the end of the step.
         p: coordinates of the pressure (T, m) [Pa].
         times: numbers of K steps.
     """
@@ -178,18 +185,20 @@ def _balance(
 
 
 def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Factors xi (P,), few of them above 0, with G xi = G 1 nearly, and the sum of volumes kept.
+    """Factors xi (P,) with G xi close to G 1. Few of them are above 0, and the total volume is nearly kept.
 
     Args:
         G: contributions (rows, P).
-        volumes: of the points (P,).
-        tolerance: part of G that may be left out [1].
+        volumes: volumes of the points (P,).
+        tolerance: fraction of G that may be left out [1].
     """
     from scipy.optimize import nnls
 
     if not len(G):
-        raise InputError("the runs give no forces to choose points from: give two rows or more, with different numbers")
-    # Rows of length 1: small vectors count as much as large ones.
+        raise InputError(
+            "the runs give no forces from which points can be chosen: give at least two rows with different numbers"
+        )
+    # The rows have length 1, so small singular vectors have the same weight as large ones.
     V = principal_fields(G, tolerance)
     V = np.concatenate([V, volumes[None] / np.linalg.norm(volumes)])
     return nnls(V, V.sum(axis=1), maxiter=20 * V.shape[1])[0]

@@ -1,12 +1,12 @@
-"""A static answer as a sum of products: a field of the place times one function of each parameter.
+"""A static displacement as a sum of products: a field in space times one function of each parameter.
 
     u(x, p_1 ... p_n) = sum over m of w_m(x) f_m1(p_1) ... f_mn(p_n)
 
-is the form of proper generalised decomposition (chapter, section 3.3; Chinesta, Ladeveze, Cueto 2011, Arch. Comput.
-Methods Eng. 18, 395). Laws of soft tissue are not such products, so the terms come from full runs at a grid of
-parameters. They are found one after another, each by alternating least squares on the part that the terms before leave
-out. After each term all fields w_m are found anew by least squares. Functions of a parameter are polynomials of
-Chebyshev.
+This is the form of proper generalised decomposition (chapter, section 3.3; Chinesta, Ladeveze, Cueto 2011, Arch.
+Comput. Methods Eng. 18, 395). Laws of soft tissue are not such products, so the terms are computed from full runs at a
+grid of parameters. The terms are found one after another, by alternating least squares on what the earlier terms leave
+out. After each term all fields w_m are computed again by least squares. The functions of a parameter are Chebyshev
+polynomials.
 """
 
 import itertools
@@ -25,9 +25,9 @@ from liverjax.scenes.checks.numbers import check_numbers
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.simulation.batch import simulate_batch
 
-#: The most parameters, and runs of the grid.
+#: Maximum number of parameters, and of runs of the grid.
 MOST_PARAMETERS, MOST_RUNS = 4, 2000
-#: Sweeps of alternating least squares for a term, and the change of its size at which they end.
+#: Maximum number of sweeps of alternating least squares for a term, and the relative change at which they end.
 SWEEPS, SETTLED = 50, 1e-6
 
 
@@ -38,8 +38,10 @@ class SeparatedModel:
     fields: jax.Array = param("m", "w (M, V, 3)")
     functions: tuple[jax.Array, ...] = param("1", "of each parameter: coefficients of Chebyshev polynomials (M, k)")
     ranges: jax.Array = param("1", "lowest and highest value of each parameter (n, 2)")
-    left_out: jax.Array = param("1", "part of the grid's displacements that the terms miss, root of mean squares")
-    error: jax.Array = param("1", "at runs between the grid's (c,): farthest node over the largest displacement there")
+    left_out: jax.Array = param(
+        "1", "fraction of the grid's displacements that the terms leave out, root of mean squares"
+    )
+    error: jax.Array = param("1", "at other runs (c,): maximum distance of a node over the largest displacement")
     names: tuple[str, ...] = static(default=(), about="dotted names of the parameters")
 
 
@@ -51,15 +53,15 @@ def separate(
     most_terms: int = 50,
     checks: int = 8,
 ) -> SeparatedModel:
-    """The separated form of a static scene's displacement, and its error at runs that it was not made from.
+    """The separated form of a static scene's displacement, and its error at other runs.
 
     Args:
-        scene: `Scene` without time; its last load step is the answer.
-        ranges: dotted names, as in `with_parameters`, of one to four single numbers -> lowest and highest value.
-        points: of the grid along each parameter: points ** n full runs.
-        tolerance: part of the grid's displacements that the terms may leave out.
-        most_terms: the most terms.
-        checks: runs at random parameters, seed 0, from which the error follows.
+        scene: `Scene` without time. The displacement is the one of its last load step.
+        ranges: dotted names (as in `with_parameters`) of one to four single numbers -> lowest and highest value.
+        points: number of grid points along each parameter; there are points ** n full runs.
+        tolerance: fraction of the grid's displacements that the terms may leave out.
+        most_terms: maximum number of terms.
+        checks: number of runs at random parameters (seed 0) that give the error.
 
     Raises:
         InputError: a scene with time, unusable ranges, too many runs, a run that did not converge.
@@ -91,9 +93,9 @@ def separate(
 
 
 def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> jax.Array:
-    """Displacements (V, 3) [m] at a value of each parameter; may be differentiated, vmapped and jitted.
+    """Displacements (V, 3) [m] at one value of each parameter; may be differentiated, vmapped and jitted.
 
-    A traced value outside of the model's range gives NaN, and so does its derivative.
+    If a traced value is outside of the model's range, the displacements and their derivatives are NaN.
 
     Raises:
         InputError: a parameter without a value, a value without a parameter, or a value outside of the model's range.
@@ -109,14 +111,14 @@ def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> 
                 f"{name} = {float(value):g} is outside of {float(low):g} to {float(high):g}: make the model with a "
                 "wider range"
             )
-        # Polynomials grow fast outside: both the answer and its derivative must not be taken for one.
+        # Outside of the range polynomials grow fast, so that neither value nor derivative would be correct there.
         value = value * jnp.where((low <= value) & (value <= high), 1.0, jnp.nan)
         product = product * (function @ _chebyshev(2 * (value - low) / (high - low) - 1, function.shape[1]))
     return jnp.tensordot(product, model.fields, axes=1)
 
 
 def _chebyshev(t: jax.Array, number: int) -> jax.Array:
-    """The first polynomials at t: (number,)."""
+    """The first Chebyshev polynomials at t: (number,)."""
     out = [jnp.ones_like(t), t]
     for _ in range(number - 2):
         out.append(2 * t * out[-1] - out[-2])
@@ -168,14 +170,14 @@ def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np
 def _terms(
     known: np.ndarray, shape: tuple[int, ...], tolerance: float, most: int
 ) -> tuple[np.ndarray, list[np.ndarray], float]:
-    """Products of the terms at the grid (N, M), their factors, each (M, points), and the part left out.
+    """Products of the terms at the grid (N, M), their factors, each (M, points), and the fraction that is left out.
 
     Args:
         known: displacements at the grid (N, 3 V), times the roots of the volumes.
-        shape: of the grid.
-        tolerance, most: as in `separate`.
+        shape: shape of the grid.
+        tolerance, most: as `tolerance` and `most_terms` in `separate`.
     """
-    # Use coordinates in the space of the runs: as many numbers as there are runs.
+    # Coordinates in the space that the runs span: at most one number for each run.
     U, S, _ = np.linalg.svd(known, full_matrices=False)
     data = U * S
     size, left = np.linalg.norm(data), data
@@ -194,9 +196,9 @@ def _terms(
 
 
 def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
-    """Unit factors of the product that is nearest to a tensor, for all axes except the last."""
+    """Unit factors of the product that is closest to a tensor, for all axes except the last."""
     n = tensor.ndim
-    # Begins with the largest singular vectors of each axis.
+    # The iteration begins with the first singular vector of each axis.
     factors = [np.linalg.svd(np.moveaxis(tensor, a, 0).reshape(tensor.shape[a], -1))[0][:, 0] for a in range(n - 1)]
     last, size = tensor.shape[-1], 0.0
     w = np.zeros(last)
@@ -214,7 +216,7 @@ def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
 
 
 def _against(tensor: np.ndarray, factors: list[np.ndarray | None]) -> np.ndarray:
-    """The tensor contracted with all factors; an axis without a factor stays."""
+    """The tensor contracted with all factors. Axes without a factor are kept."""
     out = tensor
     for a in reversed(range(tensor.ndim)):
         f = factors[a]

@@ -1,7 +1,7 @@
-"""A step of a reduced model: its equations with stresses at the sampled points alone, and their solution.
+"""A step of a reduced model: equations with stresses only at the sampled points, and their solution.
 
-Newton's method keeps an inverse from step to step and corrects it with the forces that it sees. The tangent is computed
-anew only if the iterations gain little.
+Newton's method keeps an inverse from step to step and updates it with the changes of the forces (a quasi-Newton
+method). A new tangent is computed only if the residual decreases too little.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ class ReducedMotion(NamedTuple):
     velocity: jax.Array  # [m/s]
     acceleration: jax.Array  # [m/s^2]
     change: jax.Array  # of the acceleration in the last step [m/s^2]
-    steady: jax.Array  # that change is nearer to the change before it than to zero
+    steady: jax.Array  # whether this change is closer to the previous change than to 0
 
 
 class ReducedEquations(NamedTuple):
@@ -53,8 +53,8 @@ class ReducedEquations(NamedTuple):
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
-    spread: jax.Array | None  # sizes of the slopes (9, S, n) [1/m] if motion is prescribed
-    noise: jax.Array  # size of forces [N] whose roundoff equals the tolerance; without loads the only scale
+    spread: jax.Array | None  # absolute values of the slopes (9, S, n) [1/m] if motion is prescribed
+    noise: jax.Array  # size of forces [N] with roundoff equal to the tolerance; the only scale without loads
     fluid: Flowing | None  # of a porous scene
     light: SinglePrecision
     steepest: jax.Array  # root of the sum of squares of all slopes [1/m]
@@ -80,12 +80,15 @@ def gradients_at(e: ReducedEquations, q: jax.Array) -> jax.Array:
 
 
 def _stresses(solid: Solid, F: jax.Array) -> jax.Array:
-    """First Piola-Kirchhoff stress (9, S) of deformation gradients (9, S)."""
+    """First Piola-Kirchhoff stress (9, S) at deformation gradients (9, S)."""
     return jnp.stack([jnp.broadcast_to(entry, F.shape[1:]) for row in solid.stress(as_matrix(F)) for entry in row])
 
 
 def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
-    """As `liverjax.simulation.equations.Equations.noise`: roundoff of a stretch along x, over the tolerance [N]."""
+    """Roundoff of the forces of a stretch along x, over the tolerance [N].
+
+    It corresponds to `liverjax.simulation.equations.Equations.noise`.
+    """
     own = solid_at_points(model, replace(scene, viscosity=None))
     assert isinstance(own, Elasticity)
     rest = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)).astype(model.slopes.dtype)
@@ -95,7 +98,7 @@ def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _residual(e: ReducedEquations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces (n,) and the size of all forces, with the deformation gradients F (9, S) of q."""
+    """Out-of-balance forces (n,) and the size of all forces, at q and its deformation gradients F (9, S)."""
     P = _point_forces(e, F)
     return _unbalanced(e, q, P, _added_up(e, P))
 
@@ -118,7 +121,7 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
     """Out-of-balance forces (n,) and the size of all forces, from the points' forces (9, S) and their sum (n,)."""
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:
-        # Without loads the forces of the points cancel at the solution: their sizes are the forces at work.
+        # Without loads the forces of the points cancel at the solution: the sum of their sizes is then the scale.
         size = size + jnp.linalg.norm(jnp.tensordot(jnp.abs(P), e.spread, axes=2))
     if e.springs is not None:
         pull = e.springs @ q
@@ -130,7 +133,7 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
 
 
 def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
-    """Derivative of the residual: the elements' own blocks, with the axes for shape vectors."""
+    """Derivative of the residual, from the blocks of elements with the axes as shape vectors."""
     F = gradients_at(e, q)
     blocks = e.acting.blocks(as_matrix(F), list(IDENTITY), _PAIRS)
     if e.fluid is not None:
@@ -153,7 +156,7 @@ def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
 
 
 class _Found(NamedTuple):
-    """The end of a step, and the inverse that the next step begins with."""
+    """The end of a step, and the inverse with which the next step begins."""
 
     q: jax.Array
     residual: jax.Array
@@ -169,26 +172,27 @@ class _ReducedIterate(NamedTuple):
     P: jax.Array  # forces of the points (9, S)
     internal: jax.Array  # their sum on the modes (n,)
     r: jax.Array
-    size: jax.Array  # of r, relative to the forces at work
-    rounded: jax.Array  # the part of `size` that single precision may have changed since it was exact
-    inverse: jax.Array  # of the tangent, or near it (n, n) [m/N]
-    fresh: jax.Array  # the inverse is that of the tangent at q
-    slow: jax.Array  # the last iteration gained little
+    size: jax.Array  # norm of r, relative to the size of all forces
+    rounded: jax.Array  # bound on the error of `size` by single precision
+    inverse: jax.Array  # of the tangent, exact or approximate (n, n) [m/N]
+    fresh: jax.Array  # the inverse is the inverse of the tangent at q
+    slow: jax.Array  # the last iteration reduced the residual too little
     iterations: jax.Array
     tangents: jax.Array
 
 
-#: If an iteration leaves more than this part of the residual, a new tangent is made, at the cost of ten iterations.
+#: If an iteration leaves more than this fraction of the residual, a new tangent is made. It costs ten iterations.
 _LITTLE_GAIN = 0.95
-#: Part of the tolerance that single precision may have rounded away before forces are added up anew.
+#: If the error by single precision exceeds this fraction of the tolerance, forces are computed again in double
+#: precision.
 _DOUBT = 0.1
 
 
 def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Array:
-    """The inverse that fits the change of the forces along the last motion; it stays symmetric, and positive if it was.
+    """The inverse, updated to the change of the forces along the last motion. It stays symmetric and positive.
 
-    Broyden, Fletcher, Goldfarb, Shanno (1970). If forces fall along the motion, no positive inverse fits: the old one
-    is kept.
+    This is the update of Broyden, Fletcher, Goldfarb and Shanno (1970). If the forces decrease along the motion, no
+    positive inverse fits, and the old one is kept.
     """
     work, towards = moved @ change, inverse @ change
     seen = work > 1e-8 * jnp.linalg.norm(moved) * jnp.linalg.norm(change)
@@ -198,7 +202,7 @@ def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Arr
 
 
 def _in_double_precision(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
-    """The iterate with forces from its coordinates and gradients, in double precision."""
+    """The iterate with forces computed from its coordinates and gradients in double precision."""
     P = _point_forces(e, at.F)
     internal = _added_up(e, P)
     r, size = _relative_residual(e, at.q, P, internal)
@@ -217,13 +221,13 @@ def _upright(F: jax.Array) -> jax.Array:
 
 
 def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
-    """One iteration with the inverse at hand, which is then updated with the new forces.
+    """One iteration with the present inverse, which is then updated with the new forces.
 
-    Changes of gradients and forces are small: single precision gives their digits, in half the time.
+    Changes of gradients and forces are small, so single precision is enough for them. It takes half the time.
     """
     dq = at.inverse @ at.r
     dF = (e.light.slopes @ dq.astype(jnp.float32)).astype(dq.dtype)
-    # Halved until no sampled point is inverted, six times at most.
+    # The step is halved until no sampled point is inverted, at most six times.
     part = jax.lax.while_loop(
         lambda part: (part > 0.02) & ~_upright(at.F - part * dF), lambda part: 0.5 * part, jnp.ones((), dq.dtype)
     )
@@ -233,11 +237,11 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
     more = jnp.tensordot(change.astype(jnp.float32), e.light.slopes, axes=2).astype(dq.dtype)
     internal = at.internal + more
     r, size = _relative_residual(e, q, P, internal)
-    # A bound on the roundoff of the products in r, over the forces at work.
+    # A bound on the roundoff of the products in r, relative to the size of all forces.
     lost = float(jnp.finfo(jnp.float32).eps) * e.steepest * jnp.linalg.norm(change) * size
     rounded = at.rounded + lost / jnp.maximum(jnp.linalg.norm(r), jnp.finfo(r.dtype).tiny)
     inverse = _updated(at.inverse, -part * dq, r - at.r)
-    # An old inverse may lead astray: such a step is not taken.
+    # With an old inverse |r| may grow: then the step is not taken.
     before, after = jnp.linalg.norm(at.r), jnp.linalg.norm(r)
     good = at.fresh | (after < before)
     no = jnp.array(False)
@@ -248,9 +252,9 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, inverse: jax.Array) -> _Found:
-    """The coordinates at the end of a step, from the inverse of the step before (zeros: none yet).
+    """The coordinates at the end of a step. `inverse` is the one of the previous step; zeros: there is none yet.
 
-    Derivatives are those of the solution.
+    The derivatives are the derivatives of the solution.
     """
     arrays, tree = jax.tree.flatten((e, tolerance, inverse))
 
@@ -262,9 +266,10 @@ def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, i
 
 
 def _lane_by_lane(function: Callable) -> Callable:
-    """The function of arrays, with lanes of vmap one by one: on a CPU all of them would wait for the slowest, and for
-    the tangent that any one needs. It replaces `jax.custom_batching.sequential_vmap`, which fails in second
-    derivatives.
+    """The function of arrays, for which vmap runs its lanes one after another.
+
+    On a CPU all lanes would otherwise wait for the slowest lane, and for every new tangent of any lane. This replaces
+    `jax.custom_batching.sequential_vmap`, which fails in second derivatives.
     """
     own = jax.custom_batching.custom_vmap(function)
 
@@ -283,7 +288,7 @@ def _lane_by_lane(function: Callable) -> Callable:
 
 
 def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, inverse: jax.Array) -> _Found:
-    """Newton's method with an inverse that is kept; the tangent is made anew only if the iterations gain little."""
+    """Newton's method with a kept inverse. A new tangent is made only if iterations reduce the residual too little."""
     e = e._replace(newmark=newmark)
 
     def unfinished(at: _ReducedIterate) -> jax.Array:
@@ -306,8 +311,8 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
 
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
-        # A parabola or a cubic through the last coordinates: the one that would have predicted the step before better.
-        # Accelerations of Newmark's method oscillate: they predict nothing.
+        # A parabola or a cubic through the last coordinates: whichever would have predicted the last step better.
+        # Accelerations of Newmark's method oscillate, so they are not used for a prediction.
         more = jnp.where(e.motion.steady, e.motion.change, 0.0)
         start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = gradients_at(e, start), jnp.zeros((), jnp.int32)
@@ -318,11 +323,11 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     begin = _ReducedIterate(start, F, F, e.q, e.q, zero, zero, inverse, no, no, none, none)
     begin = _in_double_precision(e, begin)
     at = inner(begin)
-    # If the old inverse does not lead to the end, the step begins again.
+    # If the iterations with the old inverse do not converge, the step begins again.
     begin = begin._replace(iterations=at.iterations)
     at = jax.tree.map(lambda old, new: jnp.where(at.size > tolerance, new, old), at, begin)
     at = jax.lax.while_loop(unfinished, lambda at: inner(refreshed(at)), at)
-    # One more correction needs no new forces.
+    # The last correction needs no new forces.
     return _Found(at.q - at.inverse @ at.r, at.size, at.iterations, at.inverse)
 
 
@@ -332,7 +337,7 @@ def _derivative_of_end(newmark: bool, most: int, primals: tuple, tangents: tuple
     found = step_end(newmark, most, *primals)
     without = e._replace(newmark=None)
 
-    # Only by the numbers that are differentiated: derivatives by the slopes would take longer than all others.
+    # Only with respect to differentiated numbers: derivatives with respect to the slopes would take most of the time.
     numbers, tree = jax.tree.flatten(without)
     changes = jax.tree.leaves(de)
     live = [k for k, change in enumerate(changes) if not isinstance(change, SymbolicZero)]

@@ -1,9 +1,9 @@
-"""The tangent of a reduced step: products with it, and a near inverse that takes half the time.
+"""The tangent of a reduced step: products with it, and an approximate inverse that takes half the time.
 
-The tangent is K = sum_p B_p^T A_p B_p + R, with slopes B_p of the modes and moduli A_p at the points p. To assemble K
-takes as long as ten products with it, and half of that in single precision. The inverse of the single-precision matrix
-is nearly that of K: it serves Newton's method, and exact solves by a few corrections x + N (b - K x), with products in
-double precision (iterative refinement: Wilkinson 1963).
+The tangent is K = sum_p B_p^T A_p B_p + R, with slopes B_p of the modes and moduli A_p at the points p. The assembly of
+K takes as long as ten products with K, and half of this time in single precision. The inverse N of the single-precision
+matrix is close to the inverse of K. Newton's method uses N. Accurate solves use N in a few corrections x + N (b - K x),
+with products in double precision (iterative refinement: Wilkinson 1963).
 """
 
 from typing import NamedTuple
@@ -11,14 +11,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-#: Part of the right-hand side that a solve leaves out, and the most corrections.
+#: Relative residual of a solve, and maximum number of corrections.
 LEFT, CORRECTIONS = 1e-12, 20
-#: A solve whose corrections leave more than this part makes the matrix in double precision.
+#: If the relative residual after the corrections is above this, the matrix is made in double precision.
 TOO_FAR = 1e-10
 
 
 class SinglePrecision(NamedTuple):
-    """The slopes, twice: a product of matrices is faster by a third if neither is transposed."""
+    """The slopes in two layouts: a product of matrices is faster by a third if no matrix is transposed."""
 
     slopes: jax.Array  # (9, S, n) [1/m]
     flat: jax.Array  # (n, 9 S)
@@ -51,7 +51,7 @@ def tangent_matrix(K: ReducedTangent) -> jax.Array:
 
 
 def near_inverse(K: ReducedTangent, light: SinglePrecision) -> jax.Array:
-    """The inverse of K (n, n) [m/N], with roundoff of single precision in K."""
+    """Approximate inverse of K (n, n) [m/N]: the roundoff in K is that of single precision."""
     AB = jnp.sum(K.moduli.astype(jnp.float32)[..., None] * light.slopes[None], axis=1)
     near = light.flat @ AB.reshape(-1, AB.shape[-1])
     return jnp.linalg.inv(near.astype(K.rest.dtype) + K.rest)
@@ -66,7 +66,7 @@ def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -
         def going(at: tuple) -> jax.Array:
             _, r, before, count = at
             size = jnp.linalg.norm(r)
-            # If r is not halved, only roundoff is left, or the inverse is not near.
+            # If r is not halved, only roundoff is left, or the inverse is not accurate enough.
             return (size > LEFT * limit) & (size < 0.5 * before) & (count < CORRECTIONS)
 
         def corrected(at: tuple) -> tuple:

@@ -1,4 +1,4 @@
-"""Modes from runs of the full model (proper orthogonal decomposition of their displacements), and their choice."""
+"""Modes from runs of the full model (proper orthogonal decomposition of displacements), and choice of the runs."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -20,14 +20,14 @@ from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation.batch import simulate_batch
 from liverjax.tensors.principal_fields import principal_fields
 
-#: Displacements below this part of the body's size count as none.
+#: Displacements below this fraction of the body's size count as 0.
 _ROUNDOFF = 1e-13
-#: A porous scene has at most one mode of pressure for so many modes of motion.
+#: A porous scene has at most one mode of pressure for this number of modes of motion.
 PRESSURES = 2
 
 
 class _Runs(NamedTuple):
-    """Full runs that converged."""
+    """The full runs that converged."""
 
     values: dict[str, np.ndarray]  # the numbers of their rows (R, ...)
     u: np.ndarray  # displacements (R, T, V, 3) [m]
@@ -47,16 +47,16 @@ def reduce_scene(
     Args:
         scene: `Scene`.
         rows: dotted names -> one value per run, as in `simulate_batch`.
-        tolerance: part of the displacements of these runs that the modes may leave out [1], root of mean squares.
-        most_modes: the most modes.
-        point_tolerance: part of the motions by the reduced forces that the sampled points may leave out [1]; default:
-            `tolerance`.
-        runs: number of full runs. The first two thirds are the first rows. The last third are the rows for which a
-            first reduced model states the largest errors, relative to its own displacements. Default: all rows.
+        tolerance: fraction of the displacements of these runs that the modes may leave out [1], root of mean squares.
+        most_modes: maximum number of modes.
+        point_tolerance: fraction of the motions that reduced forces cause that the sampled points may leave out [1];
+            default: `tolerance`.
+        runs: number of full runs. Two thirds of them are the first rows. The others are the rows for which a first
+            reduced model states the largest errors, relative to the displacements. Default: all rows.
 
     Raises:
-        InputError: physics that a reduced model does not have, a tolerance outside of 0 to 1, no row whose run
-            converged, `runs` that does not fit the number of rows, rows of different time steps.
+        InputError: physics that a reduced model does not have, a tolerance outside of 0 to 1, no run converged, `runs`
+            does not fit the number of rows, rows with different time steps.
     """
     refuse_unknown_physics(scene)
     point_tolerance = tolerance if point_tolerance is None else point_tolerance
@@ -98,7 +98,7 @@ def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
     u -= np.asarray(scene.mesh.points)
     u *= np.asarray(mask)
     if np.abs(u).max() <= _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points)):
-        raise InputError("no row moves the body: give rows whose loads or motions are not 0")
+        raise InputError("no row moves the body: give rows with loads or motions that are not 0")
     P = None if result.pressure is None else np.asarray(result.pressure)[good, :, : scene.mesh.number_of_vertices]
     return _Runs(_some(values, good), u, P)
 
@@ -116,7 +116,7 @@ def _model_of(scene: Scene, runs: _Runs, tolerance: float, most_modes: int, poin
 
 
 def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -> tuple[jax.Array, np.ndarray]:
-    """Modes (m, V) of pressures P (R, T, V), at most half as many as `most`, and their coordinates (R, T, m) [Pa]."""
+    """Modes (m, V) of pressures P (R, T, V), at most half of `most`, and their coordinates (R, T, m) [Pa]."""
     volumes = np.asarray(integrals(scene.mesh, jnp.ones_like(scene.mesh.weights)))
     modes = proper_modes(P.reshape(-1, P.shape[-1], 1), volumes, tolerance)[: max(1, most // PRESSURES), :, 0]
     return jnp.asarray(modes), (P * volumes) @ modes.T
@@ -125,7 +125,7 @@ def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -
 def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction | None:
     q, failed = _coordinates_of_rows(model, scene, runs.values)
     moved = np.linalg.norm(runs.u, axis=-1).max(axis=(1, 2))
-    good = ~failed & (moved > 1e-9 * moved.max(initial=0.0))  # a body at rest has moved by roundoff
+    good = ~failed & (moved > 1e-9 * moved.max(initial=0.0))  # the motion of a body at rest is roundoff
     missing = runs.u[good] - np.tensordot(q[good], np.asarray(model.modes), axes=1)
     volumes = np.asarray(nodal_volumes(scene.mesh))
     return learnt_correction(Learnt(q[good], missing, moved[good], volumes, scene.solve.dt))
@@ -134,7 +134,7 @@ def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction |
 def _coordinates_of_rows(
     model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates (R, T, n) [m] of reduced runs of all rows, and which of them failed (R,)."""
+    """Coordinates (R, T, n) [m] of reduced runs of all rows, and which runs failed (R,)."""
 
     def run(model: ReducedModel, values: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
         found = simulate_reduced(model, with_parameters(scene, values))
@@ -146,7 +146,7 @@ def _coordinates_of_rows(
 
 
 def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Size of the correction over the largest displacement; without a correction the largest displacement itself."""
+    """Size of the correction over the largest displacement, or the largest displacement if there is no correction."""
     q, failed = _coordinates_of_rows(model, scene, values)
     found = np.zeros(len(q))
     for k, own in enumerate(q):
@@ -156,11 +156,11 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
             continue
         off = np.linalg.norm(np.asarray(correction_at(model.correction, jnp.asarray(own), scene.solve.dt)), axis=-1)
         found[k] = off.max() / max(u, 1e-300)
-    # A run that fails states no error; the full run would most likely fail too.
+    # A failed run gives no error; the full run would probably fail, too.
     return np.where(failed, -1.0, found)
 
 
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Modes (n, V, c) that leave out at most `tolerance` of fields u (N, V, c), in the norm of lumped volumes (V,)."""
+    """Modes (n, V, c) that leave out at most the fraction `tolerance` of fields u (N, V, c); `volumes` are weights."""
     modes = principal_fields((u * np.sqrt(volumes)[:, None]).reshape(len(u), -1), tolerance)
     return modes.reshape(-1, *u.shape[1:]) / np.sqrt(volumes)[:, None]

@@ -1,6 +1,6 @@
-"""Numbers of regions as arrays: one number per element, if a region of the body has its own.
+"""Parameters of regions as arrays: a parameter that a region changes gets one value per element.
 
-A law of another kind is computed for the elements of its region alone.
+If a region has a law of another kind, this law is computed only for the elements of the region.
 """
 
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from liverjax.tensors.subsets import subsets
 
 
 def by_element(scene: Scene) -> Scene:
-    """The scene without regions: numbers of law, viscosity and porosity that a region changes become arrays."""
+    """The scene without regions: parameters of law, viscosity and porosity that a region changes become arrays."""
     mesh, law, prony, sponge = scene.mesh, scene.law, scene.viscosity, scene.porosity
     if scene.region:
         law = law_of_elements(law, scene.region, mesh.number_of_elements)
@@ -30,9 +30,9 @@ def by_element(scene: Scene) -> Scene:
 
 
 def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Law:
-    """The law of the scene with the numbers and laws of its regions.
+    """The law of the scene with the parameters and laws of its regions.
 
-    A number has one value per element (E,) if a region changes it. If a region has a law of its own, the result is a
+    A parameter has one value per element (E,) if a region changes it. If a region has a complete law, the result is a
     `ByRegion` of all laws.
 
     Raises:
@@ -51,7 +51,7 @@ def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: i
 
 
 def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_elements: int) -> Prony:
-    """The series; numbers that a region changes have one value per mode and element, (N, E)."""
+    """The series. If a region changes a parameter, ratios and times have one value per mode and element, (N, E)."""
     found: Content = {}
     for name in VISCOUS:
         own = {
@@ -73,7 +73,7 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
 
 
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
-    """The porosity; numbers that a region changes have one value per element, (E,), or (1, E) if quadratic."""
+    """The porosity. Parameters that a region changes have one value per element: (E,), or (1, E) if quadratic."""
     found: Content = {}
     for region in regions:
         for name, value in (region.porosity or {}).items():
@@ -84,5 +84,5 @@ def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: 
 
 
 def sponge_at_points(porosity: Porosity, mesh: TetMesh) -> Porosity:
-    """The porosity; its numbers by element get the axes that arrays over the points have."""
+    """The porosity. Its parameters by element get the axes of arrays over the integration points."""
     return replace(porosity, **mesh.at_points({name: getattr(porosity, name) for name in POROUS}))

@@ -1,6 +1,7 @@
-"""The same scene in the next richer space of functions: quadratic elements for linear ones, cubic for quadratic ones.
+"""The same scene in the next richer space of functions: quadratic instead of linear elements, cubic instead of
+quadratic.
 
-Supports, motions and loads stay the same. Positions and numbers of a new node follow from the nodes around it.
+Supports, motions and loads stay the same. The position and the values of a new node follow from the nodes around it.
 """
 
 import jax
@@ -41,7 +42,7 @@ def _quadratic_mesh(scene: Scene) -> Scene:
 
 
 def _between(mesh: TetMesh, moved: Displaced, nodes: Indices) -> Displaced:
-    """The motion with the middles of edges moved by the mean of their ends."""
+    """The motion with new nodes: a middle of an edge moves by the mean motion of the two ends."""
     if moved.by is None or np.ndim(moved.by) == 1:
         return replace(moved, nodes=nodes)
     by = jnp.zeros((mesh.number_of_vertices, 3), mesh.points.dtype).at[moved.nodes].set(moved.by)
@@ -54,7 +55,7 @@ def _cubic(scene: Scene) -> Scene:
     def more(nodes: Indices) -> jax.Array:
         return node_numbers(promotion.with_functions(mesh, np.asarray(nodes)))
 
-    # The unknowns of the new functions are not positions: in a prescribed motion they stay 0.
+    # The unknowns of the new functions are not positions: where a motion is prescribed, they are fixed at 0.
     still = tuple(Fixed(nodes=more(d.nodes)[len(np.asarray(d.nodes)) :], axes=d.axes) for d in scene.displaced)
     body = scene.body
     if body is not None and jnp.ndim(body.density):
@@ -70,7 +71,7 @@ def _cubic(scene: Scene) -> Scene:
 
 
 def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Density of all functions: a new one has the mean of the elements around it."""
+    """Density of all functions. A new function has the mean density of the elements around it."""
     nodes = jnp.stack(mesh.element_nodes)
     own = jnp.broadcast_to(jnp.mean(density[mesh.tetrahedra], axis=1), nodes.shape)
     total, count = (jnp.zeros(mesh.number_of_nodes).at[nodes].add(each) for each in (own, 1.0))
@@ -78,7 +79,7 @@ def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _with_faces(mesh: TetMesh, load: Traction) -> Traction:
-    """The load, whose triangles also have the number of their face: its function gets a part of the load."""
+    """The load with the number of the face added to each triangle: the function of the face gets a part of the load."""
     triangles = np.asarray(load.triangles)
     faces = promotion.face_numbers(mesh, triangles)
     return replace(load, triangles=node_numbers(np.column_stack([triangles, faces])))

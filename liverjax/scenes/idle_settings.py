@@ -1,9 +1,9 @@
-"""Settings of a scene file that would change nothing, each is refused in one sentence, so that none is ignored."""
+"""Refuse settings of a scene file that would change nothing, so that no setting is silently ignored."""
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Keys of [mesh] that all meshes read; further keys of each kind of mesh.
+#: Keys of [mesh] that are valid for all meshes; then the further keys of each kind of mesh.
 _EVERY_MESH = ("unit", "order", "is")
 _MESHES = {
     "file": ("file",),
@@ -13,7 +13,7 @@ _MESHES = {
 
 
 def refuse_idle(content: Content) -> None:
-    """Refuse settings without effect in the content of a scene file whose values have been read.
+    """Refuse settings without effect in the content of a scene file. The values must have been checked before.
 
     Raises:
         InputError: a key that this mesh, this kind of motion or this run does not use.

@@ -1,4 +1,4 @@
-"""Parts of a body with other numbers in its law, viscosity or porosity, or with a law of another kind."""
+"""Parts of a body with other parameters of law, viscosity or porosity, or with a law of another kind."""
 
 import warnings
 from collections.abc import Mapping
@@ -14,18 +14,18 @@ from liverjax.laws import Law
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import boundary
 
-#: Numbers that may differ in a region's viscosity, and in its porosity.
+#: Parameters of the viscosity, and of the porosity, that may differ in a region.
 VISCOUS = ("ratios", "relaxation_times")
 POROUS = ("bulk", "limit_bulk", "fluid_fraction", "permeability")
 
 
 @struct
 class Region:
-    """Elements with other numbers than the scene, or with another law. Where two regions meet, the later one counts."""
+    """Elements with other parameters than the scene or with another law. If regions overlap, the later one counts."""
 
     elements: Indices = param("1", "element numbers (n,)")
     law: Content | Law | None = param(
-        "1", "names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or a law of its own", default=None
+        "1", "names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or another law", default=None
     )
     viscosity: Mapping[str, Numbers] | None = param("1", "`ratios` or `relaxation_times` or both -> (N,)", default=None)
     porosity: Mapping[str, Numbers] | None = param(
@@ -34,10 +34,10 @@ class Region:
 
 
 def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | None, name: str = "region") -> np.ndarray:
-    """Numbers of the elements of a set, or of those whose four nodes satisfy `where` (see `boundary.select`).
+    """Element numbers of a set, or of the elements whose four vertices satisfy `where` (see `boundary.select`).
 
     Raises:
-        InputError: both or neither given, a set that the mesh does not have, no element found.
+        InputError: `where` and `set` are both given or both missing, the mesh has no such set, no element is found.
     """
     if set is not None and where is None:
         if as_word(set, f"{name}: set") not in mesh.element_sets:
@@ -55,12 +55,12 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
     return inside
 
 
-#: Distance of a bound from the elements of its region, over the region's width, that is told.
+#: A warning is given if a bound is farther from the elements of its region than this fraction of the region's width.
 _APART = 0.02
 
 
 def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, float], name: str) -> None:
-    """Warn of each bound that goes through elements: they are left out whole, so the region is smaller than stated."""
+    """Warn if a bound cuts elements: a cut element is left out, so the region is smaller than stated."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     size = np.ptp(points, axis=0).max()
     inside = {
@@ -83,20 +83,20 @@ def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, 
 
 
 def laws_of(law: Law, regions: tuple[Region, ...]) -> tuple[Law, ...]:
-    """The law of a scene, and the laws that regions have in its place."""
+    """The law of a scene, and the laws that replace it in regions."""
     return (*law.pieces(), *(region.law for region in regions if isinstance(region.law, Law)))
 
 
 def changed_numbers(region: Region) -> dict[str, object]:
-    """Name -> value of the numbers of the scene's law that a region changes."""
+    """Name -> value of the parameters of the scene's law that a region changes."""
     return region.law if isinstance(region.law, dict) else {}
 
 
 def law_number(law: Law, name: str) -> jax.Array:
-    """The number of a law that a region changes.
+    """The value in the law of a parameter that a region changes.
 
     Raises:
-        InputError: a name that the law does not have, or a list of numbers.
+        InputError: a name that the law does not have, or the name of a list of parameters.
     """
     value = names.get(law, name, refused_name(name))
     if isinstance(value, tuple):
@@ -105,5 +105,5 @@ def law_number(law: Law, name: str) -> jax.Array:
 
 
 def refused_name(name: str) -> str:
-    """The beginning of a refusal if the law has no such number."""
+    """The beginning of the message if the law has no such parameter."""
     return f"region: the law has no number {name!r}"

@@ -23,7 +23,7 @@ from liverjax.scenes.springpots import SpringpotSeries
 
 @struct
 class Body:
-    """Mass and weight. A lumped node has its density times a quarter of every linear element around it."""
+    """Mass and weight. A node's lumped mass is its density times a quarter of the volumes of its linear elements."""
 
     density: Number = param("kg/m^3", "per reference volume; one, or one per node (V,)", above=0.0, typical=1060.0)
     gravity: Numbers = param("m/s^2", "acceleration (3,)", default=(0.0, 0.0, 0.0))
@@ -34,12 +34,17 @@ class Body:
 
 @struct
 class Solve:
-    """How the scene is solved. Time step, tolerances and frequencies may change; the rest is fixed when compiled."""
+    """How the scene is solved.
+
+    Time step, tolerances and frequencies are numbers; another choice compiles a new program.
+    """
 
     dt: Any = param("s", "time step; None: load steps without time", above=0.0, default=None)
     kind: str = static(default="static", about="static: no inertia; dynamic; harmonic: waves at `frequencies`")
     steps: int = static(default=1, about="load steps, or time steps of dt", lower=1)
-    tolerance: Any = param("1", "of the residual, relative to the forces at work", above=0.0, upper=0.5, default=1e-8)
+    tolerance: Any = param(
+        "1", "of the residual, relative to the size of all forces", above=0.0, upper=0.5, default=1e-8
+    )
     newton: str = static(
         default="converged",
         about="converged: iterations to the tolerance; one_step: the chapter's linearly implicit scheme, one linear "
@@ -50,9 +55,7 @@ class Solve:
         default="euler", about="dynamic: euler (first order) or newmark (average acceleration, second order)"
     )
     precision: str = static(default="float64", about="float64 or float32")
-    linear_solver: str = static(
-        default="auto", about="cg; direct: factorised on the host; auto: by size and stiffness (`choice`)"
-    )
+    linear_solver: str = static(default="auto", about="cg; direct: factorised on the host; auto: by size and stiffness")
     volumetric: str = static(
         default="element",
         about="element; against locking: mixed (pressures as unknowns) or nodal (averaged at nodes); auto: mixed for "
@@ -70,11 +73,11 @@ class Solve:
 
 @struct
 class Scene:
-    """Input of `simulate`. Parts that a scene lacks are None or empty and cost nothing."""
+    """Input of `simulate`. Missing parts are None or empty; they need no computing time."""
 
     mesh: TetMesh = param("1", "the body")
     law: Law = param("1", "its hyperelastic law")
-    region: tuple[Region, ...] = param("1", "parts of the body with other numbers in the law", default=())
+    region: tuple[Region, ...] = param("1", "parts of the body with other parameters or another law", default=())
     viscosity: Prony | None = param("1", "Prony series", default=None)
     springpots: SpringpotSeries | None = param("1", "fractional model, for harmonic motion only", default=None)
     porosity: Porosity | None = param("1", "sponge and fluid", default=None)
@@ -84,21 +87,21 @@ class Scene:
     traction: tuple[Traction, ...] = param("1", "loads", default=())
     physics: tuple[Physics, ...] = unnamed("further physics: supports, …", places="named", default=())
     solve: Solve = param("1", "how it is solved", default=Solve())
-    points_are: str = static(default="reference", about="the mesh's points: reference; or loaded, under the loads")
+    points_are: str = static(default="reference", about="the mesh's points are reference, or loaded: under the loads")
 
     def named(self, section: str) -> list[int]:
-        """Places in `physics` of the physics that scene files write as [[section]]."""
+        """Indices in `physics` of the physics that scene files write as [[section]]."""
         return [k for k, physics in enumerate(self.physics) if physics.section == section]
 
 
 def named_physics(scene: Scene) -> list[tuple[str, Physics]]:
-    """Every further physics with the name that scene files give it: support.0."""
+    """Every further physics with its name in scene files, for example support.0."""
     places = {k: f"{p.section}.{n}" for p in scene.physics for n, k in enumerate(scene.named(p.section))}
     return [(places[k], physics) for k, physics in enumerate(scene.physics)]
 
 
 def histories(scene: Scene) -> dict[str, object]:
-    """Every load, motion, inlet and further physics that has a history, by its name."""
+    """Name -> load, motion, inlet or further physics, for all parts with a history."""
     inlets = () if scene.porosity is None else scene.porosity.inlet
     parts: dict[str, object] = {"body": scene.body}
     for key, several in (("displaced", scene.displaced), ("traction", scene.traction), ("porosity.inlet", inlets)):
@@ -108,13 +111,13 @@ def histories(scene: Scene) -> dict[str, object]:
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
-    """The scene with numbers changed; values may be traced.
+    """The scene with changed numbers. The values may be traced.
 
     Args:
         scene: `Scene`.
         values: dotted names as in the scene file -> values: ``law.mu`` (``law.1.mu`` of several laws),
             ``viscosity.relaxation_times``, ``viscosity.ratios.0``, ``body.density``, ``displaced.0.by``, ``solve.dt``,
-            ``mesh.points``, ``region.0.law.mu``; a number of a law may have one value per element (E,).
+            ``mesh.points``, ``region.0.law.mu``. A parameter of a law may have one value per element (E,).
 
     Raises:
         InputError: a name that the scene does not have.
@@ -134,15 +137,15 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
 
 
 def numbers_at(scene: Scene, name: str) -> Any:
-    """The number, or numbers, of a scene at a dotted name.
+    """The value of a scene at a dotted name: one number or an array.
 
     Raises:
-        InputError: a name that the scene does not have, or the name of something else than floating-point numbers.
+        InputError: a name that the scene does not have, or a name whose value is not floating-point.
     """
     if name.startswith("mesh.") and not name.startswith("mesh.points"):
         raise InputError(f"{_refusal(name)}: of a mesh only all points can change, mesh.points")
     found = names.get(scene, name, _refusal(name))
-    # Whole numbers are allowed where a user wrote one (`mu = 770`); an array of them names places in the mesh.
+    # A single whole number is allowed (`mu = 770`). An array of whole numbers contains node or element numbers.
     if not all(isinstance(v, int) or np.issubdtype(np.asarray(v).dtype, np.floating) for v in jax.tree.leaves(found)):
         raise InputError(f"{_refusal(name)}: use one like law.mu")
     return found if isinstance(found, tuple) else jnp.asarray(found, float)

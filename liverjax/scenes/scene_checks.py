@@ -1,4 +1,4 @@
-"""Checks of a scene before anything is compiled; each refusal is one sentence. The questions are in `checks/`."""
+"""Checks of a scene before anything is compiled. Each error message is one sentence. The checks are in `checks/`."""
 
 import warnings
 from collections.abc import Container
@@ -22,12 +22,12 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def check_before_run(scene: Scene) -> None:
-    """Refuse unknown choices, numbers out of bounds and nodes that are not in the mesh; traced ones pass. Compiles
-    nothing.
+    """Refuse unknown choices, numbers out of bounds and unknown nodes. Traced arrays pass; nothing is compiled.
 
     Raises:
         InputError: as `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume;
-            nodes that are fixed and moved along one axis, held while a plate moves them, or in two oblique planes.
+            nodes that are fixed and moved along the same axis, held although a plate moves them, or in two oblique
+            planes.
     """
     check_choices(scene)
     check_bounds(scene)
@@ -38,7 +38,7 @@ def check_before_run(scene: Scene) -> None:
 
 
 def check_time_and_mass(scene: Scene) -> None:
-    """Refuse a scene that lacks the time step or the mass that it needs; numbers do not matter.
+    """Refuse a scene without a time step or a mass if it needs them. Their values are not checked.
 
     Raises:
         InputError: no `dt` with viscosity, porosity, a history or in dynamics; no mass in dynamics.
@@ -62,11 +62,11 @@ def check_time_and_mass(scene: Scene) -> None:
 
 
 def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
-    """Refuse further physics whose numbers, nodes or places no run can begin with; host side.
+    """Refuse further physics if no run can begin with their numbers, nodes or places; host side.
 
     Args:
         scene: `Scene`.
-        only: names of the physics to check, like ``obstacle.0``; None: all.
+        only: names of the physics to check, for example ``obstacle.0``; None: all.
 
     Raises:
         InputError: one sentence that begins with the name of the physics.

@@ -1,4 +1,4 @@
-"""Scenes from TOML files; every key is known, every number checked."""
+"""Scenes from TOML files. Unknown keys are refused, and every number is checked."""
 
 import dataclasses
 import tomllib
@@ -65,15 +65,16 @@ _KEYS = {
     for section in dict.fromkeys(p.section for p in NAMED)
 }
 _SECTIONS = ("mesh", "law", *list(_KEYS)[1:])
-#: Keys of a place, which say nothing of what acts there.
+#: Keys that describe a place; they do not say what acts there.
 PLACE = {"where", "set"}
 
 
 def load_scene(path: str | Path) -> Scene:
-    """A scene from a TOML file; relative paths in it begin at its folder.
+    """A scene from a TOML file. Relative paths in the file begin at the folder of the file.
 
     Raises:
-        InputError: unreadable file, unknown or missing keys, values that cannot be used, checked before any compile.
+        InputError: unreadable file, unknown or missing keys, values that cannot be used. All checks run before any
+            compilation.
     """
     path = Path(path)
     try:
@@ -123,7 +124,7 @@ def scene_from(content: Content, folder: Path = Path()) -> Scene:
 
 
 def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
-    """The [output] table of a scene file: names of fields, and whether reactions are written as a table.
+    """Names of the fields in [output] of a scene file, and whether the reactions are written as a table.
 
     Raises:
         InputError: unknown keys, or values of a wrong type.
@@ -138,7 +139,10 @@ def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
 
 
 def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
-    """The physics of tables in `liverjax.physics.registry`: for each table the first kind that knows all its keys."""
+    """The physics of the tables whose sections are in `liverjax.physics.registry`.
+
+    Each table becomes the first kind of physics that has all its keys.
+    """
     for section in dict.fromkeys(p.section for p in NAMED):
         for k, table in enumerate(_tables(content, section)):
             name, own = f"{section}.{k}", set(table) - PLACE
@@ -152,14 +156,14 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
 
 
 def _of_two_kinds(name: str, given: set[str], kinds: list[set[str]]) -> str:
-    """A sentence on keys that are known but do not go together."""
+    """A sentence on keys that are known but incompatible."""
     first = min((given - keys for keys in kinds), key=len)
     other = min((given - keys for keys in kinds if first <= keys), key=len, default=given)
     return f"{name} has {', '.join(sorted(first))} together with {', '.join(sorted(other))}: leave one out"
 
 
 def _with_paths(content: object, folder: Path) -> Any:
-    """The content with paths (histories, surfaces, a reduced model) relative to the folder of the scene file."""
+    """The content with `folder` added to all paths: of histories, surfaces and a reduced model."""
     if isinstance(content, list):
         return [_with_paths(value, folder) for value in content]
     if not isinstance(content, dict):
@@ -237,7 +241,7 @@ def _linear_mesh(table: dict, folder: Path) -> TetMesh:
 
 
 def _cylinder(table: dict, scale: float) -> TetMesh:
-    """A cylinder; its optional keys refine it towards its rims and rings."""
+    """A cylinder. With optional keys the mesh is finer near its rims and rings."""
     for key in ("radius", "height", "cell_size"):
         if key not in table:
             raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")
@@ -287,14 +291,14 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
 
 
 def _law_of_region(name: str, given: Any) -> dict[str, object] | Law:
-    """A law of another kind, which has a name, or the numbers that differ."""
+    """A law of another kind if `given` has a name, else the parameters that differ."""
     if isinstance(given, list) or "name" in given:
         return _law(given, f"{name}: law")
     return dict(_dotted(f"{name} law", given))
 
 
 def _dotted(name: str, table: dict) -> list[tuple[str, float]]:
-    """Numbers of nested tables and lists, by dotted names."""
+    """Dotted name and value of each number in nested tables and lists."""
     out = []
     for key, value in table.items():
         if isinstance(value, (dict, list)):
@@ -345,7 +349,7 @@ def _porosity(mesh: TetMesh, table: dict) -> Porosity:
 
 
 def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
-    """A part with a given pressure of the fluid, or a flux through its surface."""
+    """A place with a given pressure of the fluid, or with a given flux through its surface."""
     if not isinstance(table, dict):
         raise InputError(f"{name} must be a table: write [[porosity.inlet]] and its keys below")
     _known(name, table, ("where", "set", "pressure", "flux", "history"))
@@ -362,7 +366,7 @@ def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
 
 
 def _drained(mesh: TetMesh, given: Any) -> jax.Array:
-    """Nodes of one place, or of all places in a list."""
+    """Nodes of one place, or of all places of a list."""
     if given == []:
         raise InputError("porosity.drained = [] names no place: give [{z_max = 0.0}], or leave it out (sealed)")
     name = "porosity.drained"
@@ -387,7 +391,7 @@ def _read_body(table: dict) -> Body:
 
 
 def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, jax.Array]:
-    """Times and numbers of a table's history; empty if it has none."""
+    """Times and values of a table's history; empty if the table has no history."""
     if "history" not in table:
         return {}
     times, numbers = history.read_history(table["history"], name, forms)

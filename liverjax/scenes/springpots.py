@@ -1,12 +1,13 @@
-"""Springpots for harmonic motion: fractional models of soft tissue, relative to the law's stiffness.
+"""Springpots for harmonic motion: fractional models of soft tissue, relative to the stiffness of the law.
 
-A springpot has the complex modulus V (i omega)^alpha, between a spring (alpha = 0) and a dashpot (alpha = 1). With the
-law's stiffness G0,
+A springpot has the complex modulus V (i omega)^alpha. It lies between a spring (alpha = 0) and a dashpot (alpha = 1).
+With the stiffness G0 of the law,
 
-    G* / G0 = spring + sum_k 1 / ((i omega tau_k)^-alpha_k + 1 / limit_k):
+    G* / G0 = spring + sum_k 1 / ((i omega tau_k)^-alpha_k + 1 / limit_k).
 
-with spring 0 and one springpot the springpot alone, with spring 1 the fractional Kelvin-Voigt model, with a limit (a
-spring in series with the springpot) the fractional Zener model (Bagley and Torvik 1983, J. Rheol. 27, 201).
+Special cases with one springpot: spring = 0 gives the springpot alone, and spring = 1 the fractional Kelvin-Voigt
+model. With a limit, which is a spring in series with the springpot, it is the fractional Zener model (Bagley and Torvik
+1983, J. Rheol. 27, 201).
 """
 
 from typing import Any
@@ -24,11 +25,11 @@ from liverjax.physics.viscosity import PARTS, Prony, check_part
 
 @struct
 class SpringpotSeries:
-    """The complex modulus over the law's own; for harmonic motion only."""
+    """The complex modulus divided by the modulus of the law; for harmonic motion only."""
 
     times: Any = param("s", "tau_k (K,): at omega = 1/tau_k a springpot is as stiff as the law", above=0.0)
     exponents: Any = param("1", "alpha_k (K,), 0 a spring, 1 a dashpot", lower=0.0, upper=1.0)
-    limits: Any = param("1", "stiffness over the law's of a spring in series with each (K,)", above=0.0, default=None)
+    limits: Any = param("1", "stiffness of a spring in series with each, over the law's (K,)", above=0.0, default=None)
     spring: Number = param("1", "stiffness at frequency 0, over the law's", lower=0.0, default=1.0)
     part: str = static(default="all", about="all: of the whole stress; isochoric: of its isochoric part", words=PARTS)
 
@@ -37,7 +38,7 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
     """Refuse springpots that give no modulus; host side.
 
     Raises:
-        InputError: lengths that differ, values out of bounds, an unknown part or one that the law does not have, a
+        InputError: lengths that differ, values out of bounds, an unknown part, a part that the law does not have, a
             viscosity in the same scene.
     """
     if viscosity is not None:
@@ -50,14 +51,14 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
 
 
 def series_at_rest(own: SpringpotSeries) -> Prony:
-    """A series whose stress, when it has relaxed, is that of the springpots at rest."""
+    """A Prony series. Its completely relaxed stress is equal to the stress of the springpots at rest."""
     return Prony(ratios=1 - jnp.atleast_1d(own.spring), relaxation_times=jnp.ones(1), part=own.part)
 
 
 def springpot_factors(own: SpringpotSeries, omegas: jax.Array) -> jax.Array:
     """G*/G0 (F,) at angular frequencies (F,) [rad/s]."""
     times, alpha = jnp.atleast_1d(own.times)[:, None], jnp.atleast_1d(own.exponents)[:, None]
-    # (i omega tau)^-alpha, whose phase is a quarter turn per unit of alpha.
+    # (i omega tau)^-alpha has the phase -alpha pi/2.
     compliance = jnp.exp(-alpha * (jnp.log(omegas[None] * times) + 0.5j * jnp.pi))
     if own.limits is not None:
         compliance = compliance + 1 / jnp.atleast_1d(own.limits)[:, None]

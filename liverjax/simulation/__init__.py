@@ -1,4 +1,4 @@
-"""A run of a scene: one step, the whole run, its derivatives, batches."""
+"""Runs of a scene: one step, a whole run, derivatives of a run, and batches of runs."""
 
 from liverjax.simulation.run import Result, prepared, simulate, simulate_part
 

@@ -1,9 +1,11 @@
-"""Which linear solver `linear_solver = "auto"` means: a rule on size and stiffness, measured in `experiments/`.
+"""The linear solver that `linear_solver = "auto"` means: a rule on size and stiffness, measured in `experiments/`.
 
-It means a factorisation for some static bodies of at most 10,000 tetrahedra, if no pressure follows the body and there
-is no friction: their bulk modulus is more than a thousand times the shear modulus (a hundred times if they have at most
-1,500 tetrahedra: there iterations meet negative eigenvalues on their way, and a factorisation goes through them), or
-their worst element is a sliver. For all others it means conjugate gradients.
+It means a factorisation for a static body of at most 10,000 tetrahedra (a quadratic one counts as eight) in two cases.
+In the first case the bulk modulus is more than a thousand times the shear modulus. For at most 1,500 tetrahedra, a
+hundred times is enough: the iterations of such bodies meet negative eigenvalues, and a factorisation can solve with
+them. In the second case the worst element is a sliver. Bodies with friction, with nodes that move together, with a
+pressure that follows the surface, or with pressures as unknowns are never factorised. In all other cases "auto" means
+conjugate gradients.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,12 +20,13 @@ from liverjax.scenes.checks.choices import check_choices
 from liverjax.scenes.scene import Scene, with_parameters
 
 LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
-#: Elements of a small body, and its ratio of bulk to shear modulus from which it is factorised.
+#: Maximum number of elements of a small body. It is factorised if its bulk modulus is more than `STIFFEST_OF_SMALL`
+#: times its shear modulus.
 SMALL, STIFFEST_OF_SMALL = 1500, 1e2
 
 
 def chosen(scene: Scene) -> Scene:
-    """The scene with choices in place of `auto`: form for volumes, then linear solver."""
+    """The scene with a choice in place of each `auto`: first the form for volumes, then the linear solver."""
     solve = _with_form(scene).solve
     if solve.newton_iterations == 1:
         solve = replace(solve, newton="one_step")
@@ -33,13 +36,13 @@ def chosen(scene: Scene) -> Scene:
 
 
 def with_solver(scene: Scene, rows: Iterable[Mapping[str, object]]) -> Scene:
-    """The scene, to be run with the numbers of each row in one program, with the solver that all rows can have.
+    """The scene with one linear solver for all rows: one program runs the scene with the numbers of each row.
 
-    Inside a program numbers are not known. So "direct" is chosen here, if any row needs it; "auto" stays otherwise.
+    Inside a program the numbers are not known. So "direct" is chosen here if any row needs it. Otherwise "auto" stays.
 
     Args:
         scene: `Scene`.
-        rows: dotted names -> numbers, as in `with_parameters`; traced ones are not looked at.
+        rows: dotted names -> numbers, as in `with_parameters`. Traced numbers are ignored.
     """
     direct = replace(scene, solve=replace(scene.solve, linear_solver="direct"))
     if scene.solve.linear_solver != "auto" or not _may_factorise(_with_form(scene)):
@@ -58,12 +61,12 @@ def _with_form(scene: Scene) -> Scene:
 
 
 def linear_solver(scene: Scene) -> str:
-    """The solver for a scene: cg or direct. It is cg if its numbers are traced, since they are not known then."""
+    """The solver for a scene: cg or direct. It is cg if the numbers of the scene are traced and therefore not known."""
     return "direct" if _may_factorise(scene) and (_is_stiff(scene) or _is_thin(scene)) else "cg"
 
 
 def _may_factorise(scene: Scene) -> bool:
-    """Whether size and physics allow a factorisation, whatever the numbers are."""
+    """Whether size and physics allow a factorisation, independently of moduli and shape."""
     solve = scene.solve
     if solve.volumetric == "mixed" or any(physics.ties for physics in scene.physics):
         return False
@@ -74,16 +77,16 @@ def _may_factorise(scene: Scene) -> bool:
 
 
 def _size(scene: Scene) -> int:
-    """Number of elements; a quadratic element has about eight times the unknowns of a linear one."""
+    """Number of elements; a quadratic element counts as eight, since it has about eight times the unknowns."""
     return scene.mesh.number_of_elements * (1 if scene.mesh.order == 1 else 8)
 
 
 def _is_stiff(scene: Scene) -> bool:
-    """Whether the bulk modulus is far above the shear modulus; no if they are traced."""
+    """Whether the bulk modulus is far above the shear modulus. The answer is no if the moduli are traced."""
     try:
         shear = scene.law.shear_modulus()
         bulk = scene.law.bulk_modulus() if scene.porosity is None else scene.porosity.limit_bulk
-    except InputError:  # a law need not state its moduli: how stiff it is in bulk is then not known
+    except InputError:  # a law may have no moduli: then this ratio is unknown
         return False
     if isinstance(shear, jax.core.Tracer) or isinstance(bulk, jax.core.Tracer):
         return False
@@ -92,7 +95,7 @@ def _is_stiff(scene: Scene) -> bool:
 
 
 def _is_thin(scene: Scene) -> bool:
-    """Whether an element is a sliver; no if the points are traced."""
+    """Whether an element is a sliver. The answer is no if the points are traced."""
     points, volumes = scene.mesh.points, scene.mesh.volumes
     if isinstance(points, jax.core.Tracer) or isinstance(volumes, jax.core.Tracer):
         return False
@@ -103,7 +106,7 @@ def _is_thin(scene: Scene) -> bool:
 def form_of_volumes(scene: Scene) -> str:
     """The form for volume changes: mixed for quadratic elements if possible, else element.
 
-    It does not depend on numbers, since a run and its derivatives must have the same form.
+    The choice does not depend on numbers, since a run and its derivatives must use the same form.
     """
     name = scene.solve.volumetric
     if name != "auto":
@@ -123,7 +126,7 @@ def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) ->
 
 
 def qualities(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> np.ndarray:
-    """Quality (E,) of elements: volume over the volume of a regular one with the same mean square edge."""
+    """Quality (E,) of elements: their volume over the volume of a regular element with the same mean square edge."""
     corners = points[tetrahedra]
     edges = np.stack([corners[:, a] - corners[:, b] for a in range(4) for b in range(a)], axis=1)
     length = np.sqrt(np.mean(np.sum(edges**2, axis=2), axis=1))

@@ -1,7 +1,7 @@
-"""Many runs of one scene with other numbers: one compiled program on all devices of the process.
+"""Many runs of one scene, each with other numbers: one compiled program on all devices of the process.
 
-A lane is one run of the batch. On a CPU each device runs one lane after another; a vectorised step is slower there,
-because its loops run until the slowest lane is done. On a GPU each device runs all of its lanes at once.
+A lane is one run of the batch. On a CPU each device runs one lane after another. A vectorised step would be slower
+there, because its loops run until the slowest lane is done. On a GPU each device runs all of its lanes at once.
 """
 
 from typing import Any
@@ -24,11 +24,11 @@ STRATEGIES = ("map", "vmap")
 
 @struct
 class Batch:
-    """Results of N lanes; `result.status` is (N, T). A lane that failed does not change the others."""
+    """Results of N lanes; `result.status` is (N, T). A failed lane does not change the results of the other lanes."""
 
     result: Result = param("1", "every field with a leading axis of N lanes")
     reference: jax.Array | None = param(
-        "m", 'reference shapes (N, V, 3) of a scene whose mesh is "loaded": each lane has its own', default=None
+        "m", 'reference shapes (N, V, 3) of the lanes, if the mesh of the scene is "loaded"', default=None
     )
     strategy: str = static(
         default="map", about="map: one lane after another per device; vmap: all lanes of a device at once"
@@ -44,17 +44,18 @@ def strategy_for(platform: str) -> str:
 def simulate_batch(
     scene: Scene, parameters: dict[str, Any], strategy: str | None = None, devices: list | None = None
 ) -> Batch:
-    """Run a scene once for each lane of its parameters; may be jitted and differentiated.
+    """Run a scene once for each lane of `parameters`. This function may be jitted and differentiated.
 
     Args:
         scene: `Scene`.
-        parameters: dotted names, as in `with_parameters` -> values with a leading axis of N lanes.
-        strategy: "map" or "vmap"; None: by the platform.
+        parameters: dotted names (see `with_parameters`) -> values with a leading axis of N lanes.
+        strategy: "map" or "vmap"; None: `strategy_for` chooses by the platform.
         devices: devices that share the lanes; None: all devices of the process.
 
     Raises:
-        InputError: no parameters, different numbers of lanes, a name that the scene does not have, vmap of robust
-            steps on a processor; as `simulate`, with the number of the lane.
+        InputError: no parameters, different numbers of lanes, a name that the scene does not have, vmap of robust steps
+            on a CPU; or the scene of one lane is refused as in `simulate`: then the message begins with the number of
+            the lane.
     """
     devices = jax.local_devices() if devices is None else devices
     strategy = strategy_for(devices[0].platform) if strategy is None else strategy
@@ -62,7 +63,7 @@ def simulate_batch(
         raise InputError(f"strategy = {strategy!r} is not known: use {' or '.join(STRATEGIES)}")
     if strategy == "vmap" and scene.solve.robust != "off" and devices[0].platform == "cpu":
         raise InputError(
-            f"strategy = 'vmap' with robust = {scene.solve.robust!r} takes minutes to compile on a processor: use "
+            f"strategy = 'vmap' with robust = {scene.solve.robust!r} takes minutes to compile on a CPU: use "
             "strategy = 'map'"
         )
     parameters = {name: jnp.asarray(value, float) for name, value in parameters.items()}
@@ -81,7 +82,7 @@ def simulate_batch(
 
     number = min(len(devices), lanes)
     if number > 1:
-        # The last lane is repeated, so that all devices have equally many lanes.
+        # The last lane is repeated until all devices have the same number of lanes.
         fill = -lanes % number
         parameters = {n: jnp.concatenate([v, jnp.repeat(v[-1:], fill, axis=0)]) for n, v in parameters.items()}
         spread = PartitionSpec("lane")
@@ -107,10 +108,10 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
 
 
 def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[str, np.ndarray]]:
-    """The numbers of each lane, none of which `simulate` refuses; an empty list if they are traced.
+    """The numbers of each lane, after checks; an empty list if they are traced.
 
     Raises:
-        InputError: as `simulate`, with the number of the lane.
+        InputError: `simulate` would refuse a lane. The message begins with the number of this lane.
     """
     if any(isinstance(value, jax.core.Tracer) for value in parameters.values()):
         return []

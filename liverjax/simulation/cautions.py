@@ -1,4 +1,4 @@
-"""Cautions about a run: one sentence each, on the host."""
+"""Cautions about a run, made on the host. Each caution is one sentence."""
 
 from functools import partial
 
@@ -28,20 +28,21 @@ from liverjax.simulation.automatic import qualities
 from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result
 
-#: No organ is longer [m]: numbers in millimetres read as centimetres make a liver of 2 m.
+#: No organ is longer than this [m]. If millimetres are read as centimetres, a liver is 2 m long.
 LONGEST = 1.0
-#: No organ and no sample is shorter [m]: numbers in metres read as millimetres make a liver of 0.2 mm.
+#: No organ and no sample is shorter than this [m]. If metres are read as millimetres, a liver is 0.2 mm long.
 SHORTEST = 1e-3
-#: A displacement below this part of the body's size counts as none.
+#: A displacement smaller than this fraction of the body's size counts as zero.
 _ROUNDOFF = 1e-13
-#: Quality (volume over that of a regular element of the same edges) below which gradients are a hundred times worse.
+#: Elements of a lower quality (see `qualities`) are slivers: their gradients are a hundred times worse.
 SLIVER = 0.01
-#: A soft tissue is about four fifths fluid: below this J its solid alone has no room. MOST_J is the reciprocal.
+#: About four fifths of a soft tissue is fluid. Below `LEAST_J` not even its solid part has room; `MOST_J` is
+#: 1/`LEAST_J`.
 LEAST_J, MOST_J = 0.2, 5.0
 
 
 def cautions_of_run(scene: Scene, result: Result) -> list[str]:
-    """Sentences about the mesh and the volumes of a run; an empty list if all is well.
+    """Sentences about the mesh, the loads, the contacts and the volumes of a run; the list may be empty.
 
     Args:
         scene: `Scene`, not traced.
@@ -65,7 +66,7 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
 
     Args:
         scene: `Scene`, not traced.
-        about: positions (V, 3) [m] about which it moves; None: the reference shape.
+        about: positions (V, 3) [m] about which the body vibrates; None: the reference shape.
     """
     said = [*cautions_of_mesh(scene.mesh), *_of_locking(scene)]
     if scene.body is None:
@@ -77,7 +78,7 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
     for name, physics in named_physics(scene):
         if isinstance(physics, Ligament) and physics.is_straight_without_tension(scene.mesh, x):
             said.append(
-                f"{name} is straight but has no tension: it pulls only, and here it acts as a spring in both directions"
+                f"{name} is straight but has no tension: it pulls only, but here it acts as a spring in both directions"
             )
         if isinstance(physics, Obstacle) and touches_without_pressure(physics, scene.mesh, x):
             said.append(
@@ -89,21 +90,21 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
     return said
 
 
-#: A mesh error below this part of the largest displacement is not worth another mesh.
+#: If the mesh error is below this fraction of the largest displacement, no other mesh is recommended.
 _SMALL = 0.02
 
 
 def mesh_sentence(scene: Scene, result: Result) -> str:
-    """One line on the mesh error of the positions at the last step, with the remedy."""
+    """One line on the mesh error of the positions at the last step, with a remedy if the error is large."""
     assert result.mesh_error is not None
     if np.asarray(result.status)[-1] not in (status.CONVERGED, status.ONE_STEP):
-        return "mesh error: the last step failed, so that there is nothing of which to state it"
+        return "mesh error: the last step failed, so that it is not known"
     u = np.asarray(result.positions[-1]) - np.asarray(scene.mesh.points)
     size = float(np.linalg.norm(u, axis=1).max())
     error = float(np.linalg.norm(np.asarray(result.mesh_error.positions[-1]), axis=1).max())
     nothing = _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points))
     if size <= nothing and error <= nothing and np.all(np.asarray(result.mesh_error.found)):
-        return "mesh error: the body does not move, so there is none"
+        return "mesh error: it is zero, because the body does not move"
     part = (
         f"{100 * error / size:.2g} % of the largest displacement ({size:.3g} m)"
         if size > nothing
@@ -113,7 +114,7 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     said = said.format(*_pressure_errors(result))
     if not np.all(np.asarray(result.mesh_error.found)):
         return (
-            f"{said}; at some steps it is not found, or turns elements inside out: the mesh is too coarse to say more"
+            f"{said}; at some steps it is not found, or turns elements inside out: the mesh is too coarse for a number"
         )
     if error <= _SMALL * size:
         return said
@@ -131,7 +132,7 @@ def _pressure_errors(result: Result) -> tuple[str, str]:
 
 
 def cautions_of_mesh(mesh: TetMesh) -> list[str]:
-    """Sentences on the size of the body, nodes that are not joined, and slivers."""
+    """Sentences on the size of the body, on nodes that are not joined, and on slivers."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     size, quality = float(np.ptp(points, axis=0).max()), qualities(points, tets, np.asarray(mesh.volumes))
     said = []
@@ -155,18 +156,18 @@ def cautions_of_mesh(mesh: TetMesh) -> list[str]:
     return said
 
 
-#: K/mu above which quadratic elements without pressures as unknowns are 10 % off or more (experiments/TABLES.md).
+#: With a larger K/mu quadratic elements without unknown pressures are wrong by 10 % or more (experiments/TABLES.md).
 _LOCKING = 100.0
 
 
 def _of_locking(scene: Scene) -> list[str]:
-    """A sentence on quadratic elements that lock although another form would not."""
+    """A sentence if quadratic elements lock although another form of the volumes would not lock."""
     if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
         return []
     try:
         laws = regions.laws_of(scene.law, scene.region)
         ratio = max(float(np.max(np.asarray(a.bulk_modulus()) / np.asarray(a.shear_modulus()))) for a in laws)
-    except InputError:  # a law need not state its moduli
+    except InputError:  # a law may have no moduli
         return []
     if ratio <= _LOCKING:
         return []
@@ -176,16 +177,16 @@ def _of_locking(scene: Scene) -> list[str]:
     ]
 
 
-#: Part of a history, of its largest number or of its sum over time, that may fall between two steps without a word.
+#: Fraction of a history that the steps may miss without a caution: of its largest value, or of its sum over time.
 MISSED = 0.05
 
 
-#: Relaxation times after which a body that began unrelaxed is within a hundredth of its state of rest.
+#: After this many relaxation times a body that began unrelaxed is within a hundredth of its state of rest.
 _RESTS = 5.0
 
 
 def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
-    """A sentence if a static run from a loaded shape is over before its stress has relaxed."""
+    """A sentence if a static run from a loaded shape ends before its stress has relaxed."""
     if scene.points_are != "loaded" or scene.viscosity is None or scene.solve.kind != "static":
         return []
     own, lasts = by_element(scene).viscosity, float(result.times[-1])
@@ -201,9 +202,9 @@ def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
 
 
 def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
-    """A sentence if a body under constant loads moves with more energy than they have given it.
+    """A sentence if a body under constant loads has more kinetic energy than the work of these loads.
 
-    Newmark's method keeps the energy of small motion only; with steps as long as a period, large motion can grow.
+    Newmark's method keeps the energy only of small motions. If a step is as long as a period, large motions can grow.
     """
     body, solve = scene.body, scene.solve
     if solve.kind != "dynamic" or solve.integrator != "newmark" or body is None or body.mass != "lumped":
@@ -229,7 +230,7 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
 
 
 def _of_histories(scene: Scene, result: Result) -> list[str]:
-    """A sentence on every history that changes within a step so that the steps, which see it at their ends, miss it."""
+    """A sentence on every history that changes within a step: the run uses only its values at the ends of steps."""
     said = []
     steps = np.concatenate([[0.0], np.asarray(result.times)])
     for name, part in histories(scene).items():
@@ -256,12 +257,12 @@ def _of_histories(scene: Scene, result: Result) -> list[str]:
     return said
 
 
-#: Part of an indentation that may happen between the contact points of a triangle without a word.
+#: Fraction of the approach that an obstacle may enter the body between two contact points without a caution.
 BETWEEN = 0.25
 
 
 def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: jax.Array) -> list[str]:
-    """A sentence if the body is in the obstacle, `moved` (T, 3), between its points of contact."""
+    """A sentence if the obstacle, displaced by `moved` (T, 3), overlaps the body between the contact points."""
     last = len(moved) - 1
     for k in {int(jnp.argmax(jnp.linalg.norm(moved, axis=1))), last}:
         x = jnp.asarray(result.positions[k], scene.mesh.points.dtype)
@@ -275,7 +276,7 @@ def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result,
 
 
 def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: np.ndarray) -> str:
-    """A sentence if the obstacle, at 0, `moved` (T + 1, 3), passed the surface of the body within a step."""
+    """A sentence if the obstacle, displaced by `moved` (T + 1, 3) from step 0 on, passed the surface within a step."""
     ways, radius = np.linalg.norm(np.diff(moved, axis=0), axis=1), float(np.asarray(obstacle.radius))
     centres, axis = np.asarray(obstacle.position, float) + moved, np.asarray(obstacle.axis, float)
     if obstacle.shape == "cylinder":  # it may slide along its axis
@@ -295,7 +296,7 @@ def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, m
 
 
 def _of_contacts(scene: Scene, result: Result) -> list[str]:
-    """A sentence on every round obstacle that is in the body between the points at which contact is tested."""
+    """Sentences on obstacles (not planes) that passed the surface, or overlap the body between its contact points."""
     said, steps = [], len(result.times)
     obstacles = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, Obstacle)]
     pressed = any(isinstance(physics, PressedObstacle) for _, physics in obstacles)
@@ -313,7 +314,7 @@ def _of_contacts(scene: Scene, result: Result) -> list[str]:
 
 
 def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
-    """Whether a static run failed whose body only friction holds: it may have to slide."""
+    """A sentence if a static run failed and only friction holds the body: it may have to slide."""
     rough = any(isinstance(physics, RoughObstacle) for physics in scene.physics)
     fine = (status.CONVERGED, status.ONE_STEP, status.STALLED)
     if not rough or scene.solve.kind != "static" or np.isin(result.statistics.status, fine).all():
@@ -331,12 +332,12 @@ def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
     ]
 
 
-#: Times by which changes of the pressure from step to step exceed those over two steps if a scheme is unstable.
+#: If a scheme is unstable, the changes of the pressure over one step are this many times its changes over two steps.
 ALTERNATING = 3.0
 
 
 def _of_pressures(scene: Scene, result: Result) -> list[str]:
-    """A sentence if the pressure overshoots beside drained places, or the lagged one goes up and down."""
+    """A sentence if the pressure overshoots, if elements at drained places are too high, or if "lagged" is unstable."""
     if scene.porosity is None or result.pressure is None:
         return []
     P = np.asarray(result.pressure)
@@ -357,9 +358,7 @@ def _of_pressures(scene: Scene, result: Result) -> list[str]:
 
 
 def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
-    """Median height [m] of the elements `at` over their face; `faces` (n, 4) says which corners of all elements are on
-    one.
-    """
+    """Median height [m] of the elements `at` over the face whose corners are true in `faces` (E, 4)."""
     corners = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)[at]]
     base = corners[faces[at]].reshape(-1, 3, 3)
     area = 0.5 * np.linalg.norm(np.cross(base[:, 1] - base[:, 0], base[:, 2] - base[:, 0]), axis=1)
@@ -367,10 +366,11 @@ def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
 
 
 def _of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
-    """A sentence if the layer that drains in a time is thinner than the elements there; `when` names the time.
+    """A sentence if the layer that drains in `seconds` is thinner than the elements there; `when` is the time in words.
 
-    After a time t the fluid has left a layer of about sqrt(c t), with the diffusivity c = kappa / (1/K_lim + 1/M) (Biot
-    1941). The pressure is linear in an element, so a thinner layer is drained too much.
+    After a time t the fluid has left a layer of a thickness of about sqrt(c t), with the diffusivity c = kappa /
+    (1/K_lim + 1/M) (Biot 1941). The pressure is linear in an element. So an element thicker than this layer loses too
+    much fluid.
     """
     sponge = scene.porosity
     assert sponge is not None
@@ -382,7 +382,7 @@ def _of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
         return []
     try:
         shear = float(np.median(np.asarray(scene.law.shear_modulus())))
-    except InputError:  # a law need not state its moduli
+    except InputError:  # a law may have no moduli
         return []
     K0, limit, kappa = (
         float(np.median(np.asarray(own))) for own in (sponge.bulk, sponge.limit_bulk, sponge.permeability)
@@ -399,18 +399,20 @@ def _of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
     ]
 
 
-#: Overshoot of a pressure, over the largest of its step, that is told.
+#: A larger overshoot, divided by the largest pressure of the step, leads to a caution.
 OVERSHOOT = 0.05
-#: Least dt over h^2/(kappa M): steps as long, in elements of height h and longitudinal modulus M, overshoot by less.
+#: Minimum dt, in units of h^2/(kappa M), for elements of height h, permeability kappa and longitudinal modulus M. With
+#: this dt or a longer one the overshoot is smaller.
 _FOLLOWS = 0.4
 
 
 def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
     """A sentence if pressures P (T, V) are higher beside the drained places than further inside.
 
-    The volume that leaves an element within a step belongs to all of its nodes, so that the coupling of neighbours
-    exceeds the flow between them where dt < h^2/(4 kappa M), in rows of elements; elements of a body need half as long
-    again. Such bounds are known since Vermeer and Verruijt 1981 (Int. J. Numer. Anal. Methods Geomech. 5, 1).
+    The volume that leaves an element within a step belongs to all of its nodes. In a row of elements with dt < h^2/(4
+    kappa M), this couples neighbouring nodes more strongly than the flow between them. Elements of a body need a dt
+    that is longer by half. Such bounds are known since Vermeer and Verruijt 1981 (Int. J. Numer. Anal. Methods Geomech.
+    5, 1).
     """
     sponge, tets, V = scene.porosity, np.asarray(scene.mesh.tetrahedra), scene.mesh.number_of_vertices
     assert sponge is not None
@@ -444,11 +446,11 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
     )
     try:
         shear = np.median(np.asarray(scene.law.shear_modulus()))
-    except InputError:  # a law need not state its moduli
+    except InputError:  # a law may have no moduli
         return [f"{said}: take a larger dt, or thinner elements there"]
     flow = float(np.median(np.asarray(sponge.permeability)) * (np.median(np.asarray(sponge.bulk)) + 4 / 3 * shear))
     enough = _FOLLOWS * height**2 / flow
-    if float(scene.solve.dt) >= enough:  # then it is not by the steps
+    if float(scene.solve.dt) >= enough:  # then the steps are not the cause
         return []
     return [
         f"{said}: take a dt of {enough:.2g} s or more, or elements of "
@@ -457,7 +459,7 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
 
 
 def _at_times(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Numbers (n, k) of a table, linear in between, at other times (n,)."""
+    """Values (n, k) of a table at other times (n,), by linear interpolation."""
     columns = values.reshape(len(times), -1).T
     return np.stack([np.interp(at, times, column) for column in columns], axis=1)
 
@@ -485,7 +487,7 @@ def _of_volumes(scene: Scene, result: Result) -> list[str]:
 
 
 def _extremes(mesh: TetMesh, positions: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Least J (E,) of every element and its step, from 0; then the greatest J and its step. J is 1 before a run."""
+    """Minimum J (E,) of each element, its step (from 0), maximum J and its step; J is 1 before a run."""
 
     def one(carry: tuple, given: tuple) -> tuple[tuple, None]:
         least, when_least, most, when_most = carry

@@ -23,14 +23,14 @@ class State(NamedTuple):
     """The state between two steps."""
 
     x: jax.Array  # (V, 3) [m]
-    memories: tuple  # one of every physics, in order; None: it has no memory
+    memories: tuple  # one for each physics, in order; None: this physics has no memory
 
 
 class Sizes(NamedTuple):
-    """Sizes of nodal forces at rest, the same for all steps; without derivatives."""
+    """Norms of nodal forces at rest. They are the same for all steps and have no derivatives."""
 
-    unit_strain: jax.Array  # [N] size of the forces by a stretch along x, per unit strain
-    roundoff: jax.Array  # [N] size of the forces by rounded positions
+    unit_strain: jax.Array  # [N] norm of the forces of a stretch along x, per unit strain
+    roundoff: jax.Array  # [N] norm of the forces that rounding of the positions causes
 
 
 class Equations(NamedTuple):
@@ -38,13 +38,13 @@ class Equations(NamedTuple):
 
     scene: Scene
     physics: tuple[Physics, ...]
-    acting: tuple  # the acting part of each physics; None: nothing acts
+    acting: tuple  # what acts of each physics in this step; None: nothing acts
     state: State  # at the beginning
     k: Number  # number of the step, from 1
     free: Free
-    noise: Number  # [N] below this, forces are roundoff: an unloaded equilibrium has converged
-    roundoff: jax.Array  # [N] size of the forces by rounded positions
-    moved: tuple[jax.Array, jax.Array] | None  # (V, 3) [m] prescribed before and after the step
+    noise: Number  # [N] smaller forces are roundoff: an unloaded equilibrium has converged
+    roundoff: jax.Array  # [N] norm of the forces that rounding of the positions causes
+    moved: tuple[jax.Array, jax.Array] | None  # (V, 3) [m] prescribed displacements before and after the step
 
     @property
     def mesh(self) -> TetMesh:
@@ -53,12 +53,12 @@ class Equations(NamedTuple):
 
     @property
     def solids(self) -> list[Solid]:
-        """Physics that depend on the deformation gradient of elements."""
+        """The physics whose stress depends on the deformation gradient of elements."""
         return [a for a in self.acting if isinstance(a, Solid)]
 
     @property
     def volume(self) -> VolumeStress | None:
-        """Physics that act on the volume of elements."""
+        """The physics that acts on the volume of elements, or None."""
         return next((a for a in self.acting if isinstance(a, VolumeStress)), None)
 
     @property
@@ -68,7 +68,7 @@ class Equations(NamedTuple):
 
     @property
     def nodal(self) -> list[NodalForce]:
-        """Physics that act at nodes."""
+        """The physics whose forces act at nodes."""
         return [a for a in self.acting if isinstance(a, NodalForce)]
 
     @property
@@ -80,8 +80,8 @@ class Equations(NamedTuple):
 class Forces(NamedTuple):
     """Forces at a point of a step."""
 
-    internal: jax.Array  # (V, 3) [N] of the elements
-    nodal: list[jax.Array]  # (V, 3) [N] of each physics that acts at nodes
+    internal: jax.Array  # (V, 3) [N] forces of the elements
+    nodal: list[jax.Array]  # (V, 3) [N] forces of each physics that acts at nodes
     pressure: jax.Array | None  # (V,) [Pa]
     x: jax.Array  # (V, 3) [m]
     F: Matrix
@@ -101,12 +101,12 @@ def free_directions(scene: Scene) -> Free:
 
 
 def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
-    """The state at the beginning: at rest in the reference positions, or at positions `start` (V, 3) [m]."""
+    """The state at the beginning: at rest in the reference positions, or at rest in positions `start` (V, 3) [m]."""
     x = scene.mesh.points if start is None else start
     physics, free = physics_of(scene), free_directions(scene)
 
     def force() -> jax.Array:
-        """Forces on the nodes at x without inertia; the first acceleration follows from them."""
+        """Forces on the nodes at x without inertia. The first acceleration follows from these forces."""
         if start is not None or (scene.porosity is not None and scene.porosity.initial_pressure is not None):
             return _forces_at_beginning(scene, x)
         # At rest in the reference positions only nodal forces act.
@@ -120,7 +120,10 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
 
 
 def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] of all physics except inertia at positions x (V, 3), with memories of the reference shape."""
+    """Forces (V, 3) [N] of all physics except inertia at positions x (V, 3).
+
+    The memories are those of the reference shape.
+    """
     still = replace(scene, solve=replace(scene.solve, kind="static"))
     none = jnp.zeros((), x.dtype)
     at_rest = initial_state(still)._replace(x=x)
@@ -134,7 +137,7 @@ def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
 
 
 def force_sizes(scene: Scene) -> Sizes:
-    """Sizes [N] of the forces by a stretch along x and by rounded positions: they set the tolerance without loads."""
+    """Norms [N] of the forces of a stretch along x and of rounded positions. They set the tolerance if no load acts."""
     mesh, law = scene.mesh, law_at_rest(scene)
     dtype = mesh.points.dtype
     along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], dtype)
@@ -144,15 +147,15 @@ def force_sizes(scene: Scene) -> Sizes:
     def size(motion: jax.Array) -> jax.Array:
         return jnp.linalg.norm(mjed.linear_force(mesh, law, motion))
 
-    # One loop for both: a third of the program that two products with a linearised force take.
+    # One loop for both: this program is a third as large as two products with a linearised force.
     unit_strain, roundoff = jax.lax.map(size, jnp.stack([along, rounded]))
     return Sizes(*jax.lax.stop_gradient((unit_strain, roundoff + _roundoff_at_nodes(scene, rounded))))
 
 
 def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
-    """Size [N] of the forces of springs and masses by rounded positions, a motion (V, 3) [m], in the reference shape.
+    """Norm [N] of the forces of springs and masses in the reference shape if the nodes move by `rounded` (V, 3) [m].
 
-    Contact is left out: the points of contact are not known before the step.
+    Contact is left out: the contact points are not known before the step.
     """
     x = scene.mesh.points
     begin = _first_step(scene, x, free_directions(scene))
@@ -168,13 +171,13 @@ def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
 
 
 def _is_spring(acting: NodalForce) -> bool:
-    """Whether its force changes with positions by a stiffness of its own."""
+    """Whether the class of `acting` defines a stiffness, so that its force changes with the positions."""
     own = type(acting)
     return own.stiffness is not NodalForce.stiffness or own.attached is not NodalForce.attached
 
 
 def equations(scene: Scene, state: State, k: Number, sizes: Sizes | None = None) -> Equations:
-    """The equations of step k = 1 … steps from `state`; `sizes` is `force_sizes(scene)`, the same for all."""
+    """The equations of step k = 1 … steps from `state`; `sizes` is `force_sizes(scene)`, the same for all steps."""
     sizes = force_sizes(scene) if sizes is None else sizes
     return _of_physics(scene, physics_of(scene), state, k, sizes)
 
@@ -211,11 +214,12 @@ def _prescribed_motion(scene: Scene, k: Number) -> tuple[jax.Array, jax.Array] |
 
 
 def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
-    """Positions (V, 3) from unknowns q (3 V,) and the held nodes, at part s of the step."""
+    """Positions (V, 3) from unknowns q (3 V,) and the held nodes, at fraction s of the step."""
     held, free = e.mesh.points, e.free
     q = q[: 3 * e.mesh.number_of_nodes]
     if e.moved is not None:
-        # Straight from beginning to end: a history may bend within the step, and only its end counts.
+        # Linear from beginning to end of the step: if a history bends within the step, only its value at the end
+        # counts.
         before, after = e.moved
         held = held + before + s * (after - before)
     x = free.mask * jnp.stack(columns(q), axis=-1) + (1 - free.mask) * held
@@ -227,10 +231,10 @@ def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
 
 
 def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> jax.Array:
-    """Unknowns q of a step at positions x (V, 3): the free ones (3 V,), then pressures that are unknown, in their unit.
+    """Unknowns q of a step at positions x (V, 3): free positions (3 V,), then unknown pressures in their unit.
 
     Args:
-        pressure: of the vertices (V,) [Pa], if they are unknowns; default: the pressures at the beginning of the step.
+        pressure: pressures of the vertices (V,) [Pa] if they are unknowns; default: those at the step's beginning.
     """
     field = e.free._replace(tied=()).vectors(x)
     for nodes in e.free.tied:
@@ -242,13 +246,14 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
     return jnp.concatenate([q, pressure / e.mixed.unit])
 
 
-@jax.jit  # a program has it several times: it is traced once
+@jax.jit  # a program calls it several times: it is traced once
 def forces(
     e: Equations, q: jax.Array, s: Number, guess: Guess | None = None, pressure: jax.Array | None = None
 ) -> Forces:
-    """Forces of all physics at unknowns q (3 V,), at part s of the step.
+    """Forces of all physics at unknowns q (3 V,), at fraction s of the step.
 
-    Pressures of a flowing fluid are solved for, from `guess` if it is given, or are given as `pressure` (V,) [Pa].
+    Pressures of a flowing fluid can be given as `pressure` (V,) [Pa]. Otherwise they are computed, from `guess` if it
+    is given.
     """
     x = positions(e, q, s)
     F = deformation_gradient(e.mesh, x)
@@ -267,7 +272,7 @@ def forces(
 
 
 def forces_at(scene: Scene, x: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] that keep the nodes of a scene at rest, in which nothing is held, at positions x (V, 3)."""
+    """Forces (V, 3) [N] that keep the nodes at rest at positions x (V, 3), for a scene without supports."""
     none = jnp.zeros(())
     e = equations(scene, initial_state(scene), 1.0, Sizes(none, none))
     q = unknowns(e, x)
@@ -280,22 +285,20 @@ def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
 
 
 def settled(e: Equations, q: jax.Array, s: Number | None = None) -> jax.Array:
-    """Unknowns q with the pressures that balance the volumes at part s of the step (default: its end), if pressures are
-    unknowns.
-    """
+    """Unknowns q with unknown pressures replaced: they balance the volumes at fraction s of the step (default: 1)."""
     n, x = 3 * e.mesh.number_of_nodes, positions(e, q, jnp.ones((), q.dtype) if s is None else s)
     pressure = e.mixed.settled(e.mesh, determinant(deformation_gradient(e.mesh, x)))
     return jnp.concatenate([q[:n], pressure / e.mixed.unit])
 
 
 def flowing_pressure(e: Equations, q: jax.Array, s: Number, guess: Guess) -> jax.Array:
-    """Pressures (V,) [Pa] of a flowing fluid at unknowns q (3 V,), solved for from a guess."""
+    """Pressures (V,) [Pa] of a flowing fluid at unknowns q (3 V,). The solver starts at `guess`."""
     assert e.volume is not None
     return e.volume.pressure(e.mesh, determinant(deformation_gradient(e.mesh, positions(e, q, s))), guess)
 
 
 def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces (3 V,) [N] at the end of the step with pressures (V,) [Pa], and their residuals (V,)."""
+    """Out-of-balance forces (3 V,) [N] at the step's end, and residuals (V,) of the given pressures (V,) [Pa]."""
     volume: Any = e.volume
     f = forces(e, q, jnp.ones((), q.dtype), None, volume.in_force(pressure))
     return flat(e.free.vectors(f.total, f.x)), volume.balance(e.mesh, pressure, determinant(f.F))
@@ -304,7 +307,7 @@ def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.A
 def residual(
     e: Equations, q: jax.Array, s: Number, guess: Guess | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Out-of-balance forces (3 V,) [N] at part s of the step, the size of all forces, and the pressures."""
+    """Out-of-balance forces (3 V,) [N] at fraction s of the step, sum of the norms of all forces [N], and pressures."""
     f = forces(e, q, s, guess)
     at_work = e.noise + jnp.linalg.norm(f.internal)
     for force in f.nodal:
@@ -318,13 +321,13 @@ def residual(
 def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
     """The energy [J] that a step minimises: the sum of incremental potentials.
 
-    Its gradient at `start` is the residual. If all forces have an energy, this is true at every q.
+    At `start` the gradient of the energy is the residual. If all forces have an energy, this is true at every q.
     """
     x, begin = positions(e, q, 1.0), positions(e, start, 1.0)
     F = deformation_gradient(e.mesh, x)
     total = jnp.sum(e.mesh.weights * sum(solid.energy(F) for solid in e.solids))
     if e.volume is not None:
-        total = total + e.volume.energy(e.mesh, determinant(F))  # of mixed bodies, with the best pressures
+        total = total + e.volume.energy(e.mesh, determinant(F))  # for unknown pressures: with the optimal ones
     return sum((a.energy_from(e.mesh, x, begin) for a in e.nodal), total)
 
 
@@ -335,7 +338,7 @@ def advanced(e: Equations, end: End) -> State:
 
 
 def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:
-    """Further results of the physics at a state, besides positions and reactions."""
+    """Results of the physics at a state, in addition to positions and reactions."""
     shown: dict[str, jax.Array] = {}
     for physics, memory in zip(physics_of(scene), state.memories, strict=True):
         shown |= {name: on_middles(scene.mesh, field) for name, field in physics.output(memory).items()}

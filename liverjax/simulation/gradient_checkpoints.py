@@ -1,9 +1,8 @@
-"""Checkpoints of reverse mode. It keeps the state and the root of every step, or only a few states, and computes the
-rest again.
+"""Checkpoints of reverse mode: it keeps the state and the root of every step, or only a few states.
 
-The root of a step (its name is set in `liverjax.solvers.step_cutting`) is kept. The derivative evaluates forces and
-tangent at the root again, but does not repeat Newton's iterations. If fewer states than steps are kept (Griewank and
-Walther 2008, 12), the steps between two of them run a second time.
+The root of a step is the solution of its equations; `liverjax.solvers.step_cutting` sets its name. It is kept, so the
+derivative evaluates forces and tangent at the root again, but does not repeat Newton's iterations. If fewer states than
+steps are kept (Griewank and Walther 2008, 12), the steps between two kept states run a second time.
 """
 
 import math
@@ -18,7 +17,7 @@ from liverjax.solvers.step_cutting import ROOT
 
 
 def number_kept(store: str | int, steps: int) -> int:
-    """Number of states to keep of a run of `steps` steps.
+    """Number of states that reverse mode keeps in a run of `steps` steps.
 
     Args:
         store: "all", "sqrt", or a number above 0.
@@ -36,19 +35,22 @@ def number_kept(store: str | int, steps: int) -> int:
 
 
 def lengths(steps: int, kept: int) -> tuple[int, int, int]:
-    """Number of segments, steps in each of them, and steps left over for a last one."""
+    """Number of full segments, number of steps in each, and number of steps left for a shorter last segment."""
     length = math.ceil(steps / kept)
     return steps // length, length, steps % length
 
 
 def one_step(step: Callable) -> Callable:
-    """`step`; reverse mode keeps only its arguments and its root."""
+    """The function `step`, of which reverse mode keeps only the arguments and the root."""
     policy = jax.checkpoint_policies.save_only_these_names(ROOT)
     return jax.checkpoint(step, policy=policy, prevent_cse=False)
 
 
 def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
-    """The outputs of `step` (carry, k) without the carry, stacked over `numbers` (T,); see the module for `kept`."""
+    """The outputs of `step` (carry, k), stacked over `numbers` (T,), without the carry.
+
+    `kept` states are kept (see above).
+    """
     steps = len(numbers)
     if kept >= steps:
         return jax.lax.scan(step, start, numbers)[1]
@@ -60,7 +62,7 @@ def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, carry, k)[1])
         return jax.lax.cond(real, step, lambda carry, _: (carry, nothing), carry, k)
 
-    # Only a segment's beginning is kept. Compiled once: the last segment skips steps beyond the run's end.
+    # Only a segment's beginning is kept. All segments share one program: the last one skips steps after the run's end.
     @jax.checkpoint
     def segment(carry, at):
         return jax.lax.scan(unless_over, carry, at) if beyond else jax.lax.scan(step, carry, at)

@@ -1,9 +1,9 @@
-"""Derivatives of a number from a run by any number of its scene, with a prediction of memory and a status.
+"""Derivatives of a result of a run with respect to numbers of its scene, with a status and a prediction of memory.
 
     found = lj.value_and_gradient(lambda result: loss(result.positions), scene, {"law.mu": 770.0})
 
-`jax.grad` through `simulate` gives the same numbers; this adds a status code, the choice between reverse and forward
-mode, and a prediction of the memory.
+`jax.grad` through `simulate` gives the same derivatives. This module adds a status code, the choice between reverse and
+forward mode, and a prediction of the memory.
 """
 
 import functools
@@ -24,16 +24,16 @@ from liverjax.simulation.run import Result, simulate
 from liverjax.simulation.step import beginning
 
 MODES = ("reverse", "forward")
-#: Name of the positions at the beginning, in addition to the dotted names of `with_parameters`.
+#: Name for the positions at the beginning; `with_parameters` has the other names.
 START = "start"
 
 
 @struct
 class Gradient:
-    """A number that a run leads to, and its derivatives."""
+    """A number computed from a run, and its derivatives."""
 
     value: jax.Array = param("1", "()")
-    gradient: dict = param("1", "by name, each of the shape of its value")
+    gradient: dict = param("1", "name -> derivative, in the shape of the value")
     status: jax.Array = param("1", "of `liverjax.core.status`: GRADIENT_UNCONVERGED, ADJOINT_FAILED or CONVERGED")
 
 
@@ -44,19 +44,21 @@ def value_and_gradient(
     store: str | int = "all",
     mode: str = "reverse",
 ) -> Gradient:
-    """Value of `loss` (Result -> number), and its gradient with respect to the numbers that `at` names.
+    """Value of `loss` (Result -> number), and its gradient with respect to the numbers named in `at`.
 
     Args:
-        loss: a function that JAX can differentiate; give the same one again to use its compiled program again.
+        loss: a function that JAX can differentiate. If the same function is given again, its compiled program is
+            reused.
         scene: `Scene`.
-        at: dotted names as in `with_parameters` -> values, which replace the scene's; "start": positions (V, 3) [m] to
-            begin at, at rest.
-        store: what reverse mode keeps: "all" steps, "sqrt" or a number of states (`checkpointing`, `memory`).
-        mode: "reverse", at a cost that does not grow with the number of parameters; "forward", without memory for the
-            steps, at the cost of one run per parameter.
+        at: dotted names as in `with_parameters` -> values that replace the values of the scene. "start": positions (V,
+            3) [m] at which the run begins, at rest.
+        store: what reverse mode keeps: "all" steps, "sqrt" or a number of states (see `gradient_checkpoints` and
+            `memory`).
+        mode: "reverse": its cost does not grow with the number of parameters. "forward": it needs no memory for the
+            steps, but the cost of one run per parameter.
 
     Raises:
-        InputError: unknown mode or store, no parameters, a name that the scene does not have; as `simulate`.
+        InputError: unknown mode or store, no parameters, a name that the scene does not have; also as in `simulate`.
     """
     if mode not in MODES:
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
@@ -90,12 +92,12 @@ def _program_of_gradient(loss: Callable[[Result], jax.Array], store: str | int, 
     return jax.jit(both)
 
 
-#: Numbers per point of integration that one step's derivative needs in addition to tangents; measured.
+#: Measured memory for the derivative of one step, in numbers per integration point, in addition to the tangents.
 _WORK = 440
 
 
 def memory(scene: Scene, store: str | int = "all") -> int:
-    """Bytes that a derivative in reverse mode will keep and work with, known before anything is compiled."""
+    """Predicted memory [bytes] of a derivative in reverse mode. Nothing is compiled for it."""
     steps = scene.solve.steps
     kept = gradient_checkpoints.number_kept(store, steps)
 
@@ -108,12 +110,12 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     root = _bytes(scene.mesh.points)
     if scene.porosity is not None and scene.porosity.scheme == "implicit":
         root += scene.mesh.number_of_vertices * scene.mesh.points.dtype.itemsize
-    # Tangents of a step, and of the run's beginning.
+    # Two tangents: of a step, and of the beginning of the run.
     work = 2 * tangent + _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
     if kept >= steps:
         return steps * (state + root) + work
     count, length, rest = gradient_checkpoints.lengths(steps, kept)
-    # In addition to the states, the result of the run; not all of it at once.
+    # The last term is the run's result, in addition to the states; not all of it exists at the same time.
     return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 3 * steps * root // 2 + work
 
 

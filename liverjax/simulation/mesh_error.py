@@ -1,23 +1,25 @@
-"""Error of a run by its mesh: one linearised solve in each step in the next richer space of functions.
+"""Error that the mesh causes in a run: in each step one linearised solve in the next richer space of functions.
 
-The positions of a step, with nothing added, are put into quadratic elements (those of quadratic elements into cubic
-ones). The forces out of balance, r, and the tangent K give du = -K^-1 r, which the elements of the run cannot
-represent. A reaction changes by its derivative along du. A second run in this space goes along with the first one, and
-the memories of viscosity, fluid and inertia are its own. In the richer space a surface touches an obstacle at other
-points: with contact, solves go on until these are found. With only the contact points of the first solve, the stated
-error of a flat punch's force was 1/4; the true error was 1/100.
+The richer space of linear elements is the space of quadratic elements; for quadratic elements it has cubic functions.
+The positions of a step are represented in this space without a change. There they have out-of-balance forces r. With
+the tangent K, these give du = -K^-1 r, a motion that the elements of the run cannot represent. The reactions change by
+their derivative along du. A second run, in the richer space, accompanies the first one. It has separate memories for
+viscosity, fluid and inertia. In the richer space a surface touches an obstacle at other points. With contact, solves
+are therefore repeated until these contact points are found. With the contact points of the first solve only, the
+estimated error of a flat punch's force was 1/4; the true error was 1/100.
 
-The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 of the error in small and in
-moderate strain; with du added, about a tenth is left. For quadratic elements the cubic functions show about two thirds
-of the error, so du is multiplied by 1.5. It leaves out the errors of the body's shape and of the time steps.
+The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 times the error, in small and
+in moderate strain. If du is added, about a tenth of the error is left. For quadratic elements the cubic functions find
+about two thirds of the error, so du is multiplied by 1.5. The estimate does not contain the errors of the body's shape
+and of the time steps.
 
-The pressures of a fluid are linear in both kinds of elements. With a fluid, the richer space is therefore that of the
-same elements on a mesh with every element cut into eight (`liverjax.scenes.refined`), and du is multiplied by 4/3: an
-error that falls with the square of the elements' size leaves a quarter there.
+The pressures of a fluid are linear in linear elements and in quadratic ones. With a fluid, the richer space therefore
+has the same elements on a finer mesh: every element is cut into eight (`liverjax.scenes.refined`). Then du is
+multiplied by 4/3, because an error of second order is a quarter as large on the finer mesh.
 
-In motion the errors of steps add up. The richer run has consistent masses, so that the functions which it adds fall
-like the others; the inertia of the richer motion acts on all of them. Each of its steps is linearised at its own
-positions, moved by the run's motion in this step.
+In dynamics the errors of the steps add up. The richer run has consistent masses, so that its added functions have the
+same acceleration under gravity as the others. The inertia of the richer motion acts on all functions. Each step of the
+richer run is linearised at its positions before the step, moved by the motion of the first run in this step.
 """
 
 from collections.abc import Callable
@@ -57,25 +59,28 @@ from liverjax.solvers.krylov import true_residual
 from liverjax.solvers.point_matrix import restricted
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
-#: Tolerance of the linear solve: 1e-1 finds only a fifth of the error of a slender beam of quadratic elements. Then
-#: the tolerance if pressures are unknowns, and the factor on du, both for linear elements and for
-#: quadratic ones; and the error bar of a number, over its correction.
+#: Tolerance of the linear solve: 1e-1 would find only a fifth of the error of a slender beam of quadratic elements.
+#: Then, for each order of the elements, the tolerance if pressures are unknowns, and the factor on du. The last number
+#: is the error bar of a quantity over its correction.
 _TOLERANCE = 1e-2
 _WITH_PRESSURES = {1: 1e-5, 2: 1e-4}
 _FACTOR = {1: 1.0, 2: 1.5}
 BAR = 1.25
-#: K/mu up to which quadratic elements without pressures do not lock (experiments/TABLES.md).
+#: Quadratic elements without unknown pressures do not lock up to this K/mu (experiments/TABLES.md).
 _LOCKS = 10.0
-#: With contact: most linear solves of a step, and the residual, over the forces at work, that ends them.
+#: With contact: maximum number of linear solves in a step. They end if the residual, over the sum of the norms of all
+#: forces, is below the second number.
 _ROUNDS, _SETTLED = 24, 1e-3
+#: With a fluid that flows the residual must be below this: one solve is not exact, because the matrix of the pressures
+#: is only approximated in it (`liverjax.physics.darcy.nearly_solved`).
 _WITH_FLUID = 1e-5
-#: Most halvings of such a solve, if it makes the residual larger.
+#: Maximum number of halvings of the change from such a solve, if it makes the residual larger.
 _HALVINGS = 4
 
 
 @struct
 class MeshError:
-    """Estimated error of a run: what an infinitely fine mesh would add to its result."""
+    """Estimated error of a run: the difference that an infinitely fine mesh would add to the result."""
 
     positions: jax.Array = param("m", "(T, V, 3)")
     reactions: jax.Array = param("N", "(T, V, 3)")
@@ -85,10 +90,13 @@ class MeshError:
     )
 
     def change(self, of: Callable[[jax.Array, jax.Array], Any], result: Any) -> tuple[Any, Any]:
-        """A number of interest and its estimated change: add it to correct, `BAR` times its size is the error bar.
+        """A quantity of interest and its estimated change.
+
+        The sum of both is the corrected quantity. The error bar is `BAR` times the absolute value of the change.
 
         Args:
-            of: (positions (T, V, 3), reactions (T, V, 3)) -> numbers, any pytree; its derivative along the error.
+            of: function (positions (T, V, 3), reactions (T, V, 3)) -> numbers, any pytree. The change is its derivative
+                along the error.
             result: `Result` of the run.
         """
         return jax.jvp(of, (result.positions, result.reactions), (self.positions, self.reactions))
@@ -105,7 +113,7 @@ def mesh_error_of(
         pressure: of the run (T, V), if it has a fluid.
 
     Raises:
-        InputError: a scene of another mesh; the one-step scheme, whose error is not only the mesh's.
+        InputError: a scene with another mesh; the one-step scheme, which has an error in addition to the mesh error.
     """
     if positions.shape[1] != scene.mesh.number_of_nodes:
         raise InputError(
@@ -145,7 +153,7 @@ def richer(scene: Scene) -> Richer:
     """The scene in the next richer space, as its error is estimated.
 
     Raises:
-        InputError: as in `mesh_error_of`.
+        InputError: the one-step scheme.
     """
     refuse(scene)
     if scene.porosity is not None and can_be_refined(scene):
@@ -157,16 +165,17 @@ def richer(scene: Scene) -> Richer:
 
 def _with_richer_elements(scene: Scene) -> Scene:
     rich = enriched(scene)
-    # Linear elements lock: their error is measured against elements that do not. Quadratic ones do not at a low bulk
-    # modulus, and have no pressures, which would have to be continuous where the material changes.
+    # Linear elements lock, so they are compared with elements that do not lock. At a low bulk modulus these are
+    # quadratic elements without pressures: pressures would have to be continuous where the material changes.
     of_linear = "auto" if _may_lock(scene) else "element"
     volumetric = of_linear if scene.mesh.order == 1 else scene.solve.volumetric
-    # Under an indenter the iterations of mixed cubic elements do not end: factorise if the user has chosen it.
+    # Under an indenter the iterations of mixed cubic elements do not converge: factorise if the user has chosen
+    # "direct".
     mixed = scene.mesh.order == 2 and scene.solve.volumetric == "mixed"
     linear = "direct" if mixed and scene.solve.linear_solver == "direct" else "cg"
     solve = replace(rich.solve, linear_solver=linear, robust="off", volumetric=volumetric)
     sponge = None if rich.porosity is None else sponge_at_points(rich.porosity, rich.mesh)
-    # With lumped masses the functions that the richer space adds would fall differently from the others.
+    # With lumped masses the added functions would have another acceleration under gravity than the others.
     body = None if rich.body is None else replace(rich.body, mass="consistent")
     rich = replace(rich, law=rich.mesh.at_points(rich.law), porosity=sponge, body=body, solve=solve)
     return replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
@@ -242,19 +251,19 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
     return advanced(e, End(end.x, end.F, end.pressure)), (change, found)
 
 
-#: A change, the iterations it took, whether the matrix was positive.
+#: The change dq, the number of iterations, and whether the matrix was positive.
 _Solved = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _Solved]:
-    """The point where the last linear solve begins, and its result.
+    """The point where the last linear solve begins, and the result of this solve.
 
-    One solve from q, unless there may be contact: more solves find its points in the richer space.
+    Without contact there is one solve, from q. If contact is possible, more solves find its points in the richer space.
     """
     one = jnp.ones((), q.dtype)
     tolerance = _TOLERANCE
     if e.volume is not None and e.volume.unknown:
-        # Pressures begin at the step's beginning, far from its end: the load is much larger than the mesh's error.
+        # The guess has the pressures of the step's beginning, far from the end: the load is much above the mesh error.
         tolerance = _WITH_PRESSURES[scene.mesh.order]
 
     def solved(q: jax.Array) -> _Solved:
@@ -262,7 +271,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
         K = tangent.tangent(e, f.pressure, f.x, one)
         load = -residual(e, q, one)[0]
         dq, iterations, positive = tangent.solve(e, K, load, tolerance, MOST_LINEAR_ITERATIONS)
-        # Iterations may break off without a sign.
+        # The solver does not report every breakdown.
         ended = true_residual(tangent.product(e, K), load, dq) <= 10 * tolerance
         return dq, iterations, positive & ended
 
@@ -283,7 +292,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
 
     def again(c: tuple) -> tuple:
         q, (dq, _, _), k = c
-        # The first round has no motion yet.
+        # In the first round dq is still 0.
         q = q + jax.lax.cond(k == 0, lambda: one, lambda: _shortened(size, q, dq)) * dq
         return q, solved(q), k + 1
 
@@ -293,7 +302,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
 
 
 def _shortened(size: Callable[[jax.Array], jax.Array], q: jax.Array, dq: jax.Array) -> jax.Array:
-    """The part of dq, halved `_HALVINGS` times at most, that leaves a smaller residual than at q."""
+    """The factor t (halved at most `_HALVINGS` times) with which q + t dq has a smaller residual than q."""
     before = size(q)
 
     def go_on(t: jax.Array) -> jax.Array:

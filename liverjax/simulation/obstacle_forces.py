@@ -1,4 +1,4 @@
-"""Forces on the rigid obstacles of a run, and the depth of the surface in each."""
+"""Forces on the rigid obstacles of a run, and the depth of the body's surface in each obstacle."""
 
 from typing import Any, NamedTuple
 
@@ -13,21 +13,21 @@ from liverjax.tensors.matrices import deformation_gradient
 
 
 class ObstacleForces(NamedTuple):
-    """Force and depth of each obstacle of a scene, in their order, at every step."""
+    """Force, depth and displacement of each obstacle of a scene at every step, in the order of the obstacles."""
 
-    force: jax.Array  # (obstacles, T, 3) [N] of the body on the obstacle
-    depth: jax.Array  # (obstacles, T) [m] largest depth of the surface in it
-    displacement: jax.Array  # (obstacles, T, 3) [m] of the obstacle: by a force, or as prescribed
+    force: jax.Array  # (obstacles, T, 3) [N] force of the body on the obstacle
+    depth: jax.Array  # (obstacles, T) [m] maximum depth of the surface in the obstacle
+    displacement: jax.Array  # (obstacles, T, 3) [m] of the obstacle: it follows from a force or is prescribed
 
 
 def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
-    """Forces on the obstacles of a scene, and the depths that the contact leaves; differentiable.
+    """Forces on the obstacles of a scene, and depths of the body's surface in them. Both are differentiable.
 
     Args:
         scene: the scene that was run.
         result: `Result` of `liverjax.simulate` from the reference positions, all steps stored.
     """
-    scene = prepared(scene)  # as it was run: numbers of regions by element, in its precision
+    scene = prepared(scene)  # as in the run: numbers of regions by element, in the scene's precision
     steps, dt = scene.solve.steps, 0.0 if scene.solve.dt is None else scene.solve.dt
     mesh, free = scene.mesh, Free(jnp.ones_like(scene.mesh.points))
     numbers = jnp.arange(1, len(result.positions) + 1)

@@ -1,4 +1,4 @@
-"""Run a scene: load steps or time steps, each a Newton solve with implicit differentiation."""
+"""Run a scene: load steps or time steps. Each is a Newton solve with implicit differentiation."""
 
 from collections.abc import Callable
 from functools import partial
@@ -25,7 +25,7 @@ from liverjax.solvers.problem import StepStatistics
 
 @struct
 class Result:
-    """Result of a run: arrays over the T steps. All but the statistics are differentiable."""
+    """Result of a run: arrays over the T steps. Positions, reactions and pressures are differentiable."""
 
     times: jax.Array = param("s", "(T,); the number of the load step if there is no time")
     positions: jax.Array = param("m", "(T, V, 3)")
@@ -36,7 +36,7 @@ class Result:
     mesh_error: MeshError | None = param("1", "estimated error of the mesh; None: not estimated", default=None)
 
     def check(self) -> "Result":
-        """The result itself, or `RuntimeError` with advice if a step failed; host side."""
+        """Return the result, or raise `RuntimeError` with advice if a step failed; host side."""
         codes = np.asarray(self.status)
         if np.any(codes != status.CONVERGED):
             step = int(np.argmax(codes != status.CONVERGED))
@@ -47,7 +47,7 @@ class Result:
 def _step_by_step(
     scene: Scene, sizes: Sizes, report: Callable[[int], None] | None, near: Any, differentiable: bool = True
 ) -> Callable:
-    """A function (state and tangent, k) -> state and tangent after step k, and the rows for `_result`."""
+    """A function (state and tangent, k) -> (state and tangent after step k, row of step k for `_result`)."""
 
     def physics(carry, k):
         state, kept = carry
@@ -85,7 +85,7 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
     first = equations(scene, start, numbers[0], sizes)
-    # In runs of several steps derivatives use the coarse space of the beginning; it is made only for derivatives.
+    # In runs of several steps derivatives use the coarse space of the beginning. It is computed only for derivatives.
     kept, near = beginning(first, tangent_too=steps > 1)
     advance = _step_by_step(scene, sizes, report, near)
     return _result(scene, numbers, gradient_checkpoints.scan(advance, (start, kept), numbers, store))
@@ -97,7 +97,7 @@ def _run_part(
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
     kept, _ = beginning(equations(scene, state, numbers[0], sizes))
-    # Inlined, it is traced once, for its shapes and for its program.
+    # With `inline` it is traced only once, for `eval_shape` and for the program.
     advance = jax.jit(_step_by_step(scene, sizes, report, None, differentiable=False), inline=True)
 
     def unless_over(carry, k):
@@ -115,26 +115,27 @@ def simulate(
     store: str | int = "all",
     mesh_error: bool = False,
 ) -> Result:
-    """Run a scene; may be differentiated, vmapped and jitted. See `Result` and `Result.check`.
+    """Run a scene. This function may be differentiated, vmapped and jitted. See `Result` and `Result.check`.
 
     Args:
         scene: `Scene`.
-        start: positions (V, 3) [m] to begin at, at rest, as if brought there from the reference at this moment: no
-            stress has relaxed yet, and the fluid responds to the change of volume in the first step; None: the
-            reference positions. Inverted elements need robust = "projected". A static scene then takes the start as
-            a guess. If the guess is inverted or leads nowhere, the run begins at the reference positions.
-        report: called on the host with the number of every finished step, for progress.
-        store: what reverse mode keeps. "all" keeps the end of every step. A number keeps so many states, "sqrt" the
-            root of the number of steps; the steps between them run a second time. Without a derivative it has no
-            effect. See `liverjax.simulation.gradients`.
-        mesh_error: whether to estimate the error of the mesh (`liverjax.simulation.mesh_error`), for a run that
-            begins in the reference positions.
+        start: positions (V, 3) [m] at which the run begins, at rest, as if the body had just been moved there from the
+            reference positions. No stress has relaxed yet, and the fluid responds to the change of volume in the first
+            step. None: the reference positions. If elements are inverted there, use robust = "projected": then a static
+            scene takes `start` as a guess. If the guess is inverted or leads to no solution, the run begins at the
+            reference positions.
+        report: a function that is called on the host with the number of each finished step, to show progress.
+        store: what reverse mode keeps. "all": the end of every step; a whole number: this number of states; "sqrt": the
+            square root of the number of steps. The steps between kept states run a second time. Without a derivative it
+            has no effect. See `liverjax.simulation.gradients`.
+        mesh_error: whether to estimate the error of the mesh (`liverjax.simulation.mesh_error`). Then the run must
+            begin in the reference positions.
 
     Raises:
-        InputError: unknown choices; no time step or mass where one is needed; numbers out of bounds, unless traced;
-            a loaded mesh without a reference shape (traced: its points are NaN, its steps NOT_FINITE); precision
-            "float64" if JAX's 64-bit mode is off.
-            `check_scene` checks more, the mesh above all; reading a scene file calls it.
+        InputError: unknown choices; a time step or a mass is missing; numbers out of bounds, unless they are traced; a
+            loaded mesh for which no reference shape is found (if traced: its points are NaN and its steps are
+            NOT_FINITE); precision "float64" although JAX's 64-bit mode is off. `check_scene` checks more, mainly the
+            mesh. It is called when a scene file is read.
     """
     scene = prepared(scene)
     check_time_and_mass(scene)
@@ -159,16 +160,17 @@ def simulate_part(
     count: int,
     report: Callable[[int], None] | None = None,
 ) -> tuple[Result, State]:
-    """Some steps of a run, and the state to continue from, so that a long run can be kept in parts. Not differentiable.
+    """Some steps of a run, and the state after them, so that a long run can be stored in parts. Not differentiable.
 
     Args:
         scene: `Scene`.
-        state: the state after the steps before; `initial_state(prepared(scene))` at the beginning.
+        state: the state after the previous step; at the beginning `initial_state(prepared(scene))`.
         first: number of the first step, from 1; may be traced.
-        count: how many steps. Those beyond the last of the scene are skipped; their rows are zeros.
+        count: number of steps. Steps after the last step of the scene are skipped; their rows are zeros.
         report: as in `simulate`.
 
-    Every part begins with a new tangent, so that a run continued from a stored state has the same bits.
+    Every part begins with a new tangent, so that a run which continues from a stored state gives exactly the same
+    result.
 
     Raises:
         InputError: as `simulate`.
@@ -179,9 +181,10 @@ def simulate_part(
 
 
 def prepared(scene: Scene) -> Scene:
-    """The scene as it is run: numbers by element, a linear solver chosen, in its precision. Runs do it themselves.
+    """The scene in the form in which it is run: numbers by element, a linear solver, the scene's precision.
 
-    Inside `jax.jit` numbers are not known, and `linear_solver = "auto"` iterates: call this before, to let it choose.
+    `simulate` calls this function. But inside `jax.jit` numbers are not known, so `linear_solver = "auto"` then means
+    iterations. Call this function before `jax.jit` if a factorisation may be chosen.
 
     Raises:
         InputError: as `simulate`.
@@ -191,14 +194,15 @@ def prepared(scene: Scene) -> Scene:
 
 
 def unloaded(scene: Scene) -> Unloaded:
-    """The scene whose loads lead to the given mesh; its points have derivatives by all numbers of the scene.
+    """The scene with the reference shape that its loads deform into the given mesh.
 
-    Loads are those at the beginning of the run: histories count at time 0, and prescribed motion has not begun. Forces
-    are those of a body that has lain there long: viscosity has relaxed. Quadratic elements keep the given vertices;
-    their edges are straight in the reference shape.
+    The reference points have derivatives with respect to all numbers of the scene. The loads are those at the beginning
+    of the run: histories have their value at time 0, and prescribed motion has not begun. The body has been under these
+    loads for a long time: viscosity has relaxed. Under load the vertices of quadratic elements are the given ones; in
+    the reference shape the edges of these elements are straight.
 
     Raises:
-        InputError: as `simulate`; a porous scene; no reference shape was found (traced: its points are NaN).
+        InputError: as `simulate`; a porous scene; no reference shape was found (if traced: the points are NaN).
     """
     found = unload(_ready(replace(scene, points_are="loaded")))
     whole = replace(scene, mesh=with_points(scene.mesh, found.scene.mesh.points), points_are="reference")
@@ -206,7 +210,7 @@ def unloaded(scene: Scene) -> Unloaded:
 
 
 def _ready(scene: Scene) -> Scene:
-    """`prepared`, with the points as they are given."""
+    """The scene as in `prepared`, but with the given points."""
     check_before_run(scene)
     if scene.solve.kind == "harmonic":
         raise InputError(

@@ -1,4 +1,4 @@
-"""One load or time step of a scene: it solves the equations and returns the next state."""
+"""One load or time step of a scene: solve the equations and return the next state."""
 
 from functools import partial
 from typing import Any
@@ -59,7 +59,7 @@ def problem_of(e: Equations) -> Problem:
         tangent=partial(_tangent, e, "true"),
         solve=partial(tangent.solve, e),
         preconditioner=partial(tangent.preconditioner, e),
-        # Where nodes move together on circles, the tangent is that of small turns: near, but not the derivative.
+        # If nodes move together on circles, the tangent is of small rotations: close to the derivative, but not equal.
         adjoint=partial(adjoint, e) if e.conservative and not e.free.tied else None,
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
@@ -72,7 +72,7 @@ def problem_of(e: Equations) -> Problem:
 
 
 def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangent.Tangent | None]:
-    """The empty `Kept` of a run that begins with these equations, and with `tangent_too` the first tangent."""
+    """The empty `Kept` of a run that begins with these equations, and the first tangent if `tangent_too`."""
     method, q = problem_of(first), unknowns(first, first.state.x)
     kept = step_cutting.nothing_kept(method, q)
     if not tangent_too:
@@ -82,7 +82,7 @@ def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangen
 
 
 def _flowing(e: Equations) -> Beside | None:
-    """The pressures of a flowing fluid that depend on the motion; None: there are none."""
+    """The pressures of a flowing fluid that depend on the motion; None: the scene has no such pressures."""
     volume: Any = e.volume
     if volume is None or volume.flow is None:
         return None
@@ -103,13 +103,13 @@ def _definite(
 
 
 def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
-    """The reference shape, and whether the first step begins at another one, which without inertia is a guess."""
+    """The unknowns of the reference shape, and whether the first step begins at another shape (in statics: a guess)."""
     points = e.mesh.points
     return unknowns(e, points), (e.k == 1) & jnp.any(e.free.vectors(e.state.x - points) != 0)
 
 
 def _finite(e: Equations) -> Equations:
-    """The same body of stable neo-Hookean material. It keeps the other physics that act at nodes."""
+    """The equations of the same body with stable neo-Hookean material. Physics that act at nodes stay the same."""
     law = e.scene.law
     mu = law.shear_modulus()
     own = [p.bulk_modulus() for p in e.physics if p.bulk_modulus() is not None]
@@ -122,9 +122,9 @@ def _finite(e: Equations) -> Equations:
 def step(
     e: Equations, kept: Kept | None = None, near: Any = None, differentiable: bool = True
 ) -> tuple[State, jax.Array, StepStatistics, Kept]:
-    """The next state, the reactions (V, 3) [N], statistics of the solve and the tangent for the next step.
+    """The next state, the reactions (V, 3) [N], the statistics of the solve and the tangent for the next step.
 
-    `kept` is the tangent of the last step; derivatives may use the coarse space of `near`.
+    `kept` is the tangent of the last step. Derivatives may use the coarse space of the tangent `near`.
     """
     scene, x, solve = e.scene, e.state.x, e.scene.solve
     options = StepOptions(
@@ -133,7 +133,7 @@ def step(
         one_step=solve.newton == "one_step",
         differentiable=differentiable,
     )
-    # With inertia the guess is a motion at constant velocity; a one-step solve starts at x, as in the chapter.
+    # With inertia the guess is a motion at constant velocity. A one-step solve starts at x, as in the book chapter.
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
     problem = problem_of(e)
@@ -156,10 +156,11 @@ def adjoint(
     max_iterations: int,
     earlier: Earlier | None = None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve K x = b with the pressures, for derivatives. Return x, its load (3 V,) and its residual over |b|.
+    """Solve K x = b together with the pressures, for derivatives. Return x, the load (3 V,) and the residual over |b|.
 
-    With a flowing fluid, b and x contain its pressures too: b has forces and minus the balance of volumes. In the load
-    this balance is eliminated. Iterations begin with `earlier` solves if that helps. No load may follow the body.
+    With a flowing fluid, x also contains its pressures, and b contains forces and minus the balance of volumes. In the
+    returned load this balance is eliminated, and the residual is divided by the norm of this load. Iterations begin
+    with a combination of `earlier` solves if this reduces the residual. No load may follow the body.
     """
     volume = tangent.volume_with_pressures(e)
     flows = e.mixed is None and volume is not None and volume.flow is not None
@@ -182,26 +183,26 @@ def adjoint(
     return x, b, residual
 
 
-#: In `_with_flow`: tolerances of its solves for motions and for pressures, most refinements, and most of them in a row
-#: without a gain: a loose solve for pressures far off may make the residual larger.
+#: For `_with_flow`: tolerances of the solves for motions and for pressures, maximum number of refinements, and maximum
+#: number of successive refinements without a smaller residual. Far from the solution an inaccurate solve for pressures
+#: may make the residual larger.
 _INNER, _INNER_PRESSURE, _REFINEMENTS, _VAIN = 5e-2, 1e-2, 60, 3
 
 
 def _with_flow(
     e: Equations, K: tangent.Tangent, b: jax.Array, limits: tuple[Number, int], earlier: Earlier | None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`adjoint` of the mixed system with a flowing fluid, by iterative refinement.
+    """`adjoint` for the mixed system with a flowing fluid, by iterative refinement.
 
-    Motions and pressures are refined together, so no solve for pressures is more accurate than needed.
+    Motions and pressures are refined together, so the solves for pressures are only as accurate as needed.
     """
     volume: Any = tangent.volume_with_pressures(e)
     n, flow, (tolerance, max_iterations) = 3 * e.mesh.number_of_nodes, volume.flow, limits
     loose = flow._replace(tolerance=_INNER_PRESSURE)
-    given = (flow.mask - 1) * b[n:]  # the solution's rows of given pressures
+    given = (flow.mask - 1) * b[n:]  # the rows of the solution for given pressures
 
     def left(x: jax.Array, P: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The forces still out of balance after the pressures balance the volumes, and the change of pressures for
-        that."""
+        """Forces out of balance after a change of pressures that balances the volumes, and this change."""
         motion = e.free.columns(block_matrix.columns(x))
         force, balance = mixed_system.balances(e.mesh, K.matrix, motion)
         balance = balance - b[n:] - darcy.flow_product(flow, P)
@@ -216,7 +217,7 @@ def _with_flow(
     def step(c):
         x, P, r, dP, least, vain, k = c
         size = jnp.linalg.norm(r)
-        # The last refinement is only as accurate as needed.
+        # The accuracy of the last refinement is not higher than needed.
         inner = jnp.clip(0.3 * tolerance * scale / size, _INNER, 0.5)
         x, P = x + tangent.solve(e, K, r, inner, max_iterations)[0], P + dP
         r, dP = left(x, P)

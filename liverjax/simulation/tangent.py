@@ -1,8 +1,9 @@
-"""The tangent of a scene's forces, from hand-derived blocks, and linear solves with it.
+"""The tangent of a scene's forces, computed from hand-derived blocks, and linear solves with this tangent.
 
 The physics of the scene decide the method. Conjugate gradients solve symmetric systems, after nodal pressures are
-eliminated. BiCGSTAB solves systems with loads that follow the body. The preconditioner is the same for all: the inverse
-diagonal blocks and, where slow motions would slow them down, a coarse space.
+eliminated. BiCGSTAB solves the other systems: with loads that follow the body or friction (they are not symmetric), and
+with pressures as unknowns (their preconditioner is not symmetric). The preconditioner consists of the inverse diagonal
+blocks and, if slowly varying motions would need many iterations, of a coarse space.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,15 +44,17 @@ from liverjax.tensors.matrices import (
 _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
 
-#: How the stiffness of elements is made: true, without negative eigenvalues, or as in the chapter's section 4.1.2 iii.
+#: Kinds of element stiffness: the true one, one without negative eigenvalues, and the one of section 4.1.2 iii of the
+#: book chapter.
 KINDS = ("true", "projected", "regularised")
 
-#: One of `KINDS`; or one of the last two with a flag of the running program: if it is false, the true one is used.
+#: One of `KINDS`; or one of the last two with a flag that the running program computes. If the flag is false, the true
+#: stiffness is used.
 Kind = str | tuple[str, jax.Array]
 
 
 def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
-    """Call `make` for a kind. For a kind chosen at run time the program contains both kinds."""
+    """Call `make` with the kind. If the kind is chosen at run time, the program contains both kinds."""
     if isinstance(kind, str):
         return make(kind)
     name, taken = kind
@@ -59,7 +62,7 @@ def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
 
 
 def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: Kind = "true") -> dict[tuple[int, int], Matrix]:
-    """K_ab [N/m] of corners 1 <= a <= b <= 3 of every point, at given nodal pressures (V,) [Pa] or None."""
+    """K_ab [N/m] of corners 1 <= a <= b <= 3 at every integration point, at given nodal pressures (V,) [Pa] or None."""
     return _of_kind(kind, partial(_own_blocks, e, pressure, F))
 
 
@@ -92,13 +95,13 @@ def element_blocks(
 
 
 def stiffness(e: Equations, pressure: jax.Array | None, x: jax.Array, kind: Kind = "true") -> BlockMatrix:
-    """Derivative of all forces at positions x (V, 3) [m] and given pressures (V,) [Pa], or None."""
+    """Derivative of element and nodal forces at positions x (V, 3) [m], at given pressures (V,) [Pa] or None."""
     K = element_blocks(e, pressure, deformation_gradient(e.mesh, x), kind)
     return block_matrix.force_matrix(e.mesh, K, node_blocks(e))
 
 
 def node_blocks(e: Equations) -> Block | None:
-    """Diagonal entries (V,) [N/m] of physics at nodes; None: there are none."""
+    """Sum of the diagonal entries (V,) [N/m] of physics at nodes; None: no physics has such entries."""
     total: Block | None = None
     for a in e.nodal:
         own = a.stiffness()
@@ -108,7 +111,7 @@ def node_blocks(e: Equations) -> Block | None:
 
 
 def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Between, ...]:
-    """Stiffness of the physics' elements between nodes, and its losses (`GivesWay`)."""
+    """Stiffness of elements between nodes, and the losses of this stiffness (`GivesWay`), of all physics at nodes."""
 
     def of(kind: str) -> tuple[Between, ...]:
         found: list[Between | None] = []
@@ -121,9 +124,7 @@ def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Betwee
 
 
 def _symmetric(e: Equations, more: tuple[Between, ...]) -> tuple[Attached, ...]:
-    """The part of elements between nodes that a preconditioner uses: the symmetric one, since the stiffness of friction
-    is not symmetric.
-    """
+    """The symmetric part of the elements between nodes, for a preconditioner: friction's stiffness is not symmetric."""
     elements = tuple(own for own in more if isinstance(own, Attached))
     return elements if e.conservative else tuple(attached.symmetric_part(own) for own in elements)
 
@@ -135,29 +136,29 @@ def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -
 
 
 def _shift(e: Equations) -> jax.Array | None:
-    """Stiffness (V,) [N/m] that acts on every node, or None. It keeps slow motions small."""
+    """Stiffness (V,) [N/m] that acts on every node, or None. It limits slowly varying motions."""
     own = [a.stiffness() for a in e.nodal if a.everywhere]
     return own[0][0][0] if own and own[0] is not None else None
 
 
 def volume_with_pressures(e: Equations) -> VolumeStress | None:
-    """The physics whose pressures are unknowns together with the positions; None: there is none."""
+    """The physics whose pressures are coupled to the motion; None: no physics has such pressures."""
     return e.volume if e.volume is not None and e.volume.coupled else None
 
 
 class Tangent(NamedTuple):
-    """A tangent ready to be solved with: assembled at one point, good for some iterations near it."""
+    """A tangent with its preconditioner. It is assembled at one point and used for some iterations near this point."""
 
     matrix: BlockMatrix | PointMatrix
-    inverse: Inverses  # of its diagonal blocks
-    vertices: Inverses | None  # of quadratic elements: of the diagonal blocks of the vertices' linear elements
+    inverse: Inverses  # of the diagonal blocks of the matrix
+    vertices: Inverses | None  # quadratic elements: of the diagonal blocks of linear elements with the same vertices
     slow: Coarse
-    x: jax.Array | None  # (V, 3) where it was made, for loads that follow the body
-    s: Any  # part of the step there
-    follows: jax.Array | None  # 1 if these loads count, 0 in a tangent without negative eigenvalues
+    x: jax.Array | None  # (V, 3) positions of the assembly, for loads that follow the body
+    s: Any  # fraction of the step at the assembly
+    follows: jax.Array | None  # 1 if K contains these loads, 0 if K has no negative eigenvalues
     attached: tuple[Between, ...] = ()  # elements between nodes, not in the matrix
     pressures: Coarse | None = None  # coarse space of unknown pressures in thin cells
-    #: Whether `solve` eliminates unknown pressures first; None: it never does.
+    #: Whether `solve` eliminates unknown pressures first; None: never.
     eliminates: jax.Array | None = None
 
 
@@ -169,10 +170,10 @@ def tangent(
     near: tuple[Any, Tangent] | None = None,
     kind: Kind = "true",
 ) -> Tangent:
-    """The derivative of the forces at positions x (V, 3) [m], at part s of the step.
+    """The derivative of the forces at positions x (V, 3) [m], at fraction s of the step.
 
-    `pressure` (V,) [Pa] is that of the nodes, or None; `near` a flag, and a tangent whose coarse space is used if the
-    flag is true; `kind` is a `Kind`. Everything in the result is without derivative.
+    `pressure` (V,) [Pa] is the pressure at the nodes, or None. `near` is a flag and a tangent: if the flag is true, the
+    coarse space of this tangent is used. `kind` is a `Kind`. JAX does not differentiate the result.
     """
     e, pressure, x, s = jax.lax.stop_gradient((e, pressure, x, s))
     name, taken = (kind, None) if isinstance(kind, str) else kind
@@ -182,7 +183,7 @@ def tangent(
         return _coarse(e, A)
 
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
-    # Loads that follow the body need the place where the tangent was made.
+    # Loads that follow the body need the positions at which the tangent was assembled.
     where, part, follows = (None, None, None) if e.conservative else (x, s, _true(kind, x.dtype))
     eliminates = ~_true(kind, bool) if kind != "true" and eliminates_pressures(e) else None
     K = Tangent(matrix, inverse, below, slow, where, part, follows, more, eliminates=eliminates)
@@ -197,19 +198,20 @@ def tangent(
 
 
 def eliminates_pressures(e: Equations) -> bool:
-    """Whether a tangent without negative eigenvalues is solved with its unknown pressures eliminated.
+    """Whether unknown pressures are eliminated in solves with a tangent that has no negative eigenvalues.
 
-    Far from a solution pressures are as large as the bulk modulus, and so is the stiffness that they give. Iterations
-    for positions and pressures together are scaled by the shear modulus and do not end there; positions alone have a
-    positive matrix. The matrix of the pressures of linear elements has no simple inverse.
+    Far from a solution the pressures are as large as the bulk modulus, and their stiffness is as large, too. Iterations
+    for positions and pressures together are scaled by the shear modulus and do not converge there. After the
+    elimination the matrix of the positions is positive. For linear elements the matrix of the pressures has no simple
+    inverse, so they are not eliminated.
     """
     return e.mixed is not None and e.mesh.order > 1 and e.scene.solve.linear_solver != "direct"
 
 
 def _thin(e: Equations) -> bool:
-    """Whether pressures are unknown in thin cells of linear elements.
+    """Whether unknown pressures of linear elements get a coarse space: if cells are thin.
 
-    In strongly compressed quadratic elements their coarse space increases the number of iterations.
+    In strongly compressed quadratic elements it would increase the number of iterations.
     """
     return e.mixed is not None and e.mesh.order == 1 and _groups_in_use(e, e.mesh.pattern.clusters) is not None
 
@@ -218,7 +220,7 @@ def _thin(e: Equations) -> bool:
 def _slow_pressures(e: Equations, K: Tangent) -> Coarse:
     """The coarse space of the pressures, with motions eliminated approximately.
 
-    In a layer between plates, pressures that vary slowly along it cause much less motion than their mass matrix
+    In a layer between plates, pressures that vary slowly along the layer cause much less motion than their mass matrix
     suggests.
     """
     motions, volume = _motions(e, K), e.mixed
@@ -236,7 +238,7 @@ def _true(kind: Kind, dtype: Any) -> jax.Array:
     return jnp.asarray(kind == "true" if isinstance(kind, str) else ~kind[1], dtype)
 
 
-#: Matrix, inverse and vertices of a `Tangent`, the matrix that its coarse space is made of, and elements between nodes.
+#: Matrix, inverse and vertices of a `Tangent`, the matrix for its coarse space, and elements between nodes.
 _Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Between, ...]]
 
 # The two functions below occur several times in a program: within jit they are traced once.
@@ -271,7 +273,7 @@ def _assembled(
 
 
 def _vertex_inverses(e: Equations, free: Free, A: BlockMatrix, diagonal: Block) -> Inverses:
-    """Inverse blocks of the vertices of a matrix with the given diagonal blocks, and of clusters of them."""
+    """Inverses of the given diagonal blocks of a matrix of the vertices, and inverses for clusters of vertices."""
     single = block_matrix.inverse_blocks(diagonal, free.mask, free.normals)
     groups = _groups_in_use(e, e.mesh.pattern.clusters)
     entries = clusters.of_rows(groups, e.mesh.pattern.edge_slots, A)
@@ -279,7 +281,7 @@ def _vertex_inverses(e: Equations, free: Free, A: BlockMatrix, diagonal: Block) 
 
 
 def _groups_in_use(e: Equations, groups: Any) -> Any:
-    """Clusters if they are used: not with a factorisation, nor with nodes that slide on oblique planes."""
+    """The clusters, or None if they are not used: with a factorisation, or if nodes slide on oblique planes."""
     return None if e.free.normals is not None or e.scene.solve.linear_solver == "direct" else groups
 
 
@@ -291,7 +293,7 @@ def _coarse(e: Equations, A: BlockMatrix) -> Coarse:
 
 
 def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number, kind: Kind) -> _Assembled:
-    """The tangent of quadratic elements: moduli at their points, and two levels of a preconditioner."""
+    """The tangent of quadratic elements: blocks at their integration points, and a preconditioner with two levels."""
     mesh, volume = e.mesh, volume_with_pressures(e)
     F = deformation_gradient(mesh, x)
     A = PointMatrix(stored(own_blocks(e, pressure, F, kind)), node_blocks(e), None, None)
@@ -331,13 +333,13 @@ def _vertex_shift(e: Equations) -> jax.Array | None:
 
 
 def _coarse_mask(free: Free) -> jax.Array:
-    """1 where coarse motions act, else 0, (V, 3). Nodes whose sliding plane is oblique take no part."""
+    """1 where coarse motions act, else 0, (V, 3). It is 0 for nodes that slide on an oblique plane."""
     mask, normals = free[:2]
     return mask if normals is None else mask * jnp.all(normals == 0, axis=1, keepdims=True)
 
 
 def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]:
-    """Inverse diagonal blocks, with the coarse solution added, as a function of flat vectors (3 V,)."""
+    """The preconditioner: inverse diagonal blocks plus the coarse solution, as a function of flat vectors (3 V,)."""
     return _with_pressures(e, K, _motions(e, K))
 
 
@@ -369,7 +371,7 @@ def _motions(e: Equations, K: Tangent) -> Callable:
 
 
 def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[jax.Array], jax.Array]:
-    """A preconditioner of columns (V,) as a function of flat vectors, with pressures if these are unknowns."""
+    """The preconditioner `motions` of columns (V,) as a function of flat vectors, with unknown pressures if any."""
     if e.mixed is None:
         return lambda r: flat_free(e, motions(block_matrix.columns(r)))
     volume, n = e.mixed, 3 * e.mesh.number_of_nodes
@@ -378,7 +380,7 @@ def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[ja
     slow = None if K.pressures is None else correction(e.mesh, K.pressures, every)
 
     def triangular(r: jax.Array) -> jax.Array:
-        """Solve for the pressures first, then for the motions under the forces that are left."""
+        """Solve for the pressures first, then for the motions that the remaining forces cause."""
         dp = -r[n:] / schur
         if slow is not None:
             dp = dp - slow((r[n:],))[0] / volume.unit**2
@@ -397,7 +399,10 @@ def flat_free(e: Equations, columns: Any) -> jax.Array:
 
 
 def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Array], jax.Array]:
-    """K as a function of flat vectors (3 V,). Pressures that depend on motion are solved roughly, or `exactly`."""
+    """K as a function of flat vectors (3 V,).
+
+    If `exactly` is false, pressures that depend on the motion are approximate.
+    """
     A, volume, n = K.matrix, volume_with_pressures(e), 3 * e.mesh.number_of_nodes
 
     def apply(v: jax.Array) -> jax.Array:
@@ -421,7 +426,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 def with_nodal_products(
     e: Equations, K: Tangent, motion: Sequence[jax.Array], force: Sequence[jax.Array]
 ) -> tuple[jax.Array, ...]:
-    """Forces, columns (V,), plus forces of elements between nodes and of loads that follow the body, for a motion."""
+    """`force` plus, for a motion, forces of elements between nodes and of loads that follow the body; columns (V,)."""
     for own in K.attached:
         force = block_matrix.sums(force, attached.product(own, motion))
     following = [a for a in e.nodal if not a.conservative]
@@ -436,7 +441,7 @@ def with_nodal_products(
 def solve(
     e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve K dq = b; return dq, the iterations (0 for a factorisation), and whether K seems to be positive."""
+    """Solve K dq = b. Return dq, the iterations (0 for a factorisation), and whether K seems to be positive."""
     if e.scene.solve.linear_solver == "direct":
         dq = factorised_solution(e, K, b)
         # With unknown pressures the matrix has negative eigenvalues anyway.
@@ -444,7 +449,7 @@ def solve(
         return dq, jnp.zeros((), jnp.int32), positive
     if K.eliminates is not None:
         return _one_of_both(e, K, K.eliminates, b, (tolerance, max_iterations))
-    # A block-triangular preconditioner is not symmetric either.
+    # With unknown pressures the preconditioner is block-triangular, so it is not symmetric.
     method = conjugate_gradients if e.conservative and e.mixed is None else stabilised_biconjugate_gradients
     dq, s = method(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
     return dq, s.iterations, s.positive
@@ -453,7 +458,7 @@ def solve(
 def _one_of_both(
     e: Equations, K: Tangent, flag: jax.Array, b: jax.Array, limits: tuple[Number, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`solve`, where `flag` says whether pressures are eliminated; the other solve has the load 0 and ends at once."""
+    """`solve` with pressures eliminated if `flag` is true; the other solve has the load 0 and ends at once."""
     n, A, motions = 3 * e.mesh.number_of_nodes, K.matrix, _motions(e, K)
     assert isinstance(A, PointMatrix)
 
@@ -473,9 +478,9 @@ def _one_of_both(
 
 
 def factorised_solution(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
-    """Solve K dq = b by a factorisation, of the coupled matrix if pressures depend on motion (b may contain them)."""
+    """Solve K dq = b by a factorisation; with pressures the matrix is coupled, and b may contain their entries."""
     n, volume, nothing = 3 * e.mesh.number_of_nodes, volume_with_pressures(e), jnp.ones(0)
-    # In the factorised matrix pressures push inwards, and their balance has a minus sign.
+    # In the factorised matrix positive pressures push inwards, and the balance has a minus sign.
     unit = 1.0 if e.mixed is None else -e.mixed.unit
     free, load, balance = e.free.mask.T, b[:n].reshape(3, -1), b[n:] / unit
     if isinstance(K.matrix, PointMatrix):

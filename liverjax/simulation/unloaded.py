@@ -1,12 +1,13 @@
 """The unloaded shape: reference positions from which the loads lead to the given positions.
 
-The unknowns are the displacements u. The vertices of the reference shape are X = x - u, with x the given positions.
-Quadratic elements are straight there, so the middles of their edges follow from the vertices; they move by
-displacements of their own. The out-of-balance forces of the body with reference shape X must vanish at X + u.
-For small u their derivative is the stiffness K, so K's preconditioner serves Newton's method with BiCGSTAB.
+The unknowns are the displacements u. The vertices of the reference shape are X = x - u, with x the given positions. In
+this shape quadratic elements have straight edges, so the positions of the edge middles follow from the vertices. The
+displacements of the edge middles are unknowns, too. A body with reference shape X must have no out-of-balance forces at
+X + u. For small u the derivative of these forces is the stiffness K. So Newton's method with BiCGSTAB uses the
+preconditioner of K.
 
-Source: Govindjee and Mihalic 1996, "Computational methods for inverse finite elastostatics"; here the same problem on
-the equations of the forward run.
+Source: Govindjee and Mihalic 1996, "Computational methods for inverse finite elastostatics". This module solves the
+same problem with the equations of the forward run.
 """
 
 from typing import NamedTuple
@@ -29,7 +30,7 @@ from liverjax.simulation.equations import Equations, Sizes, equations, force_siz
 from liverjax.solvers.block_matrix import columns, flat
 from liverjax.solvers.newton import NewtonOptions, newton_root
 
-#: Halvings save a step that goes too far; linear solves need few digits until the last one.
+#: A step that is too long is halved. Only the last linear solve needs high accuracy.
 _OPTIONS = NewtonOptions(max_iterations=50, linear_tolerance=1e-2, max_halvings=12, symmetric=False)
 
 
@@ -37,15 +38,15 @@ class Unloaded(NamedTuple):
     """A reference shape, its status and its residual."""
 
     scene: Scene  # with the reference shape
-    status: jax.Array  # of `liverjax.core.status`; the points are NaN if it is not CONVERGED
-    residual: jax.Array  # |r| over the forces at work
+    status: jax.Array  # of `liverjax.core.status`; under jit the points are NaN if it is not CONVERGED
+    residual: jax.Array  # |r| over the norm of all forces
 
 
 def unload(scene: Scene) -> Unloaded:
-    """See `liverjax.simulation.run.unloaded`; for a scene as it is run.
+    """`liverjax.simulation.run.unloaded` for a scene in the form in which it is run.
 
     Raises:
-        InputError: no reference shape was found; traced numbers pass.
+        InputError: no reference shape was found. With traced numbers nothing is raised.
     """
     points, code, relative = _found_shape(resting(scene))
     if not isinstance(code, jax.core.Tracer) and int(code) != status.CONVERGED:
@@ -59,7 +60,7 @@ def unload(scene: Scene) -> Unloaded:
 
 
 def resting(scene: Scene) -> Scene:
-    """The same body after a long rest under the loads of time 0."""
+    """The same body after a long time at rest under the loads of time 0."""
     if scene.springpots is not None:
         scene = replace(scene, viscosity=series_at_rest(scene.springpots), springpots=None)
     law = scene.law
@@ -74,7 +75,7 @@ def resting(scene: Scene) -> Scene:
 
         law = law.each(relaxed)
     held = tuple(Fixed(nodes=d.nodes, axes=d.axes) for d in scene.displaced)
-    # A step without length: histories are at their beginning.
+    # With a step of length 0, histories have their first value.
     solve = replace(scene.solve, kind="static", steps=1, dt=0.0, newton="converged", robust="off")
     changed: Content = {"fixed": (*scene.fixed, *held), "physics": tuple(p.at_beginning() for p in scene.physics)}
     return replace(scene, law=law, viscosity=None, displaced=(), solve=solve, points_are="reference", **changed)
@@ -82,18 +83,18 @@ def resting(scene: Scene) -> Scene:
 
 @jax.jit
 def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Reference positions (V, 3) [m], code, and the residual over the forces at work."""
+    """Reference positions (V, 3) [m], status code, and the residual over the norm of all forces."""
     one, given = jnp.ones((), scene.mesh.points.dtype), scene.mesh.points
     sizes = force_sizes(scene)
     first = jax.lax.stop_gradient(equations(scene, initial_state(scene), one, sizes))
     q = unknowns(first, given)
-    # All forces on the given shape without strain: the residual is compared with their size.
+    # The norm of all forces on the given shape without strain: the residual is divided by it.
     _, loads, pressure = jax.lax.stop_gradient(residual(first, q, one))
     K = tangent.tangent(first, pressure, given, one)
 
     def held(z: jax.Array) -> jax.Array:
         e, q = _with_displacements(scene, given, z, sizes)
-        # Unknowns that are not free must vanish themselves, so that the matrix has no empty rows.
+        # Unknowns that are not free must be 0. Their equations are added, so that the matrix has no empty rows.
         return residual(e, q, one)[0] + (z - _free_part(first, z))
 
     options = _OPTIONS._replace(tolerance=jax.lax.stop_gradient(scene.solve.tolerance))
@@ -105,7 +106,7 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def _free_part(e: Equations, z: jax.Array) -> jax.Array:
-    """The free part of the unknowns: displacements, then unknown pressures."""
+    """The unknowns with 0 for displacements that are not free: first displacements, then unknown pressures."""
     n = 3 * e.mesh.number_of_nodes
     return jnp.concatenate([jnp.concatenate(e.free.columns(columns(z[:n]))), z[n:]])
 
@@ -116,7 +117,7 @@ def _reference_shape(mesh: TetMesh, given: jax.Array, e: Equations, z: jax.Array
 
 
 def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
-    """The equations of the body with the reference shape of z, and its unknowns."""
+    """The equations of the body with the reference shape that z gives, and the unknowns of its positions."""
     n = 3 * scene.mesh.number_of_nodes
     still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)
     mesh = _reference_shape(scene.mesh, given, still, z)

@@ -1,1 +1,1 @@
-"""Block matrices, Krylov methods, factorisation, preconditioner, Newton along a load, minimisation."""
+"""Block matrices, Krylov methods, factorisation, preconditioners, Newton's method along a load, and minimisation."""

@@ -1,4 +1,4 @@
-"""Small elements that are attached to nodes of the body, and masses that nodes of an element share."""
+"""Stiffness of small elements between nodes of the body, and masses that the nodes of an element share."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,14 +20,14 @@ class Attached(NamedTuple):
 
 
 class GivesWay(NamedTuple):
-    """The change -h h^T / size of a stiffness by one unknown that follows the motion, such as an obstacle's travel."""
+    """The change -h h^T / size of a stiffness by one eliminated unknown, for example the travel of an obstacle."""
 
-    h: jax.Array  # (V, 3) [N/m] forces of the nodes per unit of this unknown
-    size: jax.Array  # () [N/m] stiffness of this unknown alone
+    h: jax.Array  # (V, 3) [N/m] forces on the nodes per unit of this unknown
+    size: jax.Array  # () [N/m] stiffness of this unknown if the nodes do not move
 
 
 class Masses(NamedTuple):
-    """The rest of the elements' consistent mass without the nodes' diagonal masses, or its stiffness in a time step."""
+    """The elements' consistent mass minus the nodes' diagonal masses, or the stiffness of this mass in a time step."""
 
     nodes: jax.Array  # (n, E)
     signs: jax.Array  # (n, E) signs of functions that have a direction
@@ -40,7 +40,7 @@ Between = Attached | GivesWay | Masses
 
 
 def masses(mesh: TetMesh, matrix: np.ndarray, size: jax.Array) -> Masses:
-    """`Masses` of a matrix (n, n) times a number for each element (E,)."""
+    """`Masses` with the matrix (n, n) times one number for each element (E,)."""
     nodes = jnp.stack(mesh.element_nodes)
     signs = mesh.oriented(jnp.ones((len(nodes), 1, nodes.shape[1]), size.dtype))[:, 0]
     return Masses(nodes, signs, jnp.asarray(matrix, size.dtype), size)
@@ -67,7 +67,7 @@ def product(A: Between, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
 
 def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
     """Diagonal blocks, 3 x 3 of (V,)."""
-    # If two places of an element are the same node, the blocks between them are on the diagonal too.
+    # If an element has the same node twice, the blocks between both are on the diagonal, too.
     same = A.nodes[:, None] == A.nodes[None]
     own = jnp.sum(jnp.where(same[:, None, :, None], A.blocks, 0.0), axis=2)  # (n, 3, 3, m)
     own = jnp.zeros((number_of_nodes, 3, 3), own.dtype).at[A.nodes].add(jnp.transpose(own, (0, 3, 1, 2)))
@@ -75,7 +75,7 @@ def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
 
 
 def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -> BlockMatrix:
-    """The matrix of the vertices plus the elements' blocks between vertices that are neighbours in the body."""
+    """The matrix of the vertices plus the elements' blocks, as far as their vertices are neighbours in the body."""
     if not attached:
         return A
     rows = jnp.stack([jnp.stack(row[:3]) for row in A.rows[:3]])
@@ -93,7 +93,7 @@ def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -
 
 
 def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
-    """The elements for motions that are linear along edges: the middle of an edge moves by the mean of its ends."""
+    """The elements for motions that are linear along edges: a middle moves by the mean of the edge's ends."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     edge = jnp.clip(A.nodes - V, 0, low.shape[0] - 1)
     is_vertex = A.nodes < V

@@ -1,4 +1,4 @@
-"""Threads of BLAS, the library of NumPy's and SciPy's dense matrices."""
+"""Threads of BLAS, the library that NumPy and SciPy use for dense matrices."""
 
 from contextlib import AbstractContextManager
 from functools import cache
@@ -7,16 +7,17 @@ from threadpoolctl import ThreadpoolController
 
 
 def one_blas_thread() -> AbstractContextManager:
-    """Limit BLAS to one thread inside a `with` block, for code with threads of its own or with small matrices.
+    """Limit BLAS to one thread inside a `with` block, for code with several threads or with small matrices.
 
-    Its threads would wait for ours: a factorisation took three times as long, the step of a reduced model twice.
+    With more BLAS threads, these and our threads would wait for each other: a factorisation took three times as long,
+    and the step of a reduced model twice as long.
     """
     return _libraries().limit(limits=1, user_api="blas")
 
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """The libraries that are loaded. SciPy loads its own with its dense matrices."""
+    """The loaded BLAS libraries. `scipy.linalg` is imported because it loads a separate one."""
     import scipy.linalg  # noqa: F401
 
     return ThreadpoolController()

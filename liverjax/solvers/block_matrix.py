@@ -1,7 +1,7 @@
-"""Symmetric matrices of node blocks in padded rows: assembled from element blocks, multiplied without a search.
+"""Symmetric matrices of node blocks in padded rows, assembled from element blocks. Products need no search.
 
-Each block of an edge is scattered once. Forces do not change under translation, so a diagonal block is minus the sum of
-the other blocks in its row. Callers give the other terms of the diagonal.
+The block of each edge is added only once. Forces do not change under translation, so a diagonal block is minus the sum
+of the other blocks in its row. Callers give other terms of the diagonal.
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,21 +21,23 @@ Block = tuple[tuple[Any, ...], ...]
 
 
 class BlockMatrix(NamedTuple):
-    """A symmetric matrix (V m, V m) of m x m blocks, every entry an array over the nodes."""
+    """A symmetric matrix (V m, V m) of m x m blocks; each entry of a block is an array over the nodes."""
 
-    rows: Block  # of arrays (W, V): blocks of a node and its neighbours
-    diagonal: Block  # of arrays (V,)
-    nodes: jax.Array  # (W, V)
+    rows: Block  # arrays (W, V): blocks of a node and its neighbours
+    diagonal: Block  # arrays (V,)
+    nodes: jax.Array  # (W, V) neighbours
 
 
 def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
-    """Blocks of nodes and their neighbours, m x m of (W, V), from the element blocks of `PAIRS`, m x m of (E,).
+    """Blocks between nodes and their neighbours, m x m arrays (W, V).
 
-    An entry that is None in every block stays None.
+    They are sums of the element blocks of `PAIRS`, m x m arrays (E,).
+
+    An entry that is None in all element blocks stays None.
     """
     pattern: Pattern = mesh.pattern
     m = len(blocks[PAIRS[0]])
-    # Otherwise XLA:CPU computes every entry again in each of its scatters.
+    # Stored, since otherwise XLA:CPU would compute every entry again in each scatter.
     blocks = stored(blocks)
     number = pattern.edges.shape[1]
     swapped = {(a, b): mesh.tetrahedra[:, a] > mesh.tetrahedra[:, b] for a, b in PAIRS}
@@ -60,12 +62,12 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
 
 
 def row_sums(rows: Block) -> Block:
-    """Sums over the neighbours, m x m of (V,)."""
+    """Sums over the neighbours: m x m arrays (V,)."""
     return tuple(tuple(jnp.sum(entry, axis=0) for entry in row) for row in rows)
 
 
 def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], own: Block | None = None) -> BlockMatrix:
-    """The stiffness matrix, from the elements' 3 x 3 blocks between different nodes and from blocks that nodes add.
+    """The stiffness matrix, from the elements' 3 x 3 blocks between different nodes and from additional node blocks.
 
     Args:
         mesh: `TetMesh`.
@@ -79,7 +81,7 @@ def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], own: Block
 
 
 def added(a: Block, b: Block) -> Block:
-    """Sum of two blocks; an entry None is 0."""
+    """Sum of two blocks. An entry that is None counts as 0."""
 
     def plus(x: Number, y: Number) -> Number:
         return y if x is None else x if y is None else x + y
@@ -88,10 +90,10 @@ def added(a: Block, b: Block) -> Block:
 
 
 def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None = None) -> Block:
-    """Inverse 3 x 3 blocks: unit rows where `mask` (V, 3) is 0, the inverse mean where a block is not positive
-    definite.
+    """Inverse 3 x 3 blocks, with unit rows where `mask` (V, 3) is 0.
 
-    Nodes do not move along `normals` (V, 3), unit vectors or 0: there a block is replaced by its mean.
+    If a block is not positive definite, the inverse of the mean of its diagonal is used. Nodes do not move along
+    `normals` (V, 3), unit vectors or 0: along them a block is replaced by this mean.
     """
     if normals is not None:
         diagonal = _across(diagonal, normals)
@@ -121,18 +123,18 @@ def _across(A: Block, normals: jax.Array) -> Block:
 
 
 def applied(blocks: Block, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """The block of each node, m x k of (V,), times the k entries of the vector at this node, as columns (V,)."""
+    """Columns (V,): the block of each node, m x k arrays (V,), times the k entries of the vector at this node."""
     return tuple(_row(row, columns) for row in blocks)
 
 
 def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """A v as columns (V,), for the k columns (V,) of v, with the first k columns of the blocks and all their rows."""
+    """A v as columns (V,), for the k columns (V,) of v. All rows and the first k columns of the blocks are used."""
 
     def add(slot, total):
         near = [taken(column, A.nodes[slot]) for column in columns]
         return tuple(t + _row([e[slot] for e in row], near) for t, row in zip(total, A.rows, strict=True))
 
-    # One neighbour after the other, in a loop, so that gathered values stay in cache.
+    # A loop over the neighbours, so that gathered values stay in the cache.
     return jax.lax.fori_loop(0, A.nodes.shape[0], add, applied(A.diagonal, columns))
 
 
@@ -146,7 +148,7 @@ def sums(a: Sequence[jax.Array], b: Iterable[jax.Array]) -> tuple[jax.Array, ...
 
 
 def columns(vector: jax.Array) -> tuple[jax.Array, ...]:
-    """x, y and z (V,) of a flat vector (3 V,), in which all x come first."""
+    """x, y and z (V,) of a flat vector (3 V,), which has first all x, then all y, then all z."""
     return tuple(vector.reshape(3, -1))
 
 

@@ -1,7 +1,8 @@
-"""Dense inverse blocks of clusters of near nodes: a part of the preconditioner of meshes with thin cells.
+"""Dense inverse blocks for clusters of near nodes: a part of the preconditioner for meshes with thin cells.
 
-In a thin cell the nodes across it are coupled much more strongly than those along it, and block-Jacobi spreads a motion
-across by one node per iteration. So chains of near nodes (`liverjax.mesh.adjacency.Clusters`) are one block each.
+In a thin cell, nodes across the cell are coupled much more strongly than nodes along it. Block-Jacobi spreads a motion
+across the cell by only one node per iteration. So each cluster of near nodes (`liverjax.mesh.adjacency.Clusters`) is
+treated as one block.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.tensors.places import given, taken
 
-#: Number of entries between nodes that are computed at once, for quadratic elements.
+#: Number of blocks between nodes that are computed at the same time, for quadratic elements.
 _AT_ONCE = 2048
 
 
@@ -31,14 +32,16 @@ class Inverses(NamedTuple):
 def inverses(
     clusters: Clusters | None, entries: jax.Array | None, diagonal: Block, mask: jax.Array, single: Block
 ) -> Inverses:
-    """Inverse blocks of clusters and of single nodes; a cluster that is not positive definite counts as single nodes.
+    """Inverse blocks of clusters and of single nodes.
+
+    If a cluster is not positive definite, its nodes are single nodes.
 
     Args:
-        clusters: of the mesh; None: there are none.
-        entries: (n, 3, 3) blocks of the matrix, one for each source of the clusters.
-        diagonal: 3 x 3 of (V,), blocks of the matrix.
+        clusters: clusters of the mesh; None: the mesh has none.
+        entries: blocks (n, 3, 3) of the matrix, one for each source of the clusters.
+        diagonal: diagonal blocks of the matrix, 3 x 3 arrays (V,).
         mask: (V, 3) 1 where free.
-        single: inverse blocks of single nodes, 3 x 3 of (V,).
+        single: inverse blocks of single nodes, 3 x 3 arrays (V,).
     """
     if clusters is None or entries is None:
         return Inverses(single)
@@ -72,7 +75,7 @@ def smoothed(clusters: Clusters | None, A: Inverses, columns: Sequence[jax.Array
 
 
 def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) of a matrix of the vertices, one for each source of their clusters."""
+    """Blocks (n, 3, 3) of a matrix of the vertices, one for each source of the clusters."""
     if clusters is None:
         return None
     slots = taken(edge_slots, clusters.sources[0])
@@ -81,13 +84,13 @@ def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) ->
 
 
 def of_points(clusters: Clusters | None, order: int, A: PointMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) between all functions of elements, one for each source: sum over q, k, l of c_ak K_kl c_bl."""
+    """Blocks (n, 3, 3) between functions of elements, one for each source: the sum of c_ak K_kl c_bl over q, k, l."""
     if clusters is None:
         return None
     c = basis(order).c
     slopes = jnp.asarray(c[:, 1:] - c[:, :1], A.blocks[1, 1][0][0].dtype)  # (n, 3, Q)
     pairs = sorted(A.blocks)
-    # Element by element, so that the numbers of one element lie together in memory.
+    # The element is the first axis, so that the numbers of one element are close together in memory.
     K = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in pairs])
     K = jnp.moveaxis(K, -1, 0)  # (E, 6, 3, 3, Q)
 

@@ -1,6 +1,7 @@
 """Linear solves by a sparse factorisation on the host, for matrices that are too ill-conditioned for iterations.
 
-SciPy's SuperLU: time and memory grow faster than the mesh (n^1.5 to n^2), so this is for bodies of some thousand nodes.
+The factorisation is SciPy's SuperLU. Its time and memory grow faster than the mesh (n^1.5 to n^2), so it is for bodies
+with some thousand nodes.
 """
 
 from functools import partial
@@ -28,9 +29,9 @@ def solve(
     normals: jax.Array | None = None,
     attached: tuple[Between, ...] = (),
 ) -> jax.Array:
-    """Solution (m, V) of A x = b (m, V) for m x m blocks, 0 where `free` (m, V) is 0; NaN where A is singular.
+    """Solution (m, V) of A x = b (m, V) for m x m blocks; 0 where `free` (m, V) is 0; NaN if A is singular.
 
-    With `normals` (V, 3), unit vectors or 0, the first three rows of x are 0 along them. `attached` adds to A.
+    Along `normals` (V, 3), unit vectors or 0, the first three rows of x are 0. `attached` is added to A.
     """
     rows, diagonal = (jnp.stack([jnp.stack(row) for row in blocks]) for blocks in (A.rows, A.diagonal))
     shape = jax.ShapeDtypeStruct(b.shape, b.dtype)
@@ -48,8 +49,8 @@ def solve_points(
 ) -> jax.Array:
     """`solve` for quadratic elements, as a flat vector: positions (3 V,), then pressures of vertices if A has them.
 
-    `free` and `b` are two arrays each, of positions (3, V) and of pressures. Empty arrays for the pressures mean that
-    all are free and that their part of `b` is 0.
+    `free` and `b` are pairs of arrays: for positions (3, V) and for pressures. Empty arrays for the pressures mean that
+    all pressures are free and that their part of `b` is 0.
     """
     blocks = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in sorted(A.blocks)])
     own = None if A.own is None else _filled(A.own, b[0][0])
@@ -71,8 +72,8 @@ def _filled(blocks: Block, like: jax.Array) -> jax.Array:
 
 
 def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
-    """Matrix (size, size) with the block n n^T of every node, in the order of the unknowns."""
-    import scipy.sparse  # slow to import (a fifth of the package), so here and below only where it is used
+    """Matrix (size, size) with the block n n^T for every node, in the order of the unknowns."""
+    import scipy.sparse  # slow to import (a fifth of the package's time), so it is imported only where it is used
 
     number, own = len(normals), np.arange(len(normals))
     entries = [
@@ -83,8 +84,10 @@ def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
 
 
 def _entries(attached: tuple[Between, ...], n: int) -> list[tuple]:
-    """Values, lines and columns of the matrices of elements between nodes. In the order of the unknowns all x of the n
-    nodes come first."""
+    """Values, rows and columns of the matrices of elements between nodes.
+
+    Unknowns are all x of the n nodes, then y, z.
+    """
     found = []
     for nodes, blocks in (own for own in attached if isinstance(own, Attached)):
         at = (nodes[:, None] + n * np.arange(3)[None, :, None]).reshape(-1, nodes.shape[1])
@@ -118,7 +121,7 @@ def _solve(*given: object) -> np.ndarray:
 
 
 def _given_ways(attached: tuple[Between, ...], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """h (size, n) of every `GivesWay`, in the order of the unknowns, and the stiffness (n,) of each."""
+    """h (size, n) of all `GivesWay`, in the order of the unknowns, and their stiffnesses (n,)."""
     found = [own for own in attached if isinstance(own, GivesWay)]
     H = np.zeros((size, len(found)))
     for column, own in zip(H.T, found, strict=True):
@@ -165,9 +168,9 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
 
 
 def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: tuple) -> np.ndarray:
-    """Solution (n,) of (A - H S^-1 H^T) x = b where `free` (n,) is not 0, for `ways`: H and the diagonal of S.
+    """Solution (n,) of (A - H S^-1 H^T) x = b where `free` (n,) is not 0. `ways` is H and the diagonal of S.
 
-    `along`: normals along which x is 0, or None, and the number that replaces A along them.
+    `along` has the normals along which x is 0, or None, and the number that replaces A along them.
     """
     import scipy.sparse.linalg
 
@@ -180,7 +183,7 @@ def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: t
     A = A[keep][:, keep].tocsc()
     x = np.zeros_like(b)
     try:
-        # The pattern is symmetric, so an order that is good for A + A^T is nearly the best.
+        # The pattern is symmetric, so an ordering that is good for A + A^T is close to the optimum.
         factor = scipy.sparse.linalg.splu(A, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         x[keep] = factor.solve(b[keep])
         if len(size):  # Sherman, Morrison and Woodbury

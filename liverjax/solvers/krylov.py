@@ -1,4 +1,4 @@
-"""Linear solves inside jit: preconditioned Krylov methods that check their true residual."""
+"""Linear solves inside jit: preconditioned Krylov methods that compute the true residual at the end."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,7 +15,7 @@ class LinearStatistics(NamedTuple):
 
     iterations: jax.Array
     residual: jax.Array  # |b - A x| / |b|, recomputed at the end
-    positive: jax.Array  # False: a direction without positive curvature was met
+    positive: jax.Array  # False: a direction without positive curvature was found
 
 
 def conjugate_gradients(
@@ -25,14 +25,14 @@ def conjugate_gradients(
     tolerance: Number,
     max_iterations: int,
 ) -> tuple[jax.Array, LinearStatistics]:
-    """Solve A x = b for symmetric positive definite A, given as a function of a flat vector (n,).
+    """Solve A x = b for a symmetric positive definite A, given as a function of a flat vector (n,).
 
     Args:
         matvec, precondition: A and an approximation of its inverse.
-        tolerance: of the recursive residual relative to |b|.
-        max_iterations: the solve ends after so many iterations.
+        tolerance: tolerance of the recursive residual, relative to |b|.
+        max_iterations: maximum number of iterations.
 
-    It also stops at a direction without positive curvature. The statistics contain the true residual.
+    The solve also stops if it finds a direction without positive curvature. The statistics contain the true residual.
     """
     goal = tolerance * jnp.linalg.norm(b)
 
@@ -42,7 +42,7 @@ def conjugate_gradients(
 
     def step(c):
         x, r, p, rz_before, k, _ = c
-        z = precondition(r)  # called only here, so that the program has it once
+        z = precondition(r)  # called only here, so that the program contains it once
         rz = jnp.vdot(r, z)
         p = z + rz / rz_before * p
         Ap = matvec(p)
@@ -65,12 +65,15 @@ def chebyshev(
     bounds: tuple[Number, Number],
     degree: Number,
 ) -> jax.Array:
-    """Approximate A^-1 b by a polynomial in D^-1 A times D^-1 b: symmetric and positive definite (Saad 2003, 12.3).
+    """Approximate A^-1 b by a polynomial in D^-1 A times D^-1 b (Saad 2003, 12.3).
+
+    The approximation of A^-1 is symmetric and positive definite.
 
     Args:
         matvec, diagonal: A and its diagonal D.
-        bounds: of the eigenvalues of D^-1 A; the error is at most 2 exp(-2 degree sqrt(low / high)).
-        degree: number of products; may be traced.
+        bounds: lower and upper bound of the eigenvalues of D^-1 A. The error is at most 2 exp(-2 degree sqrt(low /
+            high)).
+        degree: number of products with A; may be traced.
     """
     low, high = bounds
     theta, delta = (high + low) / 2, jnp.maximum((high - low) / 2, 1e-3 * high)
@@ -93,7 +96,7 @@ def stabilised_biconjugate_gradients(
     tolerance: Number,
     max_iterations: int,
 ) -> tuple[jax.Array, LinearStatistics]:
-    """The solve for an unsymmetric matrix: BiCGSTAB (van der Vorst 1992), two products in each iteration."""
+    """The same for a matrix that is not symmetric: BiCGSTAB (van der Vorst 1992), two products in each iteration."""
     goal = tolerance * jnp.linalg.norm(b)
     one = jnp.ones((), b.dtype)
 
@@ -123,19 +126,19 @@ def stabilised_biconjugate_gradients(
     return x, LinearStatistics(k, true_residual(matvec, b, x), jnp.array(True))
 
 
-#: Number of earlier solves from which a solve begins. An earlier load is skipped if newer loads represent it up to this
-#: part of its size: solutions are only as exact as this.
+#: Number of earlier solves that are kept for the start of a solve. An earlier load is skipped if newer loads represent
+#: it up to this fraction of its norm: the solutions are not more accurate than this.
 EARLIER, _NEW = 6, 1e-7
 
 
 class Earlier(NamedTuple):
-    """Loads and solutions of earlier solves, the latest first; zeros if there were fewer."""
+    """Loads and solutions of earlier solves, the latest first; zeros if there are fewer solves."""
 
     loads: jax.Array  # (EARLIER, n)
     solutions: jax.Array  # (EARLIER, m)
 
     def combined(self, b: jax.Array) -> jax.Array:
-        """The combination (m,) of earlier solutions whose load is nearest to b (n,), by Gram-Schmidt, applied twice."""
+        """The combination (m,) of earlier solutions whose load is closest to b (n,), by Gram-Schmidt, applied twice."""
 
         def add(c, pair):
             Q, Y, b, x, k = c
@@ -154,7 +157,7 @@ class Earlier(NamedTuple):
         return jax.lax.scan(add, start, (self.loads, self.solutions))[0][3]
 
     def with_latest(self, load: jax.Array, solution: jax.Array) -> "Earlier":
-        """The earlier solves with a new one; the oldest is left out."""
+        """The earlier solves and a new one, without the oldest one."""
         pairs = ((self.loads, load), (self.solutions, solution))
         return Earlier(*(jnp.concatenate([new[None], old[:-1]]) for old, new in pairs))
 
@@ -174,18 +177,19 @@ def symmetric_solve(
     solver: Callable[[jax.Array, Earlier], tuple[jax.Array, jax.Array, jax.Array]],
     tolerance: Number,
 ) -> WithEarlier:
-    """The solution of A x = b for symmetric A, as a linear map of b; and the earlier solves with this one added.
+    """The solution of A x = b for a symmetric A, as a linear map of b, and the earlier solves with this solve added.
 
-    Its derivatives are solves as well, in both modes. The solution is NaN in the cases of `differentiable_solve`.
+    Its derivatives are also solves, in forward and in reverse mode. In the cases of `differentiable_solve` the solution
+    is NaN.
 
     Args:
         matvec: (x, earlier) -> (A x, the same earlier).
-        both: b, and the earlier solves from which this one begins.
-        solver: (b, earlier) -> solution, its load (b, or the rest of b after unknowns are eliminated), and the
-            true residual over |b|.
-        tolerance: of the solver.
+        both: b, and the earlier solves that give the start of this solve.
+        solver: (b, earlier) -> solution, its load (b, or what remains of b after the elimination of unknowns), and the
+            true residual over the norm of the load.
+        tolerance: tolerance of the solver.
     """
-    # All in one vector: a derivative by one part alone has no cotangents for the others, which JAX refuses.
+    # All in one vector: a derivative with respect to one part has no cotangents for the others, which JAX refuses.
     joined, parted = ravel_pytree(both)
 
     def solve(_, vector):
@@ -211,11 +215,10 @@ def started(
     near: jax.Array,
     tolerance: Number,
 ) -> tuple[jax.Array, jax.Array]:
-    """Solution of A x = b. It begins at `near` if the residual there is smaller than at 0, so that the solver has less
-    to do.
+    """Solution of A x = b, from a start at `near` if the residual there is smaller than at 0.
 
-    `solver` is (b, tolerance) -> solution and its residual over |b|, `tolerance` the bound on |b - A x| over |b|.
-    Returns the solution and its residual over |b|.
+    `solver` is (b, tolerance) -> solution and its residual over |b|. `tolerance` is the bound on |b - A x| over |b|.
+    The function returns the solution and its residual over |b|.
     """
     left, size = b - matvec(near), jnp.linalg.norm(b)
     helps = jnp.linalg.norm(left) < size
@@ -235,7 +238,7 @@ class Known(NamedTuple):
     """Known properties of the matrix A of `differentiable_solve`."""
 
     symmetric: bool = True
-    #: b -> solution for a symmetric A, and the true residual over |b|; None: solve by iterations.
+    #: b -> (solution for a symmetric A, true residual over |b|); None: solve by iterations.
     solver: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None
     diagonal: jax.Array | None = None  # diagonal of a diagonally dominant A
 
@@ -248,11 +251,11 @@ def differentiable_solve(
     max_iterations: int,
     known: Known = Known(),
 ) -> jax.Array:
-    """A solve as a linear map of `b`: its derivatives are solves as well, not derivatives of the iterations.
+    """A solve as a linear map of `b`: its derivatives are also solves, not derivatives of the iterations.
 
-    It uses conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. The solution is NaN if the
-    true residual stays above 6e-6 |b| (float32: 1e-3) and above ten times the tolerance. A residual below 4 eps |D x|
-    is accepted too, with the `diagonal` D of a diagonally dominant A: rounding x alone causes eps |D x|.
+    It uses conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. The solution is NaN if the true
+    residual is above 6e-6 |b| (float32: 1e-3) and above ten times the tolerance. With the `diagonal` D of a diagonally
+    dominant A, a residual below 4 eps |D x| is also accepted: the rounding of x causes already eps |D x|.
     """
     symmetric, solver, diagonal = known
     method = conjugate_gradients if symmetric else stabilised_biconjugate_gradients

@@ -1,17 +1,16 @@
-"""Minimise the energy of a step. This serves steps that begin inverted, or whose load could not be followed.
+"""Minimise the energy of a step, if the step begins with inverted elements or if its load could not be followed.
 
 The true tangent is used if conjugate gradients find no negative curvature in it. Otherwise a tangent without negative
-eigenvalues is used (`liverjax.elements.projection`). Every step is shortened until the energy falls (Armijo). So the
-energy falls from point to point, and near the minimum convergence is quadratic. A start with inverted elements is first
-untangled as a stable neo-Hookean body of the same moduli, whose energy is finite everywhere: so any law may start
-there.
+eigenvalues is used (`liverjax.elements.projection`). Every step is shortened until the energy decreases (Armijo). Near
+the minimum the convergence is quadratic. If elements are inverted at the start, the body is first untangled as a stable
+neo-Hookean body of the same moduli. Its energy is finite everywhere, so every law can start from inverted elements.
 
-If pressures are unknowns of their own, the solution is a saddle point of the energy. With the pressures that are best
-for the positions it is a minimum again: so only positions are varied, and the pressures follow. In quadratic elements
-the pressures are eliminated from a tangent without negative eigenvalues, so that it is positive.
+If pressures are unknowns, the solution is a saddle point of the energy. If each position has its optimal pressures, the
+solution is a minimum. So only positions are varied, and the pressures follow from them. In quadratic elements the
+pressures are eliminated from a tangent without negative eigenvalues, so that the tangent is positive.
 
-Forces without an energy, such as friction, are held constant during each iteration. So they have an energy for that
-iteration, whose gradient at its beginning is the residual.
+Forces without an energy, for example friction, keep their values at the beginning of an iteration. So they have an
+energy during this iteration. The gradient of the total energy at its beginning is the residual.
 """
 
 from typing import NamedTuple
@@ -22,31 +21,31 @@ import jax.numpy as jnp
 from liverjax.core import status
 from liverjax.solvers.problem import LINEAR_TOLERANCE, MOST_LINEAR_ITERATIONS, Potential, Problem, StepOptions
 
-#: Required fall of the energy, over the fall that its slope predicts (Armijo; Nocedal and Wright 2006, 3.1).
+#: Required decrease of the energy, over the decrease that its slope predicts (Armijo; Nocedal and Wright 2006, 3.1).
 _FALL = 1e-4
-#: Differences of energies below so many times the precision are roundoff: there the residual must fall instead.
+#: A relative difference of energies below this multiple of the precision is roundoff: then the residual must decrease.
 _ROUNDOFF = 5e3
-#: The true tangent is tried again after at most so many iterations.
+#: The true tangent is tried again after at most this number of iterations.
 _PATIENCE = 8
-#: Most iterations on the energy, and most shortenings of one of them.
+#: Maximum number of iterations, and maximum number of halvings of a step.
 _MOST_ITERATIONS, _MOST_SHORTENINGS = 300, 30
-#: With a residual above this, over the forces at work, an unsymmetric true tangent is not tried: BiCGSTAB does not tell
-#: that it is not positive, and takes all its iterations.
+#: If the residual over the norm of all forces is above this, a true tangent that is not symmetric is not tried:
+#: BiCGSTAB does not report that it is not positive, and it would need all its iterations.
 _NEAR = 0.1
-#: Tolerance of directions if pressures follow positions: errors of their balance are amplified by K/mu.
+#: Tolerance of directions if pressures follow from positions: errors of their balance are amplified by K/mu.
 _WITH_PRESSURES = 1e-6
-#: Residual at which a surrogate body is untangled enough.
+#: Tolerance with which a surrogate body is untangled.
 _UNTANGLED = 1e-4
 
 
 class Minimum(NamedTuple):
-    """The point that the minimisation has reached."""
+    """The last point of the minimisation."""
 
     q: jax.Array
     code: jax.Array
     iterations: jax.Array
     linear_iterations: jax.Array
-    relative: jax.Array  # |r| over the forces at work
+    relative: jax.Array  # |r| over the norm of all forces
 
 
 class _Descent(NamedTuple):
@@ -55,7 +54,7 @@ class _Descent(NamedTuple):
     r: jax.Array
     relative: jax.Array
     by: jax.Array
-    definite: jax.Array  # how often a definite tangent is still used before the true one is tried
+    definite: jax.Array  # number of iterations with a definite tangent until the true one is tried
     patience: jax.Array  # the next value of `definite`, if the true tangent fails again
     indefinite: jax.Array  # the last true tangent was not positive
     stuck: jax.Array
@@ -68,7 +67,7 @@ def minimise(problem: Problem, start: jax.Array, options: StepOptions) -> Minimu
 
     Args:
         problem: `liverjax.solvers.problem.Problem` with a potential.
-        start: flat vector of unknowns; elements may be inverted if the energy is finite there.
+        start: flat vector of unknowns. Elements may be inverted if the energy is finite there.
         options: `liverjax.solvers.problem.StepOptions`.
     """
 
@@ -96,14 +95,14 @@ def _settled(problem: Problem, q: jax.Array) -> jax.Array:
 
 
 def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """A point without inverted elements near `start`, if one is found, and its nonlinear and linear iterations."""
+    """A point near `start` without inverted elements, if one is found; number of nonlinear and linear iterations."""
     zero, potential = jnp.zeros((), jnp.int32), _potential(problem)
     surrogate = potential.surrogate
     if surrogate is None:
         return start, zero, zero
 
     def away():
-        # The surrogate's unknowns are positions only.
+        # The unknowns of the surrogate are only positions.
         n = len(start) if potential.positions is None else potential.positions
         least = minimise(surrogate, start[:n], options._replace(tolerance=_UNTANGLED))
         return jnp.concatenate([least.q, start[n:]]), least.iterations, least.linear_iterations
@@ -150,7 +149,7 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
 
 
 def _length(problem: Problem, c: _Descent, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
-    """The first of the lengths 1, 1/2, 1/4, … that lowers the energy; 0 if none does."""
+    """The first of the factors 1, 1/2, 1/4, … on dq that reduces the energy; 0 if none of them does."""
     one, size = jnp.ones((), c.q.dtype), jnp.linalg.norm(c.r)
 
     def good(t):

@@ -1,6 +1,6 @@
-"""Newton's method with a line search and conjugate gradients, differentiated implicitly at its root.
+"""Newton's method with a line search and conjugate gradients or BiCGSTAB, differentiated implicitly at its root.
 
-For steps of a scene, which may follow their load in parts, see `liverjax.solvers.step_cutting`.
+The steps of a scene use `liverjax.solvers.step_cutting` instead: it can divide their load into parts.
 """
 
 from collections.abc import Callable
@@ -20,24 +20,24 @@ from liverjax.solvers.krylov import (
 
 
 class NewtonStatistics(NamedTuple):
-    """Statistics of one solve; every field is an array (under vmap, one entry for each run)."""
+    """Statistics of one solve. Every field is an array; under vmap it has one entry for each run."""
 
     status: jax.Array
     iterations: jax.Array
     linear_iterations: jax.Array
-    residual: jax.Array  # |r| / scale at the point returned
+    residual: jax.Array  # |r| / scale at the returned point
 
 
 class NewtonOptions(NamedTuple):
-    """Tolerances and limits; all except the tolerance are fixed when compiled."""
+    """Tolerances and limits. All except the tolerance are fixed in the compiled program."""
 
-    tolerance: float = 1e-8  # of |r| relative to the scale given
+    tolerance: float = 1e-8  # of |r|, relative to the given scale
     max_iterations: int = 25
     linear_tolerance: float = 1e-4  # of each Newton step
     adjoint_tolerance: float = 1e-10  # of the solves for derivatives
     max_linear_iterations: int = 2000
     max_halvings: int = 10
-    symmetric: bool = True  # whether the derivative is symmetric: if not, BiCGSTAB solves the linear systems
+    symmetric: bool = True  # whether the derivative is symmetric; if not, BiCGSTAB solves the linear systems
 
 
 def newton_root(
@@ -50,11 +50,11 @@ def newton_root(
     """Root of `residual`, a function of a flat vector (n,).
 
     Args:
-        residual: may close over traced parameters; derivatives with respect to them are exact at the root (implicit
+        residual: may close over traced parameters. The derivatives of the root with respect to them are exact (implicit
             function theorem with the true tangent).
         start: first guess; it has no derivative.
         precondition: approximate inverse of the tangent; it has no derivative.
-        scale: force [N] that the tolerance is relative to.
+        scale: force [N]; the tolerance is relative to it.
         options: tolerances and limits.
     """
 
@@ -84,7 +84,10 @@ class _Iterate(NamedTuple):
 
 
 def _halving_newton(residual, start, precondition, scale, options):
-    """Newton with step halving on |r|. The program has residual and tangent only once, so it compiles twice as fast."""
+    """Newton's method; a step is halved if |r| grows.
+
+    The program has residual and tangent once: it compiles twice as fast.
+    """
     goal = options.tolerance * scale
     method = conjugate_gradients if options.symmetric else stabilised_biconjugate_gradients
 
@@ -101,9 +104,9 @@ def _halving_newton(residual, start, precondition, scale, options):
         converged = norm(r) <= goal
         spent = (c.iterations > options.max_iterations) | (halvings > options.max_halvings)
         done = converged | spent | ~jnp.isfinite(norm(r))
-        # No stricter than the last Newton step can use, no looser than the linear tolerance.
+        # Not stricter than the last Newton step needs, and not looser than the linear tolerance.
         forcing = jnp.clip(0.1 * goal / norm(r), 1e-12, options.linear_tolerance)
-        load = jnp.where(better & ~done, -r, jnp.zeros_like(r))  # a zero load costs no iteration
+        load = jnp.where(better & ~done, -r, jnp.zeros_like(r))  # a load of 0 needs no iteration
         dq, s = method(matvec, load, precondition, forcing, options.max_linear_iterations)
         return _Iterate(
             q=q,
@@ -130,6 +133,6 @@ def _halving_newton(residual, start, precondition, scale, options):
     end = jax.lax.while_loop(lambda c: ~c.done, step, begin)
     size = norm(end.r)
     code = jnp.where(size <= goal, status.CONVERGED, jnp.where(jnp.isfinite(size), status.STALLED, status.NOT_FINITE))
-    # Counts leave as floating-point numbers: implicit differentiation gives every output a tangent.
+    # Counts are returned as floating-point numbers: implicit differentiation gives every output a tangent.
     counts = (code, end.iterations - 1, end.linear_iterations)
     return end.q, NewtonStatistics(*(n.astype(start.dtype) for n in counts), size / scale)

@@ -1,8 +1,9 @@
-"""Symmetric matrices of quadratic elements, kept as moduli at their points: multiplied without assembly.
+"""Symmetric matrices of quadratic elements, stored as blocks at their integration points. Products need no assembly.
 
-At every point an element is a linear one with corners of its own (`liverjax.mesh.shape_functions`), so its stiffness is
-45 numbers per point. A product takes motions to the corners, multiplies, and takes forces back. The vertices alone, as
-linear elements, have an assembled matrix: the second level of the preconditioner.
+At every point an element is like a linear element, but with other corners (`liverjax.mesh.shape_functions`). So its
+stiffness has 45 numbers per point. A product interpolates the motion to these corners, multiplies, and returns the
+forces to the nodes. For the vertices there is an assembled matrix of linear elements: the second level of the
+preconditioner.
 """
 
 from collections.abc import Sequence
@@ -28,9 +29,9 @@ from liverjax.tensors.places import given
 class PointMatrix(NamedTuple):
     """Derivative of the forces and, if there are pressures, of minus the balance of nodal volumes."""
 
-    blocks: dict[tuple[int, int], Matrix]  # of corners 1 <= a <= b <= 3, of (Q, E) [N/m]
-    own: Block | None  # 3 x 3 of (V,) that nodes add; entries that are 0 are None
-    border: list[Vector] | None  # change of a point's volume with its corners 1, 2, 3, of (Q, E) [m^2]
+    blocks: dict[tuple[int, int], Matrix]  # for corners 1 <= a <= b <= 3, arrays (Q, E) [N/m]
+    own: Block | None  # 3 x 3 arrays (V,) of physics at nodes; entries that are 0 are None
+    border: list[Vector] | None  # derivative of a point's volume by corners 1, 2, 3, arrays (Q, E) [m^2]
     pressures: BlockMatrix | None  # of the pressures of the vertices [m^3/Pa]
 
 
@@ -42,7 +43,7 @@ class Levels(NamedTuple):
 
 
 def product(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Forces, columns (V,), of a motion given by its columns (V,), at given pressures."""
+    """Forces, as columns (V,), of a motion with columns (V,), at given pressures."""
     moved = stored(mesh.edges(columns))
     forces = [_force(A.blocks, k, moved) for k in (1, 2, 3)]
     result = mesh.spread(forces)
@@ -60,24 +61,24 @@ def _force(blocks: dict[tuple[int, int], Matrix], k: int, moved: list[Vector]) -
 
 
 def volume_changes(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) -> jax.Array:
-    """Change (V,) [m^3] of the volumes that belong to the vertices, with a motion given by its columns (V,)."""
+    """Change (V,) [m^3] of the volumes that belong to the vertices, for a motion with columns (V,)."""
     assert A.border is not None
     moved = stored(mesh.edges(columns))
     return gathered(mesh, sum(dot(g, d) for g, d in zip(A.border, moved, strict=True)))
 
 
 def pull(mesh: TetMesh, A: PointMatrix, pressures: jax.Array) -> tuple[jax.Array, ...]:
-    """Forces, columns (V,), of pressures (V,) [Pa] at the vertices: the transpose of `volume_changes`."""
+    """Forces, as columns (V,), of pressures (V,) [Pa] at the vertices: the transpose of `volume_changes`."""
     assert A.border is not None
     p = interpolated(mesh, pressures)
     return tuple(mesh.spread([tuple(p * g for g in border) for border in A.border]))
 
 
 def levels(mesh: TetMesh, A: PointMatrix, bulk: Number | None = None) -> Levels:
-    """Blocks of the diagonal, and the matrix of the vertices' linear elements.
+    """Diagonal blocks, and the matrix of linear elements of the vertices.
 
     Args:
-        bulk: (Q, E) [Pa/m^3] that counts as stiffness against a change of a point's volume; None: there is none.
+        bulk: additional stiffness (Q, E) [Pa/m^3] against a change of a point's volume; None: no such stiffness.
     """
     blocks = A.blocks
     if bulk is not None and A.border is not None:
@@ -96,13 +97,16 @@ def levels(mesh: TetMesh, A: PointMatrix, bulk: Number | None = None) -> Levels:
 
 
 def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
-    """Blocks 3 x 3 of (V,): sum_q c_ak K_kl c_al of every node a of every element, over k, l = 1, 2, 3."""
+    """Diagonal blocks, 3 x 3 arrays (V,).
+
+    The block of node a is the sum of c_ak K_kl c_al over elements, points and k, l = 1, 2, 3.
+    """
     c = basis(mesh.order).c
     slopes = c[:, 1:] - c[:, :1]
     weights = np.stack([slopes[:, a - 1] * slopes[:, b - 1] * (1 if a == b else 2) for a, b in sorted(blocks)], axis=1)
     matrix = jnp.asarray(weights.reshape(len(c), -1), mesh.points.dtype)
     entries = [(r, s) for r in range(3) for s in range(r, 3)]
-    # K_kl + K_lk of a pair, its symmetric part twice.
+    # Symmetric part of each block: with weight 2 it stands for K_kl + K_lk.
     symmetric = [
         jnp.stack([0.5 * (blocks[pair][r][s] + blocks[pair][s][r]) for r, s in entries], axis=1)
         for pair in sorted(blocks)
@@ -114,19 +118,19 @@ def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
 
 
 def _on_vertices(mesh: TetMesh, own: Block) -> Block:
-    """The diagonal that nodes add, lumped to the vertices: half of a middle's share goes to either end."""
+    """The blocks of physics at nodes, lumped to the vertices: each end of an edge gets half of its middle's part."""
     return tuple(tuple(None if e is None else restricted(mesh, e) for e in row) for row in own)
 
 
 def restricted(mesh: TetMesh, column: jax.Array) -> jax.Array:
-    """The transpose of `prolonged`: from all nodes (V,) to the vertices."""
+    """The transpose of `prolonged`: it maps values at all nodes (V,) to the vertices."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     half = 0.5 * column[V : V + low.shape[0]]
     return given(given(column[:V], low, half), high, half)
 
 
 def prolonged(mesh: TetMesh, column: jax.Array) -> jax.Array:
-    """From the vertices (V,) to all nodes: a field that is linear in every element."""
+    """Values at all nodes of a field that is linear in every element, from its values at the vertices (V,)."""
     nodes = on_middles(mesh, column)
     more = mesh.number_of_nodes - len(nodes)
     return nodes if more == 0 else jnp.concatenate([nodes, jnp.zeros(more, column.dtype)])

@@ -1,7 +1,7 @@
 """A coarse space for the linear solves: the affine motions of each of a few dozen patches of nodes.
 
-Block-Jacobi removes short waves. The coarse space solves directly for motions that vary slowly over the body. Their sum
-is a two-level Schwarz preconditioner (Smith, Bjorstad and Gropp 1996).
+Block-Jacobi removes errors of short wavelength. The coarse space solves directly for motions that vary slowly over the
+body. The sum of both is a two-level Schwarz preconditioner (Smith, Bjorstad and Gropp 1996).
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers.block_matrix import BlockMatrix
 from liverjax.tensors.places import given, taken
 
-#: A vector, one array (V,) per component.
+#: A vector as one array (V,) per component.
 Columns = Sequence[jax.Array]
 
 
@@ -27,14 +27,13 @@ class Coarse(NamedTuple):
 
 
 def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coarse:
-    """The coarse space for the leading m x m blocks. It is left out if the blocks are not positive definite, or if
-    `used` is false.
+    """The coarse space of the leading m x m blocks. It is 0 if its matrix is not positive definite or `used` is false.
 
     Args:
         mesh: `TetMesh`.
         A: the matrix; it has no derivative.
         mask: (V, m) 1 where free: m = 3 for forces, 1 for a pressure.
-        used: whether it is worth its cost (see `worthwhile`).
+        used: whether the coarse space is worth its cost (see `worthwhile`).
     """
     f, number = mesh.pattern.patch_functions, mesh.pattern.number_of_patches
 
@@ -49,7 +48,8 @@ def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coar
 def _inverse(E: jax.Array) -> jax.Array:
     """The inverse of a coarse matrix; 0 if it is not positive definite."""
     d = jnp.diagonal(E)
-    # A patch without free nodes along an axis, or a flat one, has motions that vanish: kept out of the inverse.
+    # A patch that is flat, or has no free nodes along an axis, has motions that are 0. The added diagonal excludes
+    # them.
     E = E + jnp.diag(jnp.where(d > 0, max(1e-9, 100 * float(jnp.finfo(d.dtype).eps)) * d, 1.0))
     factor = jax.scipy.linalg.cho_factor(E)
     inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(len(E), dtype=E.dtype))
@@ -57,7 +57,10 @@ def _inverse(E: jax.Array) -> jax.Array:
 
 
 def coarse_of_product(mesh: TetMesh, product: Callable[[jax.Array], jax.Array]) -> Coarse:
-    """The coarse space of a symmetric matrix of the vertices, given as a function of (V,); one product per function."""
+    """The coarse space of a symmetric matrix of the vertices, given as a function.
+
+    It needs one product per coarse motion.
+    """
     f, patch, number = mesh.pattern.patch_functions, mesh.pattern.patches, mesh.pattern.number_of_patches
 
     def column(k: jax.Array) -> jax.Array:
@@ -69,7 +72,7 @@ def coarse_of_product(mesh: TetMesh, product: Callable[[jax.Array], jax.Array]) 
 
 
 def worthwhile(A: BlockMatrix, inertia: Any) -> jax.Array:
-    """Whether slow motions slow down block-Jacobi: true if inertia is less than a thirtieth of the diagonal."""
+    """Whether slowly varying motions slow down block-Jacobi: if inertia is less than a thirtieth of the diagonal."""
     if inertia is None:
         return jnp.array(True)
     total = sum(jnp.sum(A.diagonal[r][r]) for r in range(3)) / 3
@@ -77,7 +80,7 @@ def worthwhile(A: BlockMatrix, inertia: Any) -> jax.Array:
 
 
 def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Columns], Columns]:
-    """Z (Z^T A Z)^-1 Z^T, Z the coarse motions, as a function of a vector's m columns (V,); `mask` is (V, m)."""
+    """Z (Z^T A Z)^-1 Z^T, with the coarse motions Z, as a function of a vector's m columns (V,); `mask` is (V, m)."""
     f, patch = mesh.pattern.patch_functions.T, mesh.pattern.patches
     masks, number = mask.T, mesh.pattern.number_of_patches
     m = len(masks)
@@ -86,7 +89,7 @@ def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Colu
         weighted = jnp.stack([fk * free * r for fk in f for free, r in zip(masks, columns, strict=True)], axis=-1)
         sums = given(jnp.zeros((number, 4 * m), weighted.dtype), patch, weighted)
         motion = (coarse.inverse @ sums.ravel()).reshape(number, 4, m)
-        # Written out: a sum over an axis of four costs XLA:CPU more than all the rest.
+        # Written out, since on XLA:CPU a sum over an axis of length four needs more time than everything else.
         return tuple(masks[i] * sum(f[k] * taken(motion[:, k, i], patch) for k in range(4)) for i in range(m))
 
     return apply
@@ -95,7 +98,7 @@ def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Colu
 def corrected(
     mesh: TetMesh, coarse: Coarse, mask: jax.Array, fine: Callable[[Columns], Columns]
 ) -> Callable[[Columns], Columns]:
-    """Add the coarse solution, if it is used, to the preconditioner `fine` of columns."""
+    """The preconditioner `fine` of columns, with the coarse solution added if the coarse space is used."""
     apply = correction(mesh, coarse, mask)
 
     def both(columns):
@@ -105,7 +108,7 @@ def corrected(
 
 
 def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, number: int) -> jax.Array:
-    """Z^T A Z (4 m P, 4 m P): every edge once, then its transpose, then the diagonal."""
+    """Z^T A Z (4 m P, 4 m P): the sum over the edges, its transpose, and the diagonal blocks."""
     pattern, m = mesh.pattern, mask.shape[1]
     size = 4 * m * number
     low, high = pattern.edges

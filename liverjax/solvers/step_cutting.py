@@ -1,10 +1,10 @@
-"""Newton's method along a load: the solution is followed from the last equilibrium, in parts if the whole load fails.
+"""Newton's method along a load: it follows the solution from the last equilibrium, in parts if the whole load fails.
 
-The residual r(q, s) has the loads and prescribed motion of the step's beginning at s = 0 and of its end at s = 1.
-Forces that are out of balance at the beginning (inertia, a fluid) are reduced in proportion: r - (1 - s) r(start, 0) is
-0 where a step begins. Every part begins with the tangent at its beginning, -(r + dr/ds ds): prescribed motion enters
-through the tangent, never as a jump. A part that fails is halved. Only the root at s = 1 counts, and derivatives are
-those of the root.
+The residual r(q, s) has the loads and prescribed motion of the step's beginning at s = 0, and of its end at s = 1.
+Out-of-balance forces at the beginning (inertia, a fluid) are reduced linearly: r - (1 - s) r(start, 0) is 0 where a
+step begins. Every part begins with a solve with the tangent at its beginning and the load -(r + dr/ds ds). So a
+prescribed motion enters through the tangent and not as a jump. If a part fails, it is halved. Only the root at s = 1
+counts, and derivatives are derivatives of this root.
 """
 
 from functools import partial
@@ -28,45 +28,45 @@ from liverjax.solvers.problem import (
     StepStatistics,
 )
 
-#: A step that makes no more progress with a residual below so many times the precision (in float32, 5e-4 of the
-#: forces; measured: 1e-4), or so many times the effect of rounded positions, is at roundoff: shorter steps do not help.
+#: A step without further progress is at roundoff if its residual is below this multiple of the precision (in float32
+#: 5e-4 of the forces; measured: 1e-4), or of the effect of rounded positions. Then shorter steps do not help.
 _PRECISIONS, _ROUNDINGS = 4096, 8
 
-#: If the residual has kinks, a direction that is halved in vain is taken whole, so often per part: beyond a kink the
-#: tangent is different.
+#: If the residual has kinks and halving does not help, the full direction is taken, at most this many times per part:
+#: the tangent is different beyond a kink.
 _LEAPS = 8
 
-#: A guess is not used if an element has less than this part of its volume there: it may lead to a folded shape.
+#: A guess is not used if an element has less than this fraction of its volume: it may lead to a folded shape.
 _FLAT = 0.1
 
-#: The loosest tolerance of the direction of a one-step solve.
+#: Maximum tolerance of the direction of a one-step solve.
 _ONE_STEP = 1e-4
-#: Fall of |r| in an iteration; a tangent that does worse is made anew.
+#: If |r| does not decrease by this factor in an iteration, a new tangent is made.
 _CONTRACTION = 0.15
-#: Linear iterations per digit over those when the preconditioner was new; above this it is made anew.
+#: If the linear iterations per digit exceed this multiple of their first value, a new preconditioner is made.
 _WEAR = 1.2
 #: Tolerance of the solves for derivatives, over the tolerance of the step.
 _ADJOINT = 0.1
 
-#: Name of a step's root for checkpoints: if reverse mode keeps the root, its iterations are not computed again.
+#: Name of a step's root for checkpoints: if reverse mode keeps the root, the iterations are not repeated.
 ROOT = "root"
 
 
 class _Point(NamedTuple):
     q: jax.Array  # best point of the current part
     size: jax.Array  # |r| there
-    aim: jax.Array  # |r| that the last direction was to remove
+    aim: jax.Array  # |load| for the last direction
     kept: Kept
-    beside: jax.Array | None  # the further unknowns there (`Problem.beside`); None: there are none
-    looser: jax.Array  # tolerance of the next solve for `beside`, over the usual one
-    indefinite: jax.Array  # the last tangent solved with was not positive
+    beside: jax.Array | None  # additional unknowns there (`Problem.beside`); None: there are none
+    looser: jax.Array  # factor on the tolerance of the next solve for `beside`
+    indefinite: jax.Array  # the tangent of the last solve was not positive
     stale: jax.Array  # dq comes from a tangent that was made before q
     remake: jax.Array  # the next evaluation is at q again, for a new tangent
     dq: jax.Array
-    t: jax.Array  # part of dq to try next
+    t: jax.Array  # factor on dq to try next
     s: jax.Array
     q_begin: jax.Array  # where the current part began
-    guessing: jax.Array  # it began at the guess
+    guessing: jax.Array  # the part began at the guess
     unbalanced: jax.Array  # r at the step's beginning, 0 while guessing
     s_begin: jax.Array
     ds: jax.Array
@@ -74,7 +74,7 @@ class _Point(NamedTuple):
     first: jax.Array  # the next evaluation is the first of a part
     iterations: jax.Array  # of the part
     halvings: jax.Array
-    leaps: jax.Array  # directions of the part that were taken whole though |r| did not fall
+    leaps: jax.Array  # full directions in this part although |r| did not decrease
     total: jax.Array
     linear: jax.Array
     cuts: jax.Array
@@ -87,7 +87,7 @@ def nothing_kept(problem: Problem, start: jax.Array) -> Kept:
     zero = jnp.zeros((), start.dtype)
     made = jax.eval_shape(lambda q: problem.tangent(q, zero, problem.residual(q, zero)[2], None), start)
     no, beside = jnp.array(False), None if problem.beside is None else problem.beside.before
-    # Solves of derivatives begin near the last ones if the matrix is symmetric, so that it is its own transpose.
+    # Solves for derivatives begin with earlier solves only if the matrix is symmetric (equal to its transpose).
     both = start if beside is None else jnp.concatenate([start, beside])
     adjoints = () if problem.adjoint is None else no_earlier(start, both)
     empty = (jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), a) for a in (made, beside))
@@ -103,7 +103,9 @@ def solve(
     kept: Kept | None = None,
     near: Any = None,
 ) -> tuple[jax.Array, StepStatistics, Kept]:
-    """Root in q of r(q, 1), followed from `start` (n,) at s = 0, or from `guess` first; neither has a derivative.
+    """Root in q of r(q, 1), followed from `start` (n,) at s = 0; first from `guess`, if given.
+
+    Both have no derivatives.
 
     Returns the root, the statistics, and the tangent for the next step. `kept` is the tangent of the last step, `near`
     a tangent for derivatives. If the problem has an `adjoint`, the `beside` of the result is differentiated together
@@ -126,8 +128,8 @@ def solve(
             kept = kept._replace(surprise=off, trust=_foretold(off, kept.surprise))
         if problem.beside is not None:
             kept = kept._replace(beside=problem.beside.solved(root, one, problem.beside.guess(kept.beside, 1.0)))
-        # Counts and node numbers leave as floating-point numbers: implicit differentiation gives every output a
-        # tangent, and jax 0.10 refuses those of integers.
+        # Counts and node numbers are returned as floating-point numbers: implicit differentiation gives every output a
+        # tangent, and jax 0.10 refuses tangents of integers.
         return root, (statistics, jax.tree.map(lambda a: a.astype(start.dtype), kept))
 
     def found(start):
@@ -138,8 +140,8 @@ def solve(
         guessing = jnp.array(guess is not None)
         return _follow(problem, start, start if guess is None else guess, guessing, kept, options)
 
-    # Two rules: the search has no derivative, and the root's own derivative uses the tangent there. The first
-    # rule needs any function whose root is constant.
+    # Two rules: the search has no derivative, and the derivative of the root uses the tangent at the root. The first
+    # rule needs any function with a constant root.
     if options.differentiable:
         found_by = jax.lax.custom_root(lambda q: q, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     else:
@@ -156,7 +158,7 @@ def solve(
 
 
 def _foretold(vector: jax.Array, before: jax.Array) -> jax.Array:
-    """How much of a vector the vector before it predicted, from 0 to 1."""
+    """Fraction (0 to 1) of a vector that the previous vector predicted."""
     square = jnp.vdot(before, before)
     return jnp.clip(jnp.vdot(vector, before) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
 
@@ -169,11 +171,10 @@ def _with_derivative(
     tolerance: Number,
     near: Any,
 ) -> tuple[jax.Array, jax.Array | None, Earlier | tuple[()]]:
-    """The root q and `beside`, with the derivatives of the residual's root; and solves from which the next derivative
-    begins.
+    """The root q and `beside` with the derivatives of a root, and solves with which the next derivative begins.
 
-    These solves must be carried from step to step. So they count as further unknowns, equal to `last`. Forward mode
-    hands them on, and reverse mode hands them back, from the later step to the earlier.
+    These solves must be carried from step to step. So they are additional unknowns, equal to `last`. Forward mode
+    carries them to the next step, and reverse mode to the previous step.
     """
     one, n = jnp.ones((), q.dtype), len(q)
     both, lacking = q, None
@@ -206,11 +207,10 @@ def _with_derivative(
 
 
 def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
-    """q, whose derivative is NaN if it is ever taken through this function, which a correct derivative never does.
+    """Return q. A derivative through this function is NaN on purpose: a correct derivative never passes through it.
 
-    Up to jax 0.10 the derivative of a loop's derivative in reverse mode forgets the rule by which a root is
-    differentiated (jax 0.11.2 does not). It would take the root for a constant, and give a wrong number without a
-    warning.
+    Up to jax 0.10, the reverse-mode derivative of a derivative of a loop does not use the derivative rule of a root
+    (jax 0.11.2 does). It would treat the root as a constant, and give a wrong number without a warning.
     """
     leaves = [jnp.ravel(leaf)[:1] for leaf in jax.tree.leaves(problem.numbers)]
     some = [leaf for leaf in leaves if leaf.size and jnp.issubdtype(leaf.dtype, jnp.floating)]
@@ -222,7 +222,7 @@ def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
 
 
 def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Array | None, looser: Number) -> tuple:
-    """The residual at q; its solve for `beside` begins at a solution nearby."""
+    """The residual at q. Its solve for `beside` begins at the solution of a nearby point."""
     if problem.beside is None or beside is None:
         return problem.residual(q, s)
     return problem.residual(q, s, problem.beside.guess(beside, looser))
@@ -264,10 +264,10 @@ def _follow(
 def _robust(
     problem: Problem, potential: Potential, start: jax.Array, guess: jax.Array, kept: Kept, options: StepOptions
 ) -> tuple[jax.Array, jax.Array]:
-    """Follow the load. If that fails, or if elements are inverted at the beginning, minimise the energy.
+    """Follow the load. If this fails, or if elements are inverted at the beginning, minimise the energy.
 
-    Without inertia a start is only a guess. If it is nearly flat or leads nowhere, the load is followed from the
-    reference shape.
+    Without inertia another start than the reference shape is only a guess. If it is nearly flat or leads to no
+    solution, the load is followed from the reference shape.
     """
     zero = jnp.zeros((), start.dtype)
     nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
@@ -336,17 +336,17 @@ def _first_point(
 class _Verdict(NamedTuple):
     """The decision that follows from the residual at a trial point."""
 
-    accepted: jax.Array  # the point is the best of its part so far, or the beginning of one
+    accepted: jax.Array  # the point is the best of its part so far, or the beginning of a part
     better: jax.Array
     converged: jax.Array  # at the end of a part
-    arrived: jax.Array  # at the end of the last
+    arrived: jax.Array  # at the end of the last part
     remake: jax.Array
     failed: jax.Array
-    lost: jax.Array  # a guess that leads nowhere: it costs no cut, the last equilibrium is next
-    launch_now: jax.Array  # a new part begins at this very point
-    go_on: jax.Array  # a direction is wanted
+    lost: jax.Array  # the guess leads to no solution: without a cut, the last equilibrium is used next
+    launch_now: jax.Array  # a new part begins at this point
+    go_on: jax.Array  # a new direction is needed
     halvings: jax.Array
-    leap: jax.Array  # the last direction is taken whole, whatever |r| is there
+    leap: jax.Array  # the full last direction is taken, for any |r| there
     cuts: jax.Array
     done: jax.Array
 
@@ -355,12 +355,12 @@ def _judge(
     c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, problem: Problem, options: StepOptions
 ) -> _Verdict:
     finite = jnp.isfinite(size) & jnp.isfinite(relative)
-    # The first point of a part need not be better, if its direction was that of a tangent made there.
+    # The first point of a part need not be better if its direction was computed with a new tangent.
     free = c.first & (~c.stale | (size < c.aim))
     better = finite & ((size < c.size) | free | c.remake) & ~c.launch
     converged = better & (relative <= options.tolerance)
     arrived = converged & (s >= 1)
-    # A direction of an earlier tangent that leads nowhere is not halved: the tangent is made anew first.
+    # If a direction of an earlier tangent does not help, it is not halved: first a new tangent is made.
     remake = ~better & ~c.launch & c.stale
     halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
     small = (c.relative <= _PRECISIONS * float(jnp.finfo(size.dtype).eps)) | (c.size <= _ROUNDINGS * problem.roundoff)
@@ -409,7 +409,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         load = load - jax.lax.cond(v.launch_now, lambda: ds * _along(problem, trial, s), lambda: jnp.zeros_like(r))
     slow = c.remake | (size > _CONTRACTION * c.aim)
     renew = (v.launch_now & (~c.guessing | ~c.kept.made)) | (v.go_on & ~v.launch_now & slow)
-    # No direction is solved more accurately than it can be used (Eisenstat and Walker 1996), or than the goal needs.
+    # A direction is not solved more accurately than useful (Eisenstat and Walker 1996), or than the goal needs.
     ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
     reach = 0.3 * jnp.where(renew, ratio**2, ratio)
     goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
@@ -448,14 +448,14 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     )
 
 
-#: Error of the solve for `beside`, over the residual that a direction is to leave.
+#: Error of the solve for `beside`, over the expected residual after a direction.
 _BESIDE = 0.1
 
 
 def _looser(options: StepOptions, v: _Verdict, expected: jax.Array, before: jax.Array) -> jax.Array:
-    """Factor on the tolerance of the next solve for pressures: as loose as the next residual allows.
+    """Factor on the tolerance of the next solve for pressures, as large as the next residual allows.
 
-    At the beginning of a part the next residual is not known, so the factor is 1.
+    At the beginning of a part the next residual is unknown, so the factor is 1.
     """
     wanted = jnp.maximum(1.0, _BESIDE * expected / options.tolerance)
     return jnp.where(v.failed | v.lost, 1.0, jnp.where(v.go_on, wanted, before)).astype(before.dtype)
@@ -469,9 +469,11 @@ def _along(problem: Problem, q: jax.Array, s: jax.Array) -> jax.Array:
 def _direction(
     problem: Problem, kept: Kept, at: Any, load: jax.Array, forcing: Number, when: tuple[Number, Number]
 ) -> tuple[jax.Array, jax.Array, Kept, jax.Array]:
-    """Solve dr/dq dq = load to `forcing`; return dq, the iterations, the tangent and whether it is positive.
+    """Solve dr/dq dq = load with the tolerance `forcing`.
 
-    `when` says whether the tangent is made anew, and whether a solution is needed.
+    Return dq, the iterations, what is kept, and whether dr/dq is positive.
+
+    `when` says whether a new tangent is made, and whether a solution is needed.
     """
     near, (renew, wanted) = (kept.made & ~kept.worn, kept.tangent), when
     q, s, by = at

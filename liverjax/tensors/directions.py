@@ -1,4 +1,4 @@
-"""Directions of a material: fibres, and the axes that they make with a sheet."""
+"""Directions of a material: fibres, and the axes of fibre and sheet."""
 
 import jax.numpy as jnp
 
@@ -17,8 +17,10 @@ def components(direction: Numbers | None, like: Number) -> Vector:
 
 
 def orthogonal_axes(fibre: Numbers | None, sheet: Numbers | None, like: Number) -> Matrix:
-    """Columns fibre, sheet (made orthogonal to it) and normal, from directions as in `components`; without a fibre the
-    coordinate axes."""
+    """Columns fibre, sheet (made orthogonal to the fibre) and normal; without a fibre the coordinate axes.
+
+    The directions have the form that `components` accepts.
+    """
     if fibre is None:
         return IDENTITY
     f, s = components(fibre, like), components(sheet, like)

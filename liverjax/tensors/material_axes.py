@@ -1,6 +1,6 @@
 """Stress and stiffness in material axes A (columns a_m): principal directions, or fibre, sheet and normal.
 
-With f_m = F a_m and D' = A^T D the material part of the stiffness of two nodes is sum_mn kappa_mn f_m (x) f_n.
+With f_m = F a_m and D' = A^T D, the material part of the stiffness of two nodes is sum_mn kappa_mn f_m (x) f_n.
 """
 
 from typing import Any
@@ -10,7 +10,7 @@ import jax
 from liverjax.core.struct import Number
 from liverjax.tensors.matrices import Matrix, Vector, dot, matmul, stored, transpose
 
-#: Pairs of different axes, and the indices of the six components of a symmetric matrix.
+#: Pairs of different axes; then the indices of the six components of a symmetric matrix.
 PAIRS = ((0, 1), (0, 2), (1, 2))
 SIX = ((0, 0), (1, 1), (2, 2), *PAIRS)
 
@@ -27,13 +27,13 @@ def six_of(S: Matrix) -> tuple:
 
 
 def rotated(S: Matrix, A: Matrix) -> Matrix:
-    """A S A^T of a symmetric S, its six entries computed once."""
+    """A S A^T for a symmetric S; only its six entries are computed."""
     AS = matmul(A, S)
     return symmetric(tuple(dot(AS[i], A[j]) for i, j in SIX))
 
 
 def orthotropic(normal: Matrix, shear: Vector, a: Vector, b: Vector) -> Matrix:
-    """kappa of nodes with shape vectors a, b: moduli C_mmnn = `normal`, C_mnmn = `shear` (pairs 12, 13, 23)."""
+    """kappa of nodes with shape vectors a and b, for moduli C_mmnn = `normal`, C_mnmn = `shear` (pairs 12, 13, 23)."""
     kappa = [[normal[m][n] * (a[m] * b[n]) for n in range(3)] for m in range(3)]
     for (m, n), G in zip(PAIRS, shear, strict=True):
         kappa[m][n] = kappa[m][n] + G * (a[n] * b[m])
@@ -47,7 +47,7 @@ _INDEX = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
 
 
 def half_contracted(moduli: Any, b: Vector) -> list:
-    """T_mpn = sum_q C_mpnq b_q with moduli 6 x 6 in the order of `SIX`: the part of one node for `anisotropic`."""
+    """T_mpn = sum_q C_mpnq b_q with 6 x 6 moduli in the order of `SIX`: the part of one node in `anisotropic`."""
     return [
         [[_contract([moduli[_INDEX[m][p]][_INDEX[n][q]] for q in range(3)], b) for n in range(3)] for p in range(3)]
         for m in range(3)
@@ -55,12 +55,12 @@ def half_contracted(moduli: Any, b: Vector) -> list:
 
 
 def anisotropic(T: list, a: Vector) -> Matrix:
-    """kappa_mn = sum_p a_p T_mpn of two nodes: a is the first's shape vector, T the second's `half_contracted`."""
+    """kappa_mn = sum_p a_p T_mpn: a is the shape vector of the first node, T is `half_contracted` of the second."""
     return tuple(tuple(_contract([T[m][p][n] for p in range(3)], a) for n in range(3)) for m in range(3))
 
 
 def _contract(values: list, a: Vector) -> jax.Array:
-    """Scalar product that leaves out components of `a` that are the number 0, as in the coordinate directions."""
+    """Scalar product without the components of `a` that are the number 0, for example in coordinate directions."""
     terms = [v if isinstance(c, float) and c == 1 else v * c for v, c in zip(values, a, strict=True) if not _is_zero(c)]
     return sum(terms[1:], terms[0])
 

@@ -1,7 +1,7 @@
-"""Deformation gradients and invariants, every component an array over the elements.
+"""Deformation gradients and invariants; every component is an array over the elements.
 
-A vector is a tuple of three arrays and a matrix a tuple of three such rows, each array of shape (E,). Written out
-like this XLA vectorises over elements; batched 3 x 3 products would not (tiny matrices, no fusion).
+A vector is a tuple of three arrays (E,), and a matrix is a tuple of three such rows. In this form XLA vectorises over
+the elements. It does not vectorise batched 3 x 3 products (tiny matrices, no fusion).
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Invariants(NamedTuple):
-    """The measures of strain (E,) that a strain energy depends on; `None`: the law does not use this measure."""
+    """The strain measures (E,) on which a strain energy depends; `None`: the law does not use this measure."""
 
     I1: Any = None  # tr C
     I2: Any = None  # (I1^2 - tr C^2) / 2
@@ -71,7 +71,7 @@ def matmul(A: Matrix, B: Matrix) -> Matrix:
 
 
 def cofactor(F: Matrix) -> Matrix:
-    """cof F = J F^-T from three cross products of the columns of F: no inverse, finite at J = 0."""
+    """cof F = J F^-T from three cross products of the columns of F. It needs no inverse and is finite at J = 0."""
     c0, c1, c2 = transpose(F)
     return transpose((cross(c1, c2), cross(c2, c0), cross(c0, c1)))
 
@@ -83,7 +83,7 @@ def determinant(F: Matrix) -> jax.Array:
 
 
 def right_cauchy_green(F: Matrix) -> Matrix:
-    """C = F^T F, its six entries computed once."""
+    """C = F^T F; only its six different entries are computed."""
     c = transpose(F)
     xx, yy, zz, xy, xz, yz = (dot(c[a], c[b]) for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
     return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
@@ -134,9 +134,9 @@ def pack(A: Matrix) -> jax.Array:
 
 
 def stored(values: T) -> T:
-    """The same pytree, written to memory: a branch keeps XLA:CPU from computing it again for every use.
+    """The same pytree, written to memory. A branch prevents XLA:CPU from computing it again for every use.
 
-    Its leaves are numbers or arrays; at least one of them is not empty.
+    The leaves are numbers or arrays; at least one of them is not empty.
     """
     values = jax.tree.map(jnp.asarray, values)
     number = max(jax.tree.leaves(values), key=jnp.size).ravel()[0]
@@ -147,14 +147,15 @@ def stored(values: T) -> T:
 def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
     """F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3, since the shape vectors of an element add up to zero.
 
-    Entries are (E,), or (Q, E) where elements have Q points (`TetMesh.edges`).
+    Entries are (E,), or (Q, E) if elements have Q points (`TetMesh.edges`).
 
     Args:
         mesh: `TetMesh`.
         x: current positions (V, 3) [m]. Another field (V, 3) works as well: the result is its gradient.
 
     Raises:
-        InputError: x of another shape (an index beyond its end would silently read the last node).
+        InputError: x has another shape. Without this check, an index that is too large would silently read the last
+            node.
     """
     if jnp.shape(x) != mesh.points.shape:
         raise InputError(f"positions have shape {jnp.shape(x)}: give one row of 3 per node, {mesh.points.shape}")

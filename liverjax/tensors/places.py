@@ -1,4 +1,4 @@
-"""Read and add at node and edge numbers of a mesh. They are within bounds, so the program does not check."""
+"""Read and add at node or edge numbers of a mesh. These numbers are valid, so the program does not check them."""
 
 import jax
 

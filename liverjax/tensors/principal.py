@@ -1,11 +1,12 @@
-"""Principal stretches and sums of their powers, with derivatives that exist where stretches are equal.
+"""Principal stretches and sums of their powers, with derivatives that also exist if stretches are equal.
 
-Xi(alpha) = sum_m lambda_m^alpha = tr C^(alpha/2) is a smooth function of C although its eigenvectors are not. So the
-eigenvectors are frozen: in their axes C = diag(c) + X, where X is zero and carries the derivatives, and
+Xi(alpha) = sum_m lambda_m^alpha = tr C^(alpha/2) is a smooth function of C, although the eigenvectors of C are not. So
+the eigenvectors are frozen. In their axes C = diag(c) + X, where X is zero but has derivatives, and
 
     tr (C + X)^q = sum f(c_i) + sum g[c_i] X_ii + 1/2 sum g[c_i, c_j] X_ij^2 + 1/3 sum g[c_i, c_j, c_k] X_ij X_jk X_ki
 
-with f(c) = c^q, g = f' and its divided differences (Daleckii and Krein 1965): exact to the third derivative.
+with f(c) = c^q, g = f' and the divided differences of g (Daleckii and Krein 1965). This is exact up to the third
+derivative.
 """
 
 import math
@@ -19,12 +20,12 @@ from liverjax.core.struct import Number
 from liverjax.tensors.material_axes import PAIRS, SIX, rotated, six_of, symmetric
 from liverjax.tensors.matrices import Matrix, Vector, determinant, dot, matvec, right_cauchy_green, transpose
 
-#: Cyclic Jacobi sweeps: off-diagonal entries are at roundoff after four, for every matrix tried.
+#: Number of cyclic Jacobi sweeps. After four, off-diagonal entries were at roundoff in all matrices that were tried.
 SWEEPS = 5
 
 
 class Stretches(NamedTuple):
-    """Principal stretches of F; `logs` are constants of differentiation, `change` and `log_J` are not."""
+    """Principal stretches of F. In derivatives `logs` are constants; `change` and `log_J` are not."""
 
     logs: Vector  # ln lambda_m
     change: tuple  # X: `change` in principal axes
@@ -32,9 +33,9 @@ class Stretches(NamedTuple):
 
 
 def principal(F: Matrix) -> tuple[Vector, Matrix]:
-    """ln lambda_m and the columns n_m: C = F^T F diagonalised by Jacobi rotations, no LAPACK call.
+    """ln lambda_m and the columns n_m. C = F^T F is diagonalised by Jacobi rotations, without LAPACK.
 
-    The stretches are |F n_m|, so that a small stretch keeps its relative accuracy beside large ones.
+    The stretches are |F n_m|, so that a small stretch has a good relative accuracy even if others are large.
     """
     F = jax.lax.stop_gradient(F)
     axes = symmetric_axes(right_cauchy_green(F))
@@ -83,14 +84,14 @@ def _rotate(entries: dict, columns: tuple, p: int, q: int) -> tuple[dict, tuple]
 
 
 def stretches(F: Matrix) -> Stretches:
-    """Principal stretches of F, ready to be differentiated through `power_sum`."""
+    """Principal stretches of F, in a form that `power_sum` can differentiate."""
     logs, axes = principal(F)
     X = rotated(symmetric(change(F, 3)), transpose(axes))
     return Stretches(logs, six_of(X), jnp.log(determinant(F)))
 
 
 def change(F: Matrix, orders: int) -> tuple:
-    """Six entries of C minus their value. They are zero and may be differentiated `orders` times by F."""
+    """Six entries of C minus their value: they are zero, but may be differentiated `orders` times with respect to F."""
     C = right_cauchy_green(F)
     return _counted(orders, tuple(C[i][j] for i, j in SIX))
 
@@ -108,7 +109,7 @@ def _(left, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _counted_one(left: int, C: tuple) -> jax.Array:
-    """The number 1, which may be differentiated `left` times. A further derivative would be wrong: it is refused."""
+    """The number 1, which may be differentiated `left` times. One more derivative would be wrong, so it is refused."""
     return jnp.ones_like(C[0])
 
 
@@ -144,7 +145,7 @@ _PAIRS_OF_NODES = ((0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1))  # i, j of g[i, i, j]
 def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -> jax.Array:
     """The expansion in this module's docstring for (J^(-1/3) lambda)^alpha, differentiable in alpha, X and ln J.
 
-    Divided differences of one kind are stacked in one array, so only a tenth of the operations is compiled.
+    Divided differences of one kind are stacked in one array. So only a tenth of the operations is compiled.
     """
     q, log_J0 = alpha / 2, jax.lax.stop_gradient(log_J)
     l = 2 * (jax.lax.stop_gradient(jnp.stack(logs)) - (log_J0 / 3)[None])
@@ -168,7 +169,7 @@ def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -
 
 
 def divided_difference(p: Number, *logs: Number) -> jax.Array:
-    """Divided difference of c^p at one, two or three nodes c = exp(log), accurate where nodes are near or equal."""
+    """Divided difference of c^p at one, two or three nodes c = exp(log). It is accurate for close or equal nodes."""
     if len(logs) == 1:
         return jnp.exp(p * logs[0])
     if len(logs) == 2:
@@ -186,7 +187,7 @@ def divided_difference(p: Number, *logs: Number) -> jax.Array:
 
 
 def _divided_power(p: Any, y: list) -> Number:
-    """Divided difference of (1 + c)^p at three |c| < 0.11: its binomial series, cut at 0.11^16 = 5e-16."""
+    """Divided difference of (1 + c)^p at three |c| < 0.11, by its binomial series, truncated at 0.11^16 = 5e-16."""
     homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]  # complete homogeneous sums h_k of the nodes
     for node in y:
         for k in range(1, 16):
@@ -204,7 +205,7 @@ def sinh_ratio(p: Number, delta: Number) -> jax.Array:
 
 
 def _sinhc(x: Number) -> Any:
-    """sinh(x)/x; its series (last term 1/19!) below 1."""
+    """sinh(x)/x; for |x| < 1 by its series (last term 1/19!)."""
     square = x * x
     near = square < 1
     small: jax.Array = jnp.where(near, square, 0.0)

@@ -1,16 +1,16 @@
-"""Proper orthogonal decomposition: a few fields that represent many fields up to a small rest."""
+"""Proper orthogonal decomposition: a few fields that represent many fields up to a small error."""
 
 import numpy as np
 
-#: The largest size of the matrix of products; if there are more rows, so many of them are used, evenly spaced.
+#: Maximum size of the matrix of products. If there are more rows, this number of them is used, evenly spaced.
 MOST_PRODUCTS = 6000
 
 
 def principal_fields(rows: np.ndarray, tolerance: float) -> np.ndarray:
     """Orthonormal fields (n, P) that represent rows (N, P) up to `tolerance` times the Frobenius norm of the rows.
 
-    They come from the eigenvalues of the products of rows, or of columns if there are fewer columns (Sirovich 1987).
-    The products keep only half of the digits, so the least tolerance is 1e-7.
+    They are computed from the eigenvectors of the matrix of products of rows, or of columns if there are fewer columns
+    (Sirovich 1987). The products keep only half of the digits, so the minimum useful tolerance is 1e-7.
     """
     if min(rows.shape) > MOST_PRODUCTS:
         rows = rows[np.linspace(0, len(rows) - 1, MOST_PRODUCTS).round().astype(int)]
@@ -20,5 +20,5 @@ def principal_fields(rows: np.ndarray, tolerance: float) -> np.ndarray:
     left = np.sqrt(np.maximum(size.sum() - np.cumsum(size), 0.0) / size.sum())
     n = min(int(np.sum(left > tolerance)) + 1, int(np.sum(size > 1e-14 * size[0])))
     fields = vectors[:, :n].T @ rows if few_rows else vectors[:, :n].T
-    # Orthonormal to all digits.
+    # Now the fields are orthonormal to full precision.
     return np.linalg.qr(fields.T)[0].T

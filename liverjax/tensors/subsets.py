@@ -1,4 +1,6 @@
-"""Subsets of elements that are computed separately: read the numbers of one subset, put all numbers together again."""
+"""Subsets of elements that are computed separately: select the numbers of a subset, and join the numbers of all
+subsets.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -14,8 +16,8 @@ T = TypeVar("T")
 class Subsets(NamedTuple):
     """A partition of the elements: every element is in exactly one subset."""
 
-    elements: tuple[jax.Array, ...]  # element numbers (1, n) of each subset; no numbers by element have this shape
-    places: jax.Array  # place of each element when all subsets follow each other: (E,), or (1, E) with several points
+    elements: tuple[jax.Array, ...]  # element numbers (1, n) of each subset; no parameters by element have this shape
+    places: jax.Array  # place of each element if all subsets are joined: (E,), or (1, E) with several points
 
     @property
     def number_of_elements(self) -> int:
@@ -41,7 +43,7 @@ def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
 
 
 def in_subset(s: Subsets, k: int, numbers: T) -> T:
-    """A pytree with the entries of subset k of its arrays (…, E) and (…, E, 3); other arrays stay as they are."""
+    """The pytree with arrays (…, E) and (…, E, 3) reduced to the elements of subset k; other arrays are not changed."""
     E, own = s.number_of_elements, s.elements[k][0]
 
     def one(a: Number) -> Number:
@@ -54,14 +56,14 @@ def in_subset(s: Subsets, k: int, numbers: T) -> T:
 
 
 def put_together(s: Subsets, numbers: Sequence[T]) -> T:
-    """Numbers of all elements, from pytrees of one structure with the numbers (…, n) of each subset."""
+    """Numbers of all elements, from the pytrees of all subsets (with the same structure and arrays (…, n))."""
     leaves, trees = zip(*(jax.tree.flatten(each) for each in numbers), strict=True)
     shapes = [
         jnp.broadcast_shapes(*map(jnp.shape, own), (e.shape[1],)) for own, e in zip(leaves, s.elements, strict=True)
     ]
     lead = jnp.broadcast_shapes(s.places.shape[:-1], *(shape[:-1] for shape in shapes))
     dtype = jnp.result_type(*(a for own in leaves for a in own))
-    # One array per subset, so that one copy puts all numbers of every element in order.
+    # One array per subset, so that one copy brings the numbers of all elements into order.
     stacked = [
         jnp.stack([jnp.broadcast_to(jnp.asarray(a, dtype), (*lead, shape[-1])) for a in own])
         for own, shape in zip(leaves, shapes, strict=True)

@@ -1,1 +1,1 @@
-"""Small motion at a frequency: harmonic waves in a body, about its reference shape or a loaded state."""
+"""Small harmonic motion of a body at given frequencies, about its reference shape or about a loaded state."""

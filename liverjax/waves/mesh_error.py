@@ -1,4 +1,4 @@
-"""Error of harmonic motion by its mesh: the same problem is solved in the next richer space of functions."""
+"""Mesh error of harmonic motion: the same problem is solved again in the next richer space of functions."""
 
 from functools import partial
 
@@ -19,7 +19,7 @@ from liverjax.waves.rest import under_its_weight
 
 @struct
 class HarmonicError:
-    """Estimated error of amplitudes: what an infinitely fine mesh would add."""
+    """Estimated error of amplitudes: the difference that an infinitely fine mesh would add."""
 
     displacement: jax.Array = param("m", "complex (F, V, 3)")
     reactions: jax.Array = param("N", "complex (F, V, 3); sums over the nodes of a support count")
@@ -35,7 +35,7 @@ def harmonic_mesh_error(
     about: jax.Array | None = None,
     motion: Number | None = None,
 ) -> jax.Array:
-    """Estimated error of displacements, complex (F, V, 3) [m]; `harmonic_errors` gives that of reactions too."""
+    """Estimated error of displacements, complex (F, V, 3) [m]. `harmonic_errors` also gives the error of reactions."""
     return harmonic_errors(scene, found, factors, about, motion).displacement
 
 
@@ -46,20 +46,19 @@ def harmonic_errors(
     about: jax.Array | None = None,
     motion: Number | None = None,
 ) -> HarmonicError:
-    """Estimated error of amplitudes by the mesh.
+    """Estimated error of amplitudes that the mesh causes.
 
-    A result of linear elements is solved again with quadratic ones, and one of quadratic elements with cubic ones. With
-    too few elements per wave the phase is wrong, and the error is as large as the motion. The cost is that of a mesh
-    with eight (quadratic: three) times the unknowns. With a fluid, the scene is solved again on a mesh with every
-    element cut into eight, because its pressures are linear in both kinds of elements, and 4/3 of the change is the
-    estimate.
+    Linear elements are replaced by quadratic ones, and quadratic elements by cubic ones. With too few elements per wave
+    the phase is wrong, and the error is as large as the motion. The mesh has then eight (quadratic: three) times the
+    unknowns, with a corresponding cost. The pressures of a fluid are linear in all elements. With a fluid, the scene is
+    therefore solved again on a mesh in which every element is cut into eight, and the estimate is 4/3 of the change.
 
     Args:
         scene, factors, about, motion: as in `harmonic`.
         found: result of `harmonic`.
 
     Raises:
-        InputError: a scene of another mesh, and what `harmonic` refuses.
+        InputError: a scene with another mesh, and what `harmonic` refuses.
     """
     nodes = scene.mesh.number_of_nodes
     if found.displacement.shape[1] != nodes:

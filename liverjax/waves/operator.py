@@ -1,13 +1,14 @@
-"""Dynamic stiffness of small harmonic motion: K(omega) - omega^2 M, kept by element.
+"""Dynamic stiffness of small harmonic motion, K(omega) - omega^2 M, stored as element matrices.
 
-About a state x that has rested for long, the stress that relaxes has come down to m_inf S_h, and a small motion adds
-m(omega) times its instantaneous change, where m = G*/G0 (m_inf = 1 - sum g_k). So, with the tangent split into its
-material and geometric part (superposed small motion: Lockett 1972, Nonlinear Viscoelastic Solids, chapter 7),
+The body moves about a state x in which it has rested for a long time. There the relaxing stress has decreased to m_inf
+S_h. A small motion adds m(omega) times the instantaneous change of this stress, with m = G*/G0 and m_inf = 1 - sum g_k.
+With the tangent split into a material and a geometric part (superposed small motion: Lockett 1972, Nonlinear
+Viscoelastic Solids, chapter 7), the stiffness is
 
     K(omega) = m(omega) (K_h - K_geometric) + m_inf K_geometric + K_rest,
 
-where K_rest is the stiffness that does not relax: the volumetric part of the law if only the isochoric part relaxes, a
-sponge, supports, membranes and springs. For pressures as unknowns see `liverjax.waves.pressures`.
+where K_rest is the stiffness that does not relax: of the volumetric part of the law if only the isochoric part relaxes,
+of a sponge, of supports, membranes and springs. Unknown pressures are in `liverjax.waves.pressures`.
 """
 
 from typing import NamedTuple
@@ -38,13 +39,13 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
 
 class Operator(NamedTuple):
-    """Matrices of every element with n nodes, and the matrices of nodes."""
+    """Matrices of the elements with n nodes each, and matrices of nodes."""
 
     points: jax.Array  # (V, 3) [m] reference positions of the nodes
     nodes: jax.Array  # (n, E)
-    relaxing: jax.Array  # (n, 3, n, 3, E) [N/m] is multiplied by m(omega)
+    relaxing: jax.Array  # (n, 3, n, 3, E) [N/m] part that is multiplied by m(omega)
     rest: jax.Array | None  # (n, 3, n, 3, E) [N/m]
-    mass: jax.Array | None  # (n, n, E) [kg] of one component, or lumped (V,)
+    mass: jax.Array | None  # (n, n, E) [kg] for each component, or lumped (V,)
     springs: Block | None  # diagonal blocks 3 x 3 of (V,) [N/m]
     attached: tuple[Attached, ...]
     free: Free
@@ -56,7 +57,7 @@ def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
 
     Args:
         e: equations of the scene without its viscosity.
-        loaded: x is not the reference shape; there is stress.
+        loaded: whether x is not the reference shape, so that there is stress.
         mass: "consistent" or "lumped", as in runs in time.
     """
     scene, mesh, F = e.scene, e.mesh, deformation_gradient(e.mesh, x)
@@ -80,7 +81,7 @@ def _shape_vectors(mesh: TetMesh) -> list[Vector]:
 
 
 def _blocks(scene: Scene, law: Law, F: Matrix, loaded: bool) -> tuple[list[Matrix], list[Matrix] | None]:
-    """Blocks per volume of the corners 1, 2, 3 (`_OWN`) that m(omega) multiplies, and the other blocks or None."""
+    """Blocks per volume of corners 1, 2, 3 (`_OWN`): first those to multiply by m(omega), then the others or None."""
     mesh, prony, D = scene.mesh, scene.viscosity, _shape_vectors(scene.mesh)
     if prony is None:
         return invariant_terms.blocks(invariant_terms.state(law, F), D, _OWN), None
@@ -104,7 +105,7 @@ def _times_identity(value: jax.Array) -> Matrix:
 
 
 def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
-    """(n, 3, n, 3, E) [N/m] from blocks per volume at the points."""
+    """Element matrices (n, 3, n, 3, E) [N/m] from blocks per volume at the integration points."""
     weighted = {(a + 1, b + 1): scale_matrix(mesh.weights, K) for (a, b), K in zip(_OWN, blocks, strict=True)}
     corners = jnp.stack([jnp.stack([_stacked(K) for K in row]) for row in mjed.all_blocks(weighted)])
     if mesh.order == 1:
@@ -114,7 +115,7 @@ def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
 
 
 def _both_ways(mesh: TetMesh, K: jax.Array) -> jax.Array:
-    """Matrices (n, …, n, …, E) with the nodes' signs: functions of order 3 on an edge have a direction."""
+    """Matrices (n, …, n, …, E) times the signs of functions on both sides: functions of order 3 have a direction."""
     if mesh.order < 3:
         return K
     n, E, half = len(K), K.shape[-1], K.ndim // 2
@@ -142,13 +143,13 @@ Motion = tuple[jax.Array, jax.Array | None]
 
 
 def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion) -> Motion:
-    """Forces (V, 3) complex [N] of a motion, and the balance (P,) [m^3] if there are pressures.
+    """Complex forces (V, 3) [N] of a motion, and the balance (P,) [m^3] if there are pressures.
 
     Args:
         A: `Operator`.
-        factor: m at omega, () or (E,).
-        omega: [rad/s].
-        motion: amplitudes.
+        factor: m(omega), () or (E,).
+        omega: angular frequency [rad/s].
+        motion: complex amplitudes.
     """
     u, p = motion
     own = u[A.nodes]  # (n, E, 3)
@@ -170,7 +171,7 @@ def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion)
 
 
 def _stored(own: Pressures, omega: Number, near: jax.Array) -> jax.Array:
-    """(store + flow / (i omega)) p of every element's vertices, (4, E) [m^3]."""
+    """(store + flow / (i omega)) p at the vertices of every element, (4, E) [m^3]."""
     stored = jnp.einsum("vwe,we->ve", own.store, near)
     return stored if own.flow is None else stored + jnp.einsum("vwe,we->ve", own.flow, near) / (1j * omega)
 

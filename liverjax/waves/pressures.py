@@ -1,14 +1,13 @@
-"""Pressures of the vertices in harmonic motion: of a fluid that flows, or of volumes that hardly change.
+"""Pressures at the vertices in harmonic motion: of a flowing fluid, or of nearly incompressible volumes.
 
-A motion u takes the volume B^T u from the fluid or from the volume that the pressure acts on. Both cases are one
-symmetric system,
+A motion u changes the volume on which the pressures act by B^T u. Both cases lead to a symmetric system,
 
     K u + B p = f,    B^T u - (store + flow / (i omega)) p = -enters / (i omega).
 
-In a sponge (`liverjax.physics.porosity`) B is minus the change of the vertices' volumes, and the second line is Darcy's
-law over i omega: (1/K_lim) i omega p = kappa lap p - i omega (dJ/J), with volumes of the state about which the body
-moves. With averaged or mixed volumes (`liverjax.physics.volumes`) nothing flows, and store is the compliance of the
-pressures.
+In a sponge (`liverjax.physics.porosity`), B^T u is minus the change of the volumes of the vertices. The second equation
+is then Darcy's law over i omega: (1/K_lim) i omega p = kappa lap p - i omega (dJ/J), with the volumes of the state
+about which the body moves. With averaged or mixed volumes (`liverjax.physics.volumes`) nothing flows, and `store` is
+the compliance of the pressures.
 """
 
 from typing import Any, NamedTuple
@@ -32,30 +31,30 @@ from liverjax.tensors.matrices import Matrix, determinant, dot, scale
 
 
 class Pressures(NamedTuple):
-    """Matrices of every element with n nodes, and the given numbers of the P pressures."""
+    """Matrices of the elements with n nodes each, and given data of the P pressures."""
 
     nodes: jax.Array  # (4, E) vertices
     pull: jax.Array  # (n, 3, 4, E) [m^2]: B
     store: jax.Array  # (4, 4, E) [m^3/Pa]
     flow: jax.Array | None  # (4, 4, E) [m^3/(Pa s)]; None: nothing flows
     mask: jax.Array  # (P,) 0 where the pressure is given
-    given: jax.Array  # (P,) [Pa] amplitudes where it is given, 0 elsewhere
+    given: jax.Array  # (P,) [Pa] given amplitudes, 0 elsewhere
     enters: jax.Array | None  # (P,) [m^3/s] amplitude of the inflow; None: no inflow
 
 
 def law_beside(scene: Scene) -> Any:
-    """The law without the energy that the pressures replace."""
+    """The law without the volumetric energy that the pressures replace."""
     if scene.solve.volumetric in ("nodal", "mixed"):
         return isochoric_part(scene.law)
     return law_in_force(scene.porosity, scene.law)
 
 
 def scalars_and_pressures(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars | None, Pressures | None]:
-    """Stress and slope of volumes at given pressures about positions x (V, 3) [m], and `Pressures`; or None."""
+    """Volumetric stress and slope at given pressures, at positions x (V, 3) [m], and `Pressures`; or None, None."""
     mesh, J = scene.mesh, determinant(F)
     if scene.porosity is not None:
         own = scene.porosity
-        # After a long rest the fluid has flowed until its pressure is 0.
+        # After a long time at rest the fluid has flowed until its pressure is 0.
         found = Scalars({"J": volumetric_stress(own, J)}, {("J", "J"): volumetric_slope(own, J)})
         return found, _of_sponge(own, mesh, F)
     if scene.solve.volumetric == "mixed":
@@ -88,7 +87,7 @@ def _of_mixed(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars, Pressures
 
 
 def _compliance(mesh: TetMesh, volume: Mixed) -> jax.Array:
-    """Compliance (4, 4, E) of every element: see `Mixed.compliance`."""
+    """Compliance matrix (4, 4, E) of every element; see `Mixed.compliance`."""
     if mesh.order > 1:
         L = jnp.asarray(basis(mesh.order).L, mesh.volumes.dtype)
         return jnp.einsum("aq,bq,qe->abe", L, L, mesh.weights / volume.rest, optimize=True)
@@ -114,7 +113,7 @@ def _sealed(mesh: TetMesh, pull: jax.Array, store: jax.Array) -> Pressures:
 
 
 def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Diagonal matrices (4, 4, E): each element's share of `integrals` of a density at the points."""
+    """Diagonal matrices (4, 4, E): contribution of each element to the `integrals` of a density at the points."""
     if mesh.order == 1:
         share = jnp.broadcast_to(mesh.volumes * density / 4, (4, mesh.number_of_elements))
     else:
@@ -123,7 +122,7 @@ def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _pull(mesh: TetMesh, g: list) -> jax.Array:
-    """Forces (n, 3, 4, E) on the nodes by pressures at the corners, from the forces g (3,) of 1 Pa at each corner."""
+    """Forces (n, 3, 4, E) on the nodes per pressure at the vertices, from the vectors g of the four corners."""
     own = mesh.weights[None, None] * jnp.stack([jnp.stack(vector) for vector in g])  # (4, 3, E), or (4, 3, Q, E)
     if mesh.order == 1:
         return jnp.broadcast_to(own[:, :, None] / 4, (4, 3, 4, mesh.number_of_elements))

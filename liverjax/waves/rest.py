@@ -1,4 +1,4 @@
-"""The state of rest under gravity and pre-tension, about which a body moves harmonically."""
+"""The state of rest under gravity and pre-tension. A body in harmonic motion moves about this state."""
 
 import jax
 import jax.numpy as jnp
@@ -18,18 +18,17 @@ from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared, simulate
 from liverjax.simulation.unloaded import resting
 
-#: A strain whose forces are compared with those of the reference shape, and the part of them that counts as none.
+#: Forces in the reference shape count as 0 if they are below the second number times the forces of this strain.
 _STRAIN, _NONE = 1e-6, 1e-3
-#: A time [s] after which nothing flows any more.
+#: A time [s] that is so long that all flow has ended.
 _FOR_LONG = 1e12
 
 
 def under_its_weight(scene: Scene) -> jax.Array | None:
-    """Positions (V, 3) [m] at rest under gravity and what pulls in the reference shape, such as a ligament with
-    pre-tension, with stresses that have relaxed; None if nothing acts there. Tractions and inlets are amplitudes of
-    the motion: they do not act here.
+    """Positions (V, 3) [m] at rest under gravity and pre-tension, with relaxed stresses; None if nothing acts.
 
-    Traced: a body that finds no rest has NaN as positions.
+    Pre-tension is what pulls in the reference shape, for example a ligament. Tractions and inlets are amplitudes of the
+    motion, so they do not act here. If the scene is traced and no state of rest is found, the positions are NaN.
 
     Raises:
         InputError: no state of rest was found.
@@ -40,7 +39,7 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
     still = resting(replace(by_element(scene), traction=(), **changed))
     if not (_is_heavy(scene) or _is_pulled(still)):
         return None
-    # With a sponge the steps are so long that its fluid has flowed.
+    # With a sponge the steps are so long that its fluid stops flowing within a step.
     dt = None if scene.porosity is None else _FOR_LONG
     solve = replace(still.solve, dt=dt, steps=4, frequencies=None)
     found = simulate(replace(still, solve=solve))
@@ -51,12 +50,12 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
         return found.check().positions[-1]
     except RuntimeError as error:
         raise InputError(
-            f"no state of rest under gravity or tension was found ({error}): hold the body, or give a state as about"
+            f"no state of rest under gravity or tension was found ({error}): hold the body, or give a state by about"
         ) from None
 
 
 def without_history(physics: Physics) -> Physics:
-    """The same physics without a history: a support with its own stiffness, an obstacle at its place at time 0."""
+    """The same physics without a history: a support with its unscaled stiffness, an obstacle at its place at time 0."""
     changed: Content = {name: None for name in ("times", "history") if getattr(physics, name, None) is not None}
     if isinstance(physics, Obstacle):
         changed |= {"by": None, "position": jnp.asarray(physics.position) + physics.displacement(0, 1, 0.0)}
@@ -64,7 +63,7 @@ def without_history(physics: Physics) -> Physics:
 
 
 def _without_inflow(sponge: Porosity | None) -> Porosity | None:
-    """The sponge with pressures of 0 where an inlet gives the pressure, and without fluxes."""
+    """The sponge without fluxes, and with the pressure 0 where an inlet gives a pressure."""
     if sponge is None:
         return None
     open_ones = [inlet for inlet in sponge.inlet if inlet.nodes is not None]
@@ -79,7 +78,7 @@ def _is_heavy(scene: Scene) -> bool:
 
 
 def _is_pulled(still: Scene) -> bool:
-    """Whether a physics acts on free nodes in the reference shape; of traced numbers, whether a ligament may."""
+    """Whether a physics acts on free nodes in the reference shape; if traced, whether there is a ligament."""
     if not still.physics:
         return False
     alone = replace(still, fixed=(), displaced=(), body=None, porosity=None)

@@ -1,4 +1,4 @@
-"""Arruda-Boyce, the eight-chain law of the chapter's liver."""
+"""Arruda-Boyce: the eight-chain law that the book chapter uses for liver."""
 
 from typing import ClassVar
 
@@ -23,7 +23,7 @@ class ArrudaBoyce(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """The series, factored by (Ibar1 - 3) so that nothing cancels at rest."""
+        """The series with the factor (Ibar1 - 3) taken out, so that there is no cancellation at rest."""
         total = 0.0
         for k, c in enumerate(COEFFICIENTS, start=1):
             # (I^k - 3^k) = (I - 3) sum_m I^m 3^(k-1-m), by Horner's rule.
@@ -34,7 +34,7 @@ class ArrudaBoyce(Law):
         return self.mu * (I1 - 3) * total
 
     def isochoric_derivatives(self, I1, I2):
-        """Horner's rule for both derivatives."""
+        """Both derivatives by Horner's rule."""
         t = I1 / self.chain_length
         slope, curvature = 0.0, 0.0
         for k, c in reversed(list(enumerate(COEFFICIENTS, start=1))):

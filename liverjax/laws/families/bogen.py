@@ -1,6 +1,6 @@
 """Bogen: one power of the principal stretches.
 
-The chapter's Table 1 prints "- 1" in place of "- 3": then neither energy nor stress would be right at rest.
+The chapter's Table 1 prints "- 1" instead of "- 3". With "- 1" the energy at rest would not be 0.
 """
 
 from typing import ClassVar
@@ -13,7 +13,7 @@ from liverjax.laws.base import Law
 class Bogen(Law):
     """W = mu/alpha (Xi(alpha) - 3) + U(J).
 
-    Chapter, Table 1 (with - 3 for its - 1); Bogen 1987. One term of Ogden's law.
+    Chapter, Table 1 (with - 3 instead of - 1); Bogen 1987. It is one term of Ogden's law.
     """
 
     mu: Number = param("Pa", "mu; it must have alpha's sign for a stable law", typical=400.0)

@@ -1,4 +1,4 @@
-"""Costa's law of fibrous tissue; Guccione's is its transversely isotropic case."""
+"""Costa's law of fibrous tissue. Guccione's law is its transversely isotropic case."""
 
 from typing import Any, ClassVar
 
@@ -17,10 +17,10 @@ from liverjax.tensors.material_axes import SIX, symmetric
 class Costa(Law):
     """W = c/2 (exp Q - 1) + U(J), Q = sum b_AB E_AB^2 over fibre, sheet, normal, shear pairs counted twice.
 
-    Q = b_ff E_ff^2 + b_ss E_ss^2 + b_nn E_nn^2 + 2 (b_fs E_fs^2 + b_fn E_fn^2 + b_sn E_sn^2).
-    Costa, Holmes and McCulloch 2001. The chapter names the law (section 4.1.2 i, for heart muscle) but prints no
-    formula: it is not in Table 1. E is Green's strain in the axes fibre, sheet (made orthogonal to the fibre) and
-    normal. Not an isochoric energy: it adds to the bulk modulus.
+    Q = b_ff E_ff^2 + b_ss E_ss^2 + b_nn E_nn^2 + 2 (b_fs E_fs^2 + b_fn E_fn^2 + b_sn E_sn^2). Costa, Holmes and
+    McCulloch 2001. The chapter names the law (section 4.1.2 i, for heart muscle) but prints no formula: it is not in
+    Table 1. E is Green's strain in the axes fibre, sheet (made orthogonal to the fibre) and normal. This energy is not
+    isochoric: it adds to the bulk modulus.
     """
 
     c: Number = param("Pa", "scale", above=0.0, typical=200.0)
@@ -44,7 +44,7 @@ class Costa(Law):
         return sum(terms[:3]) + 2 * sum(terms[3:])
 
     def green_energy(self, E):
-        """The energy by expm1, so that nothing cancels at rest."""
+        """The energy with expm1, so that there is no cancellation at rest."""
         return 0.5 * self.c * jnp.expm1(self._exponent(E))
 
     def green_derivatives(self, E):
@@ -56,16 +56,19 @@ class Costa(Law):
         return S, GreenModuli(normal, tuple(0.5 * s * w for w in b[3:]), 2 / s)
 
     def shear_modulus(self):
-        """Voigt's mean over all shears, c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""
+        """Voigt mean over all shears, c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""
         b = self._weights()
         return self.c * (sum(b[:3]) / 15 + sum(b[3:]) / 10)
 
     def bulk_modulus(self):
-        """Voigt's mean: bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
+        """Voigt mean: bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
         return (0.0 if self.bulk is None else self.bulk) + self.c * sum(self._weights()[:3]) / 9
 
     def check_directions(self):
-        """Raise `InputError` if a direction has no length or the sheet lies along the fibre; traced ones pass."""
+        """Raise `InputError` if a direction has length 0, or the sheet is parallel to the fibre.
+
+        Traced directions pass.
+        """
         if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves((self.fibre, self.sheet))):
             return
         f, s = np.asarray(self.fibre, float), np.asarray(self.sheet, float)

@@ -1,6 +1,6 @@
 """Exponential of a power of the principal stretches.
 
-The chapter's Table 1 prints "- 1" in place of "- 3": then neither energy nor stress would be right at rest.
+The chapter's Table 1 prints "- 1" instead of "- 3". With "- 1" the energy at rest would not be 0.
 """
 
 from typing import ClassVar
@@ -15,7 +15,7 @@ from liverjax.laws.base import Law
 class Exponential(Law):
     """W = c1 (exp(c2 (Xi(alpha) - 3)) - 1) + U(J).
 
-    Chapter, Table 1 (with - 3 for its - 1).
+    Chapter, Table 1 (with - 3 instead of - 1).
     """
 
     c1: Number = param("Pa", "scale", above=0.0, typical=385.0)
@@ -30,7 +30,7 @@ class Exponential(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """The energy by expm1, so that nothing cancels at rest."""
+        """The energy with expm1, so that there is no cancellation at rest."""
         return self.c1 * jnp.expm1(self.c2 * X)
 
     def stretch_derivatives(self, X):

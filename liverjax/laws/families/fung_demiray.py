@@ -22,7 +22,7 @@ class FungDemiray(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """The energy by expm1, so that nothing cancels at rest."""
+        """The energy with expm1, so that there is no cancellation at rest."""
         return 0.5 * self.c1 / self.c2 * jnp.expm1(self.c2 * (I1 - 3))
 
     def isochoric_derivatives(self, I1, I2):

@@ -1,4 +1,4 @@
-"""Logarithm of a power of the principal stretches, infinite at a finite stretch."""
+"""Logarithm of a power of the principal stretches. It is infinite at a finite stretch."""
 
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from liverjax.laws.base import Law
 class Logarithmic(Law):
     """W = -c1 ln(1 - c2 (Xi(alpha) - 3)) + U(J).
 
-    Chapter, Table 1. Infinite where Xi(alpha) = 3 + 1/c2: NaN beyond.
+    Chapter, Table 1. W is infinite at Xi(alpha) = 3 + 1/c2, and NaN above.
     """
 
     c1: Number = param("Pa", "scale", above=0.0, typical=1925.0)
@@ -27,11 +27,11 @@ class Logarithmic(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """The energy by log1p, so that nothing cancels at rest."""
+        """The energy with log1p, so that there is no cancellation at rest."""
         return -self.c1 * jnp.log1p(-self._filled(X))
 
     def _filled(self, X):
-        """c2 X, which is 1 at the pole; NaN beyond the pole."""
+        """c2 X; NaN at the pole c2 X = 1 and above."""
         return jnp.where(self.c2 * X < 1, self.c2 * X, jnp.nan)
 
     def stretch_derivatives(self, X):

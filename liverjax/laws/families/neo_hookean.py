@@ -1,4 +1,4 @@
-"""Neo-Hookean laws: Table 1 of the chapter (with C1 = mu/2) and the plain compressible form."""
+"""Neo-Hookean laws: the form of the chapter's Table 1 (with C1 = mu/2), and the compressible form of the literature."""
 
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from liverjax.laws.base import Law
 class NeoHookean(Law):
     """W = mu/2 (Ibar1 - 3) + U(J).
 
-    Chapter, Table 1 (C1 = mu/2), written on isochoric invariants for compressible tetrahedra.
+    Chapter, Table 1 (C1 = mu/2), with isochoric invariants because tetrahedra are compressible.
     """
 
     mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)
@@ -25,7 +25,7 @@ class NeoHookean(Law):
         return 0.5 * self.mu * (I1 - 3)
 
     def isochoric_derivatives(self, I1, I2):
-        """A constant first derivative; the second is 0."""
+        """The first derivative is constant, and the second is 0."""
         return {"I1": 0.5 * self.mu}, {}
 
     def shear_modulus(self):
@@ -37,7 +37,7 @@ class NeoHookean(Law):
 class NeoHookeanCompressible(Law):
     """W = mu/2 (I1 - 3) - mu ln J + lambda/2 ln^2 J.
 
-    The compressible form of the literature (Bonet and Wood 2008, eq. 6.27), infinite at J = 0.
+    The compressible form of the literature (Bonet and Wood 2008, eq. 6.27). It is infinite at J = 0.
     """
 
     mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)
@@ -45,7 +45,7 @@ class NeoHookeanCompressible(Law):
     invariants: ClassVar = ("I1", "J")
 
     def strain_energy(self, I):
-        """Whole energy."""
+        """The complete energy."""
         ln = jnp.log(I.J)
         return 0.5 * self.mu * (I.I1 - 3) - self.mu * ln + 0.5 * self.lame_lambda * ln**2
 

@@ -1,6 +1,6 @@
 """Ogden: powers of the principal stretches.
 
-Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. A law of stretches receives X = Xi - 3, which is exact at rest.
+Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. A law of stretches gets X = Xi - 3, which is exact at rest.
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from liverjax.laws.base import Law
 class Ogden(Law):
     """W = sum_k mu_k/alpha_k (Xi(alpha_k) - 3) + U(J).
 
-    Chapter, Table 1; Ogden 1972. Others write mu_k/alpha_k^2: their mu_k is alpha_k times the one here. The law is
-    stable for every stretch if each mu_k alpha_k > 0.
+    Chapter, Table 1; Ogden 1972. Some authors write mu_k/alpha_k^2: their mu_k is alpha_k times the mu_k here. The law
+    is stable for every stretch if each mu_k alpha_k > 0.
     """
 
     mu: Sequence[float] | Array = param("Pa", "mu_k, one per term", each=True, typical=(700.0, -40.0))
@@ -42,6 +42,6 @@ class Ogden(Law):
         return sum(m * a for m, a in zip(self.mu, self.alpha, strict=True)) / 2
 
     def check(self):
-        """Raise `InputError` if the numbers of mu and alpha differ."""
+        """Raise `InputError` if mu and alpha have different numbers of terms."""
         if len(self.mu) != len(self.alpha):
             raise InputError(f"law ogden has {len(self.mu)} mu and {len(self.alpha)} alpha: give one each per term")

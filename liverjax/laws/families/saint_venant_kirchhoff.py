@@ -1,4 +1,4 @@
-"""Saint Venant-Kirchhoff."""
+"""Saint Venant-Kirchhoff: a quadratic energy of Green's strain."""
 
 from typing import ClassVar
 
@@ -10,8 +10,8 @@ from liverjax.laws.base import Law
 class SaintVenantKirchhoff(Law):
     """W = lambda/2 (tr E)^2 + mu tr E^2.
 
-    Chapter, Table 1: tr E = (I1 - 3)/2 and tr E^2 = (I1^2 - 2 I2 - 2 I1 + 3)/4, so J does not enter at all. Softens and
-    collapses in compression (stretch below about 0.6).
+    Chapter, Table 1: tr E = (I1 - 3)/2 and tr E^2 = (I1^2 - 2 I2 - 2 I1 + 3)/4, so the energy does not depend on J. The
+    law softens and collapses in compression (stretch below about 0.6).
     """
 
     mu: Number = param("Pa", "second Lame coefficient, the shear modulus", above=0.0, typical=770.0)
@@ -19,7 +19,7 @@ class SaintVenantKirchhoff(Law):
     invariants: ClassVar = ("I1", "I2")
 
     def strain_energy(self, I):
-        """Whole energy, as a form of deviations from rest (nothing large cancels)."""
+        """The complete energy as a function of deviations from rest, so that there is no cancellation."""
         a, b = I.I1 - 3, I.I2 - 3
         return self.lame_lambda / 8 * a * a + self.mu / 4 * (a * a + 4 * a - 2 * b)
 

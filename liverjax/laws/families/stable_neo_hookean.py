@@ -1,4 +1,4 @@
-"""Stable neo-Hookean: finite for every deformation gradient, inverted ones included."""
+"""Stable neo-Hookean: its energy is finite for every deformation gradient, even if it is inverted."""
 
 import math
 from typing import ClassVar
@@ -14,7 +14,7 @@ class StableNeoHookean(Law):
     """W = m/2 (I1 - 3) - m/2 ln((I1 + 1)/4) + l/2 [(J - a)^2 - (1 - a)^2], a = 1 + 3 m/(4 l),
     m = 4/3 mu, l = lame_lambda + 5/6 mu.
 
-    Smith, De Goes, Kim 2018 (eq. 14, shifted to zero at rest), with m and l such that mu and lame_lambda are the Lame
+    Smith, De Goes, Kim 2018 (eq. 14, shifted to 0 at rest). With these m and l, mu and lame_lambda are the Lame
     coefficients of the ground state (their section 3.4).
     """
 
@@ -26,7 +26,7 @@ class StableNeoHookean(Law):
         return 4 / 3 * self.mu, self.lame_lambda + 5 / 6 * self.mu
 
     def strain_energy(self, I):
-        """Whole energy: l/2 [(J - a)^2 - (1 - a)^2] = l/2 (J - 1)^2 - 3 m/4 (J - 1)."""
+        """The complete energy: l/2 [(J - a)^2 - (1 - a)^2] = l/2 (J - 1)^2 - 3 m/4 (J - 1)."""
         m, l = self._constants()
         shift = I.J - 1
         return 0.5 * m * (I.I1 - 3 - jnp.log(I.I1 + 1) + math.log(4)) + shift * (0.5 * l * shift - 0.75 * m)

@@ -1,4 +1,4 @@
-"""Yeoh, the reduced polynomial."""
+"""Yeoh: a polynomial of the first invariant."""
 
 from typing import ClassVar
 

@@ -1,1 +1,1 @@
-"""Stress and stiffness at one deformation gradient, one module per kind of law."""
+"""Stress and stiffness at one deformation gradient, with one module for each kind of law."""

@@ -1,8 +1,8 @@
-"""Stress and stiffness as the chapter writes them (section 4.1.2): six terms for every product g^k(I1, I2) h^k(J).
+"""Stress and stiffness in the form of the chapter (section 4.1.2): six terms for every product g^k(I1, I2) h^k(J).
 
-A documented variant: `liverjax.laws.terms.invariant_terms` sums the scalars over k first and gives the same numbers to
-roundoff at a cost that does not grow with the number of products. `liverjax.laws.products` writes the laws as such
-products.
+This is a documented variant. `liverjax.laws.terms.invariant_terms` first sums the scalars over k. It gives the same
+values up to roundoff, and its cost does not grow with the number of products. `liverjax.laws.products` writes the laws
+as such products.
 """
 
 from typing import NamedTuple
@@ -34,7 +34,7 @@ from liverjax.tensors.matrices import (
 
 
 class _Term(NamedTuple):
-    """One product's scalars: g and its derivatives by I1 and I2, h and its derivatives by J."""
+    """Scalars of one product: g(I1, I2) with its partial derivatives, and h(J) with its derivatives."""
 
     g: Number
     g1: Number
@@ -55,7 +55,7 @@ def _term(k: products.Product, I1: Number, I2: Number, J: jax.Array) -> _Term:
     c, i, j, p = k
 
     def g(a: int, b: int) -> Number:
-        """Derivative of g, of order a by I1 and of order b by I2."""
+        """Derivative of g, of order a with respect to I1 and of order b with respect to I2."""
         factor = (1, i, i * (i - 1))[a] * (1, j, j * (j - 1))[b]
         return 0.0 if factor == 0 else c * factor * _power(I1, i - a) * _power(I2, j - b)
 
@@ -88,7 +88,7 @@ def _state_at(law: Energies, F: Matrix) -> _At:
 
 
 def _stress_of_product(t: _Term, s: _At) -> Matrix:
-    """S^k = 2 dg/dC, no inverse."""
+    """S^k = 2 dg/dC; it needs no inverse."""
     return add_matrices(scale_matrix(2 * t.g1, IDENTITY), scale_matrix(2 * t.g2, s.B))
 
 
@@ -109,11 +109,11 @@ def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, jax.A
 
 
 class Layout(NamedTuple):
-    """The parts that are kept in memory; the default is the fastest (experiments/chapter)."""
+    """Which parts are stored in memory; the default is the fastest (experiments/chapter)."""
 
     #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes; None: computed where they are used.
     constant: list | None = None
-    #: Write values that blocks share to memory, as `invariant_terms` does; here the program is faster without.
+    #: Whether values that blocks share are written to memory, as in `invariant_terms`; here this is slower.
     write: bool = False
 
 
@@ -125,9 +125,9 @@ def blocks(
     regularised: bool = False,
     layout: Layout = Layout(),
 ) -> list[Matrix]:
-    """d2W/dx_i dx_j per reference volume: G + H + I + Lambda + M + R of every k, and phi'' of a function of the sum.
+    """d2W/dx_i dx_j per reference volume: the sum of G + H + I + Lambda + M + R over k, and the term with phi''.
 
-    `regularised` changes the G of every product (not phi'').
+    `regularised` changes the G of every product, but not the term with phi''.
     """
     keep = _written if layout.write else lambda values: values
     s = keep(_state_at(law, F))
@@ -152,8 +152,7 @@ def _node(s: _At, D: Vector) -> _Node:
 
 
 def _written(values: T) -> T:
-    """The pytree with its arrays written to memory (`stored`). Plain numbers stay as they are, so that products with 0
-    can be left out."""
+    """The pytree with its arrays written to memory (`stored`). Plain numbers are not changed."""
     leaves, tree = jax.tree.flatten(values)
     arrays = iter(stored([v for v in leaves if jnp.ndim(v)]))
     return jax.tree.unflatten(tree, [next(arrays) if jnp.ndim(v) else v for v in leaves])
@@ -164,7 +163,7 @@ def _six_terms(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Number], regu
     for n, (terms, phi1, phi2) in enumerate(s.groups):
         for t, FSDi, FSDj, SDj in zip(terms, i.FS[n], j.FS[n], j.S[n], strict=True):
             G = scale_matrix(t.h2 * t.g, outer(i.cof, j.cof))
-            if regularised:  # eps/3 where the chapter prints eps: the trace is kept
+            if regularised:  # eps/3, where the chapter prints eps: so the trace does not change
                 eps = jnp.clip(1 - s.J, 0, 1)
                 trace = scale_matrix(t.h2 * t.g * eps / 3 * dot(i.cof, j.cof), IDENTITY)
                 G = add_matrices(scale_matrix(1 - eps, G), trace)

@@ -31,7 +31,7 @@ from liverjax.tensors.matrices import (
 
 
 class GreenModuli(NamedTuple):
-    """dS/dE = orthotropic moduli + `curvature` S (x) S, all in the axes of the material."""
+    """dS/dE = orthotropic moduli + `curvature` S (x) S, in the axes of the material."""
 
     normal: Matrix  # C_mmnn
     shear: Vector  # C_mnmn of the pairs 12, 13, 23
@@ -39,7 +39,7 @@ class GreenModuli(NamedTuple):
 
 
 def stress(law: Energies, F: Matrix) -> Matrix:
-    """Second Piola-Kirchhoff stress [Pa] of w alone."""
+    """Second Piola-Kirchhoff stress [Pa] of w only."""
     A = law.material_axes(F[0][0])
     return rotated(_stress_of_strain(law, green_strain(matmul(F, A))), A)
 
@@ -70,7 +70,7 @@ def _stress_of_strain(law: Energies, E: Matrix) -> Matrix:
 
 
 def _slopes(function: Any, six: tuple) -> list:
-    """Derivative with respect to each entry E_ij of a symmetric E; a shear changes two entries, so each has half."""
+    """Derivative with respect to each entry E_ij of a symmetric E. A shear changes two entries, each by one half."""
     result = []
     for k, (i, j) in enumerate(SIX):
         weight = 1.0 if i == j else 0.5

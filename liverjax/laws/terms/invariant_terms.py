@@ -1,6 +1,6 @@
-"""The hand-derived terms of one deformation gradient: stress, tangent and the blocks of the stiffness.
+"""Hand-derived terms at one deformation gradient: stress, tangent and the blocks of the stiffness.
 
-Chapter, section 4.1.2, contracted: with J as one more invariant and v_a,i = dI_a/dx_i,
+They are the terms of the chapter's section 4.1.2, contracted. With J as an additional invariant and v_a,i = dI_a/dx_i,
 
     d2W/dx_i dx_j = sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j
 
@@ -37,7 +37,7 @@ from liverjax.tensors.subsets import Subsets, in_subset, put_together
 
 
 class Stress(NamedTuple):
-    """P = F S + p cof F, arrays of shape (E,): `S` a symmetric matrix or, if spherical, one array; p = W_J."""
+    """P = F S + p cof F with arrays (E,). `S` is a symmetric matrix, or one array if it is spherical; p = W_J."""
 
     S: Matrix | Any
     p: jax.Array
@@ -53,7 +53,7 @@ class Scalars(NamedTuple):
 class State(NamedTuple):
     """Values at one deformation gradient that force and stiffness share."""
 
-    laws: tuple  # summands, whose energies of stretches and of Green's strain add up
+    laws: tuple  # summands with energies of stretches or of Green's strain, which add up
     F: Matrix
     C: Matrix | None
     cof: Matrix
@@ -66,7 +66,7 @@ class State(NamedTuple):
 
 
 class Pieces(NamedTuple):
-    """The states of laws of several kinds, each at its own elements."""
+    """The states of laws of several kinds, each in the elements of its region."""
 
     subsets: Subsets
     states: tuple[State, ...]
@@ -92,7 +92,7 @@ def state_of(scalars: Scalars, F: Matrix) -> State:
 
 
 def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
-    """C is computed only if I2 needs it, principal stretches only if a law needs them."""
+    """The state: C is computed only if I2 needs it, principal stretches only if a law needs them."""
     first, second = scalars
     cof = cofactor(F)
     C = right_cauchy_green(F) if "I2" in first else None
@@ -103,7 +103,7 @@ def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
 
 
 def stress(s: State | Pieces) -> Stress:
-    """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J; a missing derivative adds no term."""
+    """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J. A missing derivative adds no term."""
     if isinstance(s, Pieces):
         return _put_together(s.subsets, [stress(own) for own in s.states])
     W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
@@ -126,7 +126,7 @@ def stress(s: State | Pieces) -> Stress:
 
 
 def _put_together(subsets: Subsets, found: list[Stress]) -> Stress:
-    """Stresses of all elements; if one of them is a matrix, the spherical ones become matrices too."""
+    """Stresses of all elements. If one of them is a matrix, spherical stresses are written as matrices, too."""
     if any(isinstance(S, tuple) for S, _ in found):
         found = [Stress(S if isinstance(S, tuple) else _spherical(S), p) for S, p in found]
     return put_together(subsets, found)
@@ -144,15 +144,15 @@ def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
     return tuple(tuple(FS[i][j] + p * cof[i][j] for j in range(3)) for i in range(3))
 
 
-#: Smallest |J| for which a second Piola-Kirchhoff stress is computed.
+#: Minimum |J| for the second Piola-Kirchhoff stress.
 _FLAT = 1e-3
 
 
 def second_piola(F: Matrix, resultant: Stress) -> Matrix:
     """S + p J C^-1 [Pa] of P = F S + p cof F, with J C^-1 = cof(F)^T cof(F) / J.
 
-    Section 4.2 needs F^-1 here, which does not exist at J = 0. So an element flatter than |J| = 1e-3 is treated as if
-    it had |J| = 1e-3.
+    Section 4.2 of the chapter needs F^-1 here, which does not exist at J = 0. So a smaller |J| is replaced by 1e-3 in
+    the division by J.
     """
     S, p = resultant
     cof = cofactor(F)
@@ -174,7 +174,7 @@ def first_piola(law: Energies, F: Matrix) -> Matrix:
 
 
 def slopes(s: State, D: Vector) -> dict[str, Vector]:
-    """dJ/dx of a node with shape vector D, and half of the slopes of I1, I2 and I4: F D, F (I1 Id - C) D, (a.D) F a."""
+    """For a node with shape vector D: dJ/dx, and half of dI/dx for I1, I2, I4: F D, F (I1 Id - C) D, (a.D) F a."""
     FD = matvec(s.F, D)
     v = {"I1": FD, **{key: scale(dot(a, D), matvec(s.F, a)) for key, a in s.fibres.items()}}
     if "J" in s.first:
@@ -189,7 +189,7 @@ def _weight(invariant: str) -> float:
 
 
 class _Parts(NamedTuple):
-    """Values from which the blocks are computed."""
+    """Values that are needed to compute the blocks."""
 
     J: jax.Array
     first: dict
@@ -202,7 +202,10 @@ class _Parts(NamedTuple):
 
 
 def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Parts:
-    """The result is written to memory. Otherwise XLA:CPU computes it again for each entry: a fifth slower."""
+    """The result is written to memory.
+
+    Otherwise XLA:CPU would compute it again for each entry, which is a fifth slower.
+    """
     S, p = stress(s)
     metric = {(i, j): dot(D[i], D[j]) for i, j in pairs}
     tensor = isinstance(S, tuple)
@@ -214,7 +217,7 @@ def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Pa
 
 
 def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
-    """The block of two nodes, without stretches and Green's strain."""
+    """The block of two nodes, without energies of stretches and of Green's strain."""
     vi, vj = s.slopes[pair[0]], s.slopes[pair[1]]
     second = dict(s.second)
     W_JJ = second.pop(("J", "J"), None) if regularised else None
@@ -260,7 +263,8 @@ def blocks(
         s: `state` of the element.
         D: shape vectors of its nodes [1/m].
         pairs: which blocks, as indices (i, j) into D.
-        regularised: replace G as in section 4.1.2 iii, with eps/3 where the chapter prints eps (the trace is kept).
+        regularised: replace G as in section 4.1.2 iii, but with eps/3 where the chapter prints eps, so that the trace
+            does not change.
     """
     if isinstance(s, Pieces):
         own = [blocks(each, in_subset(s.subsets, k, D), pairs, regularised) for k, each in enumerate(s.states)]
@@ -283,7 +287,7 @@ _UNIT_VECTORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def tangent(s: State | Pieces) -> list[list[Matrix]]:
-    """d2W/dF dF [Pa] as nested [J][L] of matrices (i, k): the blocks of shape vectors e_J and e_L."""
+    """d2W/dF dF [Pa] as nested lists [J][L] of matrices (i, k): the blocks for shape vectors e_J and e_L."""
     pairs = tuple((J, L) for J in range(3) for L in range(3))
     A = blocks(s, list(_UNIT_VECTORS), pairs)
     return [A[3 * J : 3 * J + 3] for J in range(3)]

@@ -3,12 +3,13 @@
 In the principal axes S is diagonal, S_m = tau_m / lambda_m^2 with tau_m = dw/d ln lambda_m, and
 
     C_mmnn = (d2w/d ln lambda_m d ln lambda_n - 2 delta_mn tau_m) / (lambda_m lambda_n)^2
-    C_mnmn = (S_m - S_n) / (lambda_m^2 - lambda_n^2), a divided difference, exact where stretches are equal.
+    C_mnmn = (S_m - S_n) / (lambda_m^2 - lambda_n^2).
 
-The chapter's A H A form (section 4.1.2) has a geometric mean there: wrong except for alpha = 2 and 4.
+C_mnmn is computed as a divided difference that is exact if stretches are equal. The chapter's A H A form (section
+4.1.2) has a geometric mean there, which is wrong except for alpha = 2 and 4.
 
-Values come from these formulas. Their derivatives come from the energy expanded in frozen principal axes
-(`liverjax.tensors.principal`). This expansion is smooth where stretches are equal; the axes themselves are not.
+Values are computed with these formulas. Their derivatives are computed from the energy, expanded in frozen principal
+axes (`liverjax.tensors.principal`). If stretches are equal, this expansion is smooth, but the axes are not.
 """
 
 from functools import partial
@@ -33,7 +34,7 @@ from liverjax.tensors.material_axes import (
 from liverjax.tensors.matrices import Matrix, Vector, add, determinant, dot, matmul, stored, transpose
 from liverjax.tensors.principal import change, expanded_power_sum, principal, sinh_ratio
 
-#: Logarithms of the principal stretches and their axes (`liverjax.tensors.principal`): constants of differentiation.
+#: Logarithms of the principal stretches, and their axes (`liverjax.tensors.principal`): constants in derivatives.
 Frame = tuple[Vector, Matrix]
 
 
@@ -52,7 +53,7 @@ class Principal(NamedTuple):
 
 
 def stretch_slopes(law: Energies, X: tuple) -> tuple[tuple, dict]:
-    """dw/dX_k and {(k, l): d2w/dX_k dX_l}: by hand where the law has them, else by scalar automatic differentiation."""
+    """dw/dX_k and {(k, l): d2w/dX_k dX_l}: hand-derived if the law has them, else by automatic differentiation."""
     if law.stretch_derivatives is not None:
         return law.stretch_derivatives(*X)
     n = len(X)
@@ -78,7 +79,7 @@ def _at_stretches(law: Energies, F: Matrix, frame: Frame) -> Principal:
 
 
 def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
-    """C_mmnn as a matrix and C_mnmn of the three pairs."""
+    """C_mmnn as a matrix, and C_mnmn of the three pairs."""
 
     def normal(m: int, n: int) -> jax.Array:
         h = -2 * s.tau[m] if m == n else 0.0
@@ -103,12 +104,12 @@ def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
 
 
 def stress(law: Energies, F: Matrix, frame: Frame) -> Matrix:
-    """Second Piola-Kirchhoff stress [Pa] of w alone (no volumetric part), with `frame` = `principal(F)`."""
+    """Second Piola-Kirchhoff stress [Pa] of w only (no volumetric part), with `frame` = `principal(F)`."""
     return symmetric(_stress(_arrays(law, F), F, frame))
 
 
 def moduli(law: Energies, F: Matrix, frame: Frame) -> list[list]:
-    """dS/dE [Pa] of w alone, 6 x 6 components in the coordinate axes, with `frame` = `principal(F)`."""
+    """dS/dE [Pa] of w only: 6 x 6 components in the coordinate axes, with `frame` = `principal(F)`."""
     return _square(_moduli_of_axes(_arrays(law, F), F, frame))
 
 
@@ -120,7 +121,7 @@ def blocks(law: Energies, F: Matrix, frame: Frame, D: list[Vector], pairs: tuple
 
 
 def _arrays(law: Energies, F: Matrix) -> jax.Array:
-    """The law with its parameters in the precision of F, since whole numbers have no derivative."""
+    """The law with its parameters as arrays in the precision of F, since whole numbers have no derivative."""
     return jax.tree.map(lambda v: jnp.asarray(v, jnp.result_type(F[0][0])), law)
 
 
@@ -132,12 +133,12 @@ def _square(upper: tuple) -> list[list]:
     return [[entries[min(a, b), max(a, b)] for b in range(6)] for a in range(6)]
 
 
-# Functions with a derivative rule of their own are not linear in any argument: JAX would drop the rule of a
-# function if only a linear argument were unknown (forward over reverse mode).
+# Functions with a custom derivative rule must not be linear in an argument: if only a linear argument is unknown
+# (forward over reverse mode), JAX does not use the rule.
 
 
 def stress_at_constant(law: Energies, F: Matrix) -> Matrix:
-    """`stress` for an F that is data. Its axes do not move, so plain differentiation by parameters is right."""
+    """`stress` for a constant F. The axes do not change, so JAX can differentiate with respect to the parameters."""
     return symmetric(_stress.fun(_arrays(law, F), F, principal(F)))
 
 
@@ -202,7 +203,7 @@ def _vanishes(t: Number) -> bool:
     return isinstance(t, SymbolicZero)
 
 
-# -- the same from the expanded energy, slower, to be differentiated --------------------------------------------------
+# -- the same from the expanded energy: slower, used for derivatives --------------------------------------------------
 
 
 def _expanded_energy(law: Energies, logs: Vector, axes: Matrix, log_J0: Number, Y: tuple) -> jax.Array:
@@ -215,14 +216,17 @@ def _expanded_energy(law: Energies, logs: Vector, axes: Matrix, log_J0: Number, 
 
 
 def _energy_of_change(law: Energies, F: Matrix, frame: Frame, orders: int) -> tuple[Any, tuple]:
-    """The energy as a function of a change Y of C, and Y itself: zero, but differentiable `orders` times by F."""
+    """The energy as a function of a change Y of C, and Y: it is 0, but can be differentiated `orders` times in F."""
     logs, axes = frame
     log_J0 = jax.lax.stop_gradient(jnp.log(determinant(F)))
     return partial(_expanded_energy, law, logs, axes, log_J0), change(F, orders)
 
 
 def _strain_derivatives(function: Any, Y: tuple) -> jax.Array:
-    """Derivatives of `function` with respect to the six entries of E, first axis; dY = 2 dE, a shear fills two."""
+    """Derivatives of `function` with respect to the six entries of E (first axis).
+
+    dY = 2 dE, and a shear changes two entries.
+    """
 
     def along(direction):
         tangents = tuple(d * jnp.ones_like(y) for d, y in zip(direction, Y, strict=True))

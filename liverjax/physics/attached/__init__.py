@@ -1,1 +1,1 @@
-"""Additional elements between the nodes of a body: membranes, ligaments, vessels."""
+"""Additional elements that connect nodes of the body: membranes, ligaments, vessels."""

@@ -1,8 +1,9 @@
-"""Centre lines and radii of tubes from their surface, as a segmentation writes it: one tube, or a tree of them.
+"""Centre lines and radii of one tube or a tree of tubes, from their surface, for example from a segmentation.
 
-Lines of equal distance from one end, measured along the surface, are rings about the tubes: one ring for each branch.
-Their centres, joined across the bands between them, are the centre lines. The radius of a piece is the mean distance of
-its rings from it. Lines begin and end where the surface does.
+The distance from one end is measured along the surface. Lines of equal distance are rings around the tubes, one ring
+for each branch. The band between two levels contains the surface between two rings. The centres of the two rings of a
+band are joined by a piece of a centre line. The radius of a piece is the mean distance of the points of its rings from
+it. The centre lines begin and end at the ends of the surface.
 
 Source: level sets of geodesic distance (Verroust and Lazarus 2000, Extracting skeletal curves from 3D scattered data).
 """
@@ -17,9 +18,9 @@ from liverjax.core.errors import InputError
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Distance between rings over the mean radius of the tubes.
+#: Distance between rings, divided by the mean radius of the tubes.
 _BAND = 2.0
-#: Rings of fewer points do not go around a tube.
+#: Minimum number of points of a ring: a ring with fewer points does not go around a tube.
 _LEAST = 5
 
 
@@ -32,7 +33,7 @@ class CentreLines(NamedTuple):
 
 
 def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (n, 3) [m] and triangles (t, 3) of a surface file, with corners at the same place joined.
+    """Corners (n, 3) [m] and triangles (t, 3) of a surface file. Corners at the same place are merged.
 
     Args:
         path: any format of meshio with triangles (STL, PLY, OBJ, VTK, …).
@@ -63,9 +64,9 @@ class _Rings(NamedTuple):
     """Rings of one surface, and the bands between them."""
 
     points: np.ndarray  # (p, 3) where the edges cross levels
-    ring: np.ndarray  # (p,) number of the ring of each
+    ring: np.ndarray  # (p,) ring of each point
     below: np.ndarray  # (r,) band below each ring
-    above: np.ndarray  # (r,) band above each
+    above: np.ndarray  # (r,) band above each ring
     band: np.ndarray  # (n,) band of each corner
 
 
@@ -74,11 +75,11 @@ def centre_lines(points: np.ndarray, triangles: np.ndarray, name: str = "vessel"
 
     Args:
         points: corners (n, 3) [m].
-        triangles: (t, 3) corners of each; tubes may be open or closed at their ends.
+        triangles: corner numbers (t, 3); tubes may be open or closed at their ends.
         name: name of the vessel, for messages.
 
     Raises:
-        InputError: a surface too short or too coarse to have a line.
+        InputError: the surface is too short or too coarse for a centre line.
     """
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components
@@ -109,7 +110,7 @@ def _edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarray:
-    """Distance along the edges (n,) from a corner at one end."""
+    """Distances (n,) along the edges from a corner at one end of the surface."""
     from scipy.sparse.csgraph import dijkstra
 
     first = dijkstra(graph, directed=False, indices=own[0])
@@ -117,8 +118,7 @@ def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarra
 
 
 def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> float:
-    """Distance between rings: from the area of the surface over its length, but so large that no edge crosses two
-    rings."""
+    """Distance between rings: from the mean radius (area over length), but so large that no edge crosses two rings."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     longest = max(np.ptp(away[triangles], axis=1).max(), 1e-300)
@@ -126,7 +126,7 @@ def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> flo
 
 
 def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _Rings:
-    """Rings of the points where edges cross levels of the distance; the levels lie midway in each spacing."""
+    """Rings of the points where edges cross levels of the distance. The levels are at (k + 1/2) times the spacing."""
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components
 
@@ -140,7 +140,7 @@ def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _R
     low, high = crossing.T
     part = ((level[low] + 0.5) * spacing - away[low]) / (away[high] - away[low])
     at = points[low] + part[:, None] * (points[high] - points[low])
-    # The two crossing edges of a triangle are neighbours on a ring.
+    # If a level cuts a triangle, the points on its two cut edges are neighbours on the ring.
     key = np.minimum(low, high) * n + np.maximum(low, high)
     order = np.argsort(key)
     sides = np.stack([np.sort(triangles[:, pair], axis=1) @ [n, 1] for pair in ([0, 1], [1, 2], [2, 0])], axis=1)
@@ -157,7 +157,7 @@ def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _R
 
 
 def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
-    """Lines between the centres of the two rings of a band, and from the last ring of a branch to its end."""
+    """Lines that join the centres of the rings of a band, and lines from the last ring of a branch to its end."""
     count = np.bincount(r.ring)
     centre = np.stack([np.bincount(r.ring, r.points[:, k]) for k in range(3)], axis=1) / count[:, None]
     r, real = _without_tips(r, np.flatnonzero(count >= _LEAST))
@@ -169,7 +169,8 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
             if own in others:
                 continue
             beside = real[side[real] == own]
-            # Where two branches meet, or leave the first band, they are joined; else a branch ends.
+            # Branches that meet in this band, or begin in it, are joined. If there is no other branch, this branch
+            # ends.
             lines += [(centre[a], centre[b], np.isin(r.ring, (a, b))) for b in beside[beside > a]]
             if len(beside) > 1:
                 continue
@@ -184,7 +185,7 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
 
 
 def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
-    """Drop the last ring of each branch, which may go around a corner of the end, and join its bands."""
+    """Remove the last ring of each branch and merge its two bands: the ring may go around a corner of the end."""
     keep, band, below, above = set(real.tolist()), r.band.copy(), r.below.copy(), r.above.copy()
     sides = np.concatenate([below[real], above[real]])
     for a in real:
@@ -196,7 +197,7 @@ def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
 
 
 def _outwards(centre: np.ndarray, r: _Rings, real: np.ndarray, a: int, own: int) -> np.ndarray:
-    """Direction (3,) of the line at its last ring a: from the ring before, or normal to the only ring."""
+    """Direction (3,) of the line at its last ring a: away from the previous ring, or normal to a if there is none."""
     inner = r.below[a] if own == r.above[a] else r.above[a]
     before = [b for b in real if b != a and inner in (r.below[b], r.above[b])]
     if before:

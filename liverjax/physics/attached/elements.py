@@ -1,7 +1,8 @@
 """Elements between nodes of the body whose energy depends on their lengths and angles: membranes, springs, bars.
 
-At every point an element has d tangent vectors f_k = sum_a p_ka y_a of its nodes' positions y_a. Its energy is a
-function W of the metric C_kl = f_k . f_l. With T_kl = dW/dC_kl + dW/dC_lk forces and stiffness are
+At every integration point an element has d tangent vectors f_k = sum_a p_ka y_a, with the positions y_a of its nodes.
+Its energy is a function W of the metric C_kl = f_k . f_l. With T_kl = dW/dC_kl + dW/dC_lk, the forces and the stiffness
+are
 
     g_a = sum p_ka T_kl f_l,    K_ab = sum p_ka p_lb (T_kl I + d2W/dC_v dC_w (dC_v/df_k) (dC_w/df_l)).
 """
@@ -16,10 +17,10 @@ from liverjax.solvers.attached import Attached
 
 
 class Elements(NodalForce):
-    """A force that acts between nodes, element by element."""
+    """Forces between nodes, computed element by element."""
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Node numbers (n, m) of m elements."""
+        """Node numbers (n, m) of m elements with n nodes each."""
         raise TypeError(f"{type(self).__name__} lacks nodes(mesh)")
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
@@ -27,11 +28,11 @@ class Elements(NodalForce):
         raise TypeError(f"{type(self).__name__} lacks tangents(mesh)")
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Energy (Q, m) [J] of every point as a function of C_11 (Q, m), or of C_11, C_12 and C_22."""
+        """Energy (Q, m) [J] at every point as a function of C_11 (Q, m), or of C_11, C_12 and C_22."""
         raise TypeError(f"{type(self).__name__} lacks energies(mesh, C)")
 
     def away(self) -> jax.Array | None:
-        """Part (d, 3, Q, m) to subtract from the tangent vectors, for ends that are not nodes; None: nothing."""
+        """Vectors (d, 3, Q, m) to subtract from the tangent vectors, for ends that are not nodes; None: nothing."""
         return None
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
@@ -81,7 +82,7 @@ def _metric(f: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def _tension(slopes: tuple[jax.Array, ...]) -> list[list[jax.Array]]:
-    """Stress T from the derivatives of the energy by C_11, or by C_11, C_12 and C_22."""
+    """Stress T from the derivatives of the energy with respect to C_11, or to C_11, C_12 and C_22."""
     if len(slopes) == 1:
         return [[2 * slopes[0]]]
     return [[2 * slopes[0], slopes[1]], [slopes[1], 2 * slopes[2]]]

@@ -1,8 +1,8 @@
-"""A ligament: a cable with tension at rest, between two points of the body, or from a place of it to a point outside.
+"""A ligament: a cable between two points of the body, or from a place of the body to a point outside.
 
-Its tension is k (l - l0) of its length l, and 0 if it is slack: a ligament pulls and does not push. The user gives its
-rest length l0, or its tension T0 at its length L in the reference shape: then l0 = L - T0/k. From a place of n nodes it
-has n fibres, which share stiffness and tension.
+Its tension at length l is k (l - l0), and 0 if it is slack: a ligament pulls and does not push. The user gives the rest
+length l0, or the tension T0 in the reference shape. There the length is L, so l0 = L - T0/k. A ligament from a place of
+n nodes to a point outside has n fibres, which share stiffness and tension equally.
 """
 
 from typing import Any, ClassVar
@@ -19,13 +19,13 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
 
-#: A fibre that is shorter by less than this part of its rest length is not slack: the difference is roundoff.
+#: A fibre may be shorter than its rest length by this fraction and is still not slack: the difference is roundoff.
 _ROUNDED = 1e-9
 
 
 @struct
 class Ligament(Physics):
-    """Fibres (m) that each pull at nodes of the body, and may end outside it."""
+    """Fibres (m): each of them pulls at nodes of the body and may end outside the body."""
 
     nodes: Indices = param("1", "node numbers (n, m)", lower=0)
     weights: Array = param("1", "weights of these nodes in the fibre's vector (n, m): the sum is 0, or 1 with a wall")
@@ -39,7 +39,7 @@ class Ligament(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "Ligament":
-        """Read [[ligament]]: a place and a point of the wall, or two points of the body."""
+        """Read [[ligament]]: a place and a point outside the body, or two points of the body."""
         if ("points" in table) == ("to" in table):
             raise InputError(f"{name} needs either to = [x, y, z], with a place, or points = [[x, y, z], [x, y, z]]")
         if "stiffness" not in table:
@@ -59,7 +59,7 @@ class Ligament(Physics):
         return between(mesh, np.array([_vector(end, f"{name} points") for end in ends]), name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse wrong node numbers, a wrong length at rest, and fibres without a direction."""
+        """Refuse wrong node numbers, a wrong rest length or tension, and fibres of length 0."""
         numbers = np.asarray(self.nodes)
         if numbers.ndim != 2:
             raise InputError(f"{name}.nodes has shape {numbers.shape}: give the nodes of each fibre in a column (n, m)")
@@ -95,7 +95,7 @@ class Ligament(Physics):
         return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held along the fibres that end in a wall and are not slack at the beginning."""
+        """Nodes are held along fibres that end outside the body and are not slack at the beginning."""
         if self.to is None:
             return np.zeros(0, int), np.zeros((0, 3))
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
@@ -104,12 +104,15 @@ class Ligament(Physics):
         return np.asarray(self.nodes)[0, taut], f / lengths[taut, None]
 
     def is_straight_without_tension(self, mesh: TetMesh, x: jax.Array) -> bool:
-        """Whether a fibre has its rest length at positions x (V, 3): a small motion would leave it slack by turns."""
+        """Whether a fibre has exactly its rest length at positions x (V, 3).
+
+        A small vibration about x would make it slack half of the time.
+        """
         lengths, rest = np.asarray(self._lengths(x)), np.asarray(self._rest(mesh))
         return bool(np.any(np.abs(lengths - rest) <= _ROUNDED * rest))
 
 
-@jax.jit  # compiled, since checks of a sweep compute them for each row
+@jax.jit  # compiled, since the checks of a sweep call it for each row
 def _lengths_and_rest(ligament: Ligament, mesh: TetMesh) -> tuple[jax.Array, jax.Array]:
     """Lengths (m,) of the fibres in the reference shape, and at rest [m]."""
     return ligament._lengths(mesh.points), ligament._rest(mesh)
@@ -164,6 +167,6 @@ class Fibres(Elements):
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
         """Half the stiffness times the square of the elongation; 0 if the fibre is slack."""
         length, rest = jnp.sqrt(C[0]), self.rest[None]
-        # A fibre at its rest length is taut: the derivatives of a maximum there would be those of a softer one.
+        # A fibre at its rest length is taut. `maximum` would have half the derivative there.
         longer = jnp.where(length >= (1 - _ROUNDED) * rest, length - rest, 0.0)
         return 0.5 * self.spring * longer * longer

@@ -1,8 +1,8 @@
-"""A membrane on a part of the surface: a capsule that is stretched with it, and that bends without force.
+"""A membrane on a part of the surface, for example the capsule: it stretches with the surface and bends without force.
 
-Its law acts in its plane. The stress across it is 0 (plane stress). A law with an isochoric part is taken as
-incompressible: the thickness is stretched by 1 over the change of area. For another law, the stretch of the thickness
-is an unknown at every point.
+Its law acts in the plane of the membrane. The stress across the thickness is 0 (plane stress). A law with an isochoric
+part is treated as incompressible: the stretch of the thickness is 1 over the area ratio. For another law the stretch of
+the thickness is an unknown at every point.
 
 Source: Holzapfel, Eberlein, Wriggers and Weizsaecker 1996, "A new axisymmetrical membrane element for anisotropic,
 finite strain analysis of arteries", and Bonet and Wood 2008, section 6.6 (plane stress).
@@ -27,11 +27,11 @@ from liverjax.physics.base import Physics, Step
 
 @struct
 class Membrane(Physics):
-    """A thin layer on triangles of the surface, without tension in the reference shape."""
+    """A thin layer on triangles of the surface. It has no tension in the reference shape."""
 
     triangles: Indices = param("1", "node numbers (m, 3)", lower=0)
     thickness: Number = param("m", "of the layer: one number, or one per triangle (m,)", above=0.0)
-    law: Law = param("1", "law of the layer; its numbers may have one value per triangle (m,)")
+    law: Law = param("1", "law of the layer; parameters may have one value per triangle (m,)")
 
     section: ClassVar[str] = "membrane"
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "thickness", "law")
@@ -52,7 +52,7 @@ class Membrane(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), thickness=table["thickness"], law=law)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse triangles that are not in the mesh, a wrong number of thicknesses, and a law with directions."""
+        """Refuse triangles that are not in the mesh, a wrong number of thicknesses, and laws with fibre directions."""
         selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
         if np.shape(self.thickness) not in ((), (len(self.triangles),)):
             shape, count = np.shape(self.thickness), len(self.triangles)
@@ -76,11 +76,11 @@ class Stretched(Elements):
 
     triangles: Indices = param("1", "node numbers (m, 3)")
     thickness: Any = param("m", "of the layer")
-    law: Law = param("1", "isochoric, or whole if the stretch of the thickness is solved for")
-    solved: object = param("1", "not None: the stretch of the thickness is solved for", default=None)
+    law: Law = param("1", "isochoric part, or the whole law if the stretch of the thickness is unknown")
+    solved: object = param("1", "not None: the stretch of the thickness is an unknown", default=None)
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Nodes of the triangles: 3 each, or 6."""
+        """Nodes of the triangles: 3 or more for each."""
         return jnp.stack(surface.triangle_nodes(mesh, self.triangles))
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
@@ -99,7 +99,7 @@ class Stretched(Elements):
         return (0.5 * self.thickness * r11 * r22)[None] * jnp.asarray(weights, W.dtype)[:, None] * W
 
     def _edges(self, mesh: TetMesh) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Cholesky factor, r11, r12 and r22 (m,) [m], of the metric of the reference triangles' edges."""
+        """Cholesky factor (r11, r12, r22), each (m,) [m], of the metric of two edges of each reference triangle."""
         corners = jnp.moveaxis(mesh.points[self.triangles[:, :3]], 0, -1)
         first, second = corners[1] - corners[0], corners[2] - corners[0]
         r11 = jnp.sqrt(jnp.sum(first * first, axis=0))

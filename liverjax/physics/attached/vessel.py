@@ -1,8 +1,8 @@
-"""A vessel: bars along a centre line, which stiffen the tetrahedra they cross. They bend without force.
+"""A vessel: bars along a centre line. They stiffen the tetrahedra through which they pass, and they bend without force.
 
-The line is cut at the faces of the tetrahedra. A piece has no unknowns of its own: its points move with the functions
-of its element. Its section is a ring, or a disc without `wall`; its law acts in tension along it, at constant volume.
-The tissue in the place law of the wall is not removed.
+The line is cut at the faces of the tetrahedra. A piece has no additional unknowns: its points move with the shape
+functions of its element. Its cross-section is a ring, or a disc if `wall` is None. Its law acts in uniaxial tension
+along the piece, at constant volume. The tissue at the place of the wall is not removed.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from liverjax.physics.attached.centre_lines import CentreLines, centre_lines, re
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
 
-#: Two points of Gauss on a piece: exact for the squares of the slopes of quadratic elements.
+#: Two Gauss points on a piece: they integrate the squared slopes of quadratic elements exactly.
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3)
 
 
@@ -38,7 +38,7 @@ class Vessel(Physics):
     enters: jax.Array = param("1", "barycentric coordinates where a piece begins (4, m)")
     leaves: jax.Array = param("1", "barycentric coordinates where a piece ends (4, m)")
     radius: Number = param("m", "outer radius, one number or one per piece (m,)", above=0.0)
-    wall: Number | None = param("m", "thickness law of the wall; None: the section is a disc", above=0.0, default=None)
+    wall: Number | None = param("m", "thickness of the wall; None: the section is a disc", above=0.0, default=None)
     law: Law = param("1", "law of the wall")
 
     section: ClassVar[str] = "vessel"
@@ -46,13 +46,13 @@ class Vessel(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: dict[str, object], name: str) -> "Vessel":
-        """Read [[vessel]]: points of a centre line and a radius (or one per point), or the file of a surface; a law."""
+        """Read [[vessel]]: a law, and the points of a centre line with radii or the file of a surface."""
         if ("line" in table) == ("surface" in table) or "law" not in table:
             raise InputError(
                 f"{name} needs line = [[x, y, z], …] with radius in m, or surface = 'tube.stl', and [vessel.law]"
             )
         if "where" in table or "set" in table:
-            raise InputError(f"{name} has a place, but its line says where it is: leave the place out")
+            raise InputError(f"{name} has a place, but its line already gives the place: leave where and set out")
         given = {"wall": table["wall"]} if "wall" in table else {}
         law = layers.read_layer(table["law"], name)
         if "surface" in table:
@@ -72,7 +72,7 @@ class Vessel(Physics):
         return along(mesh, line, radius, law, name=name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse elements that are not in the mesh, a wall thicker than the radius, and a law with directions."""
+        """Refuse elements that are not in the mesh, a wall thicker than the radius, and laws with fibre directions."""
         numbers = np.asarray(self.element)
         if numbers.ndim != 1 or not numbers.size or numbers.max() >= mesh.number_of_elements:
             raise InputError(
@@ -100,7 +100,7 @@ class Vessel(Physics):
 
 
 def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
-    """Centre lines of the tubes of a file; a given radius replaces the measured one."""
+    """Centre lines of the tubes in a surface file. A given radius replaces the measured radii."""
     unit, radius = as_word(table.get("unit", "m"), f"{name} unit"), table.get("radius")
     if unit not in UNITS:
         raise InputError(f"{name} unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
@@ -115,10 +115,10 @@ def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
 
 
 def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "vessel", **given: object) -> Vessel:
-    """A vessel along a line (n, 3) [m] with one radius or one per point (n,) [m], without parts outside the body.
+    """A vessel along a line (n, 3) [m], with one radius or one per point (n,) [m]. Parts outside the body are left out.
 
     Raises:
-        InputError: a line outside the body.
+        InputError: the whole line is outside the body.
     """
     cut = _cut(mesh, line[:-1], line[1:], name)
     if np.ndim(radius):
@@ -133,7 +133,7 @@ def crossing(mesh: TetMesh, lines: CentreLines, law: Law, name: str = "vessel", 
     """Vessels along centre lines, for example of a tree. Parts outside the body are left out.
 
     Raises:
-        InputError: lines outside the body.
+        InputError: all lines are outside the body.
     """
     cut = _cut(mesh, lines.begin, lines.end, name)
     return _of_pieces(mesh, cut, (lines.begin, lines.end), jnp.asarray(lines.radius[cut.line]), law, **given)
@@ -179,7 +179,7 @@ class Bars(Elements):
         return jnp.sqrt(jnp.sum(f * f, axis=1))
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Slopes of the functions along the piece, at its points."""
+        """Derivatives of the shape functions along the piece, at its integration points."""
         along = (self.leaves - self.enters) / self._lengths(mesh)[None]
         if mesh.order == 1:
             return along[None, :, None, :]
@@ -190,14 +190,17 @@ class Bars(Elements):
         return jnp.stack(rows, axis=1)[None]
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Volume law of the wall times the energy density of an incompressible sample in tension."""
+        """Volume of the wall times the energy density of an incompressible sample in tension."""
         law = jax.tree.map(lambda v: v if jnp.ndim(v) == 0 else v[None], self.law)
         volume = self.section_area * self._lengths(mesh) / len(C[0])
         return volume[None] * layers.axial_energy(law, jnp.sqrt(C[0]))
 
 
 def _slopes_along(L: jax.Array, along: jax.Array) -> jax.Array:
-    """Derivatives (10, m) of the quadratic functions at L (4, m) in a direction (4, m): they are linear in L."""
+    """Derivatives (10, m) of the quadratic functions at L (4, m) in the direction `along` (4, m).
+
+    They are linear in L.
+    """
     corners = np.eye(4)
-    table = functions(2, corners)[1]  # (10, 4, 4): by L_k, at every corner
+    table = functions(2, corners)[1]  # (10, 4, 4): derivatives with respect to L_k, at every corner
     return jnp.einsum("akc,cm,km->am", jnp.asarray(table, L.dtype), L, along)

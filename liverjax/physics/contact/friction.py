@@ -1,11 +1,11 @@
 """A rigid obstacle with Coulomb friction: the surface sticks to it until the shear reaches mu times the pressure.
 
-Every point of contact has an elastic slip e along the obstacle's surface [m], which the next steps remember. Within a
-step it grows with the motion of the point past the obstacle; beyond mu times the point's depth it is cut to that, and
-the point slides. The shear is `stiffness` times e, and the pressure is `stiffness` times the depth. So a point that
-sticks slips by at most mu times its depth, and it does not creep. A contact that opens loses its slip.
+Every contact point has an elastic slip e along the obstacle's surface [m], a memory from step to step. Within a step,
+the slip grows with the motion of the point relative to the obstacle. Its maximum is mu times the depth of the point; at
+this maximum the point slides. The shear stress is `stiffness` times e, and the pressure is `stiffness` times the depth.
+So a sticking point slips by at most mu times its depth, and it does not creep. When a contact opens, its slip is lost.
 
-The force has no energy: sliding dissipates it. Its tangent is exact, and not symmetric where points slide.
+The force has no energy, since sliding dissipates energy. The tangent is exact. It is not symmetric if points slide.
 
 Source: Wriggers 2006, Computational Contact Mechanics, sections 5.2 and 6.4 (penalty, return mapping).
 """
@@ -50,7 +50,7 @@ class RoughObstacle(Obstacle):
         return replace(plain, friction=table["friction"])
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held in all directions where the surface touches the obstacle at the beginning."""
+        """Nodes are held in all directions if their part of the surface touches the obstacle at the beginning."""
         nodes, normals = super().holds(mesh)
         if not np.all(np.asarray(self.friction) > 0):
             return nodes, normals
@@ -61,9 +61,9 @@ class RoughObstacle(Obstacle):
         return jnp.zeros_like(contact_points(self, start.mesh, start.x))
 
     def freeze(self, memory: Any, step: Step) -> "Rubbing":
-        """Keep the slip at the beginning of the step, and the places of the points relative to the obstacle."""
+        """Store the slip at the step's beginning, and the positions of the contact points relative to the obstacle."""
         moved = super().freeze(memory, step).moved
-        # In a static run the first positions are only a guess: the surface comes from the reference shape.
+        # In a static run the first positions are only a guess: the surface starts from the reference shape.
         x = step.x if step.inertia else jnp.where(step.k == 1, step.mesh.points, step.x)
         past = contact_points(self, step.mesh, x) - moved[0][:, None, None]
         slip = jnp.zeros_like(past) if memory is None else memory
@@ -88,7 +88,7 @@ class Rubbing(Touching):
 
     friction: Number = param("1", "mu", default=0.0)
     slip: Any = param("m", "elastic slip at the beginning (3, Q, m)", default=None)
-    past: jax.Array | None = param("m", "points of contact then, relative to the obstacle (3, Q, m)", default=None)
+    past: jax.Array | None = param("m", "contact points then, relative to the obstacle (3, Q, m)", default=None)
     nodes: Array | None = param("1", "nodes of the triangles (n, m)", default=None)
     functions: Array | None = param("1", "functions of a triangle's nodes at its points (n, Q)", default=None)
 
@@ -99,42 +99,44 @@ class Rubbing(Touching):
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
 
     def slip_at(self, at: jax.Array, s: Number) -> jax.Array:
-        """Elastic slip (3, Q, m) [m] of points (3, Q, m) at part s of the step."""
+        """Elastic slip (3, Q, m) [m] of points (3, Q, m) at fraction s of the step."""
         n, most = self._law(at, s)
         trial = self._trial(at, s, n)
         size = _of_slip(trial)
         return trial * jnp.where(size > most, most / size, 1.0)[None]
 
     def _law(self, at: jax.Array, s: Number) -> tuple[jax.Array, jax.Array]:
-        """Normals (3, Q, m), and the largest slip (Q, m) [m] that the pressure allows."""
+        """Normals (3, Q, m), and the maximum slip (Q, m) [m] that the pressure allows."""
         d = distances(self.obstacle, at, self.now(s))
         return jnp.stack(d.normal), jnp.multiply(self.friction, jnp.maximum(-d.value, 0.0))
 
     def _trial(self, at: jax.Array, s: Number, n: jax.Array) -> jax.Array:
-        """Slip (3, Q, m) [m] of points that all stick, along planes with normals n (3, Q, m)."""
+        """Slip (3, Q, m) [m] if all points stick, along planes with normals n (3, Q, m)."""
         trial = self.slip + at - self.now(s)[:, None, None] - self.past
         return trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
 
     def _guessed(self, mesh: TetMesh, at: jax.Array, s: Number) -> jax.Array:
-        """Points (1, 1, Q, m) where the surface just touches; the first guess is that they are pressed and stick."""
+        """Points (1, 1, Q, m) where the surface just touches. The tangent treats them as pressed and sticking."""
         d = distances(self.obstacle, at, self.now(s))
         return (just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0))[None, None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Forces of the pressures and of the frictional shear."""
+        """Forces from the contact pressures and from the frictional shear."""
         shear = weighted_stiffness(self.obstacle, mesh)[None] * self.slip_at(self.points(x), s)
         return super().force(mesh, x, s) + shared_out(self.obstacle, mesh, x, shear)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """The whole derivative of the force."""
+        """The complete derivative of the force."""
         at, plain = self.points(x), super().attached(mesh, x, s)
         units = [jnp.zeros_like(at).at[j].set(1.0) for j in range(3)]
         H = jnp.stack([jax.jvp(lambda at: self.slip_at(at, s), (at,), (unit,))[1] for unit in units], axis=1)
         return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(self._law(at, s)[0]), H))
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """The energy of the contact, plus half of stiffness times slip squared up to the largest slip that the pressure
-        at `start` allows; linear beyond.
+        """The energy of the contact plus an energy of the slip.
+
+        The second energy is half of stiffness times slip squared. Above the maximum slip that the pressure at `start`
+        allows, it grows linearly.
         """
         one = jnp.ones((), x.dtype)
         n, most = self._law(self.points(start), one)
@@ -143,7 +145,7 @@ class Rubbing(Touching):
         return self.energy(mesh, x) + jnp.sum(weighted_stiffness(self.obstacle, mesh) * stored)
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of `energy_from`. A sliding point has stiffness only across its direction of sliding."""
+        """Second derivative of `energy_from`. A sliding point has no stiffness along its direction of sliding."""
         at, plain = self.points(x), super().definite(mesh, x, s)
         n, most = self._law(at, s)
         trial = self._trial(at, s, n)
@@ -154,7 +156,7 @@ class Rubbing(Touching):
         return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(n), H))
 
     def _with_shear(self, mesh: TetMesh, plain: Attached, H: jax.Array) -> Attached:
-        """The stiffness of the pressures plus that of the shear: H (3, 3, Q, m) times the contact's stiffness."""
+        """The stiffness of the pressures, `plain`, plus that of the shear: H (3, 3, Q, m) times `stiffness`."""
         shear = weighted_stiffness(self.obstacle, mesh)[None, None] * H
         return Attached(plain.nodes, plain.blocks + between_nodes(mesh, shear))
 
@@ -164,7 +166,7 @@ class Rubbing(Touching):
 
 
 def _of_slip(trial: jax.Array) -> jax.Array:
-    """Size (Q, m) of slips (3, Q, m), never 0."""
+    """Length (Q, m) of slips (3, Q, m), never 0."""
     return jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
 
 

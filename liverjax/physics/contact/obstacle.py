@@ -1,12 +1,14 @@
-"""A rigid obstacle that the surface of the body does not enter: a plane, a sphere, a cylinder or a cone.
+"""A rigid obstacle that the surface of the body cannot enter: a plane, a sphere, a cylinder or a cone.
 
-At three points of every triangle a pressure `stiffness` times the depth acts along the obstacle's normal, per reference
-area; where the surface is outside, nothing acts, so nothing sticks. It has no friction
-(`liverjax.physics.contact.friction` has). The energy is half of pressure times depth. Its gradient and second
-derivative are exact. The surface stays inside the obstacle, at a depth of pressure over stiffness. By default the
-stiffness is `HARDNESS` times the body's own over the size of a triangle. At a pressure as large as the body's stiffness
-the depth is then below a hundredth of the triangle's size. `lj.obstacle_forces` returns the force and the largest
-depth.
+Contact is tested at some points of every triangle (three in linear and quadratic meshes). At a point inside the
+obstacle a pressure acts along the obstacle's normal, per reference area. It is `stiffness` times the depth of the
+point. At points outside nothing acts, so the surface does not stick to the obstacle. There is no friction (see
+`liverjax.physics.contact.friction`). The energy per area is half of pressure times depth. Its gradient and second
+derivative are exact.
+
+With this penalty the surface enters the obstacle by a depth of pressure over stiffness. By default the stiffness is
+`HARDNESS` times the modulus of the body over the size of a triangle. At a pressure as large as this modulus, the depth
+is then a hundredth of the triangle's size. `lj.obstacle_forces` returns the force and the maximum depth.
 
 Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalty, exact tangent).
 """
@@ -33,17 +35,17 @@ from liverjax.physics.contact.passage import in_body
 from liverjax.physics.contact.shapes import SHAPES, Distance, distance
 from liverjax.solvers.attached import Attached
 
-#: Stiffness of the contact over that of the body's material in a layer as thick as a triangle is wide.
+#: Stiffness of the contact, over the stiffness of a layer of the body's material as thick as a triangle is wide.
 HARDNESS = 100.0
-#: Distance that counts as touching, over the size of a triangle.
+#: A smaller distance, over the size of a triangle, counts as touching.
 _TOUCHING = 1e-9
-#: Points of a triangle: weights and barycentric coordinates (3, Q), exact to degree 2.
+#: Contact points of a triangle: weights and barycentric coordinates (3, Q) of a rule of degree 2.
 _POINTS = np.full(3, 1 / 3), np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 
 
 @struct
 class Obstacle(Physics):
-    """One rigid shape that stands still, moves `by` a vector within the run, or follows a history."""
+    """One rigid shape that does not move, moves by the vector `by` during the run, or follows a history."""
 
     triangles: Indices = param("1", "node numbers (m, 3) of the surface that may touch it", lower=0)
     shape: str = static(default="plane", about="plane, sphere, cylinder or cone", words=tuple(SHAPES))
@@ -63,7 +65,7 @@ class Obstacle(Physics):
     )
 
     section: ClassVar[str] = "obstacle"
-    #: The field that the factors of a history multiply.
+    #: Name of the field that is multiplied by the factors of a history.
     driven: ClassVar[str] = "by"
     keys: ClassVar[tuple[str, ...]] = (
         *("shape", "where", "set", "position", "axis", "radius", "half_angle", "by", "history", "stiffness"),
@@ -71,7 +73,7 @@ class Obstacle(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
-        """Read [[obstacle]]: a shape, its place and numbers; by default the whole surface may touch it."""
+        """Read [[obstacle]]: a shape, its position and its numbers. By default the whole surface may touch it."""
         if "shape" not in table:
             raise InputError(f"{name} is without shape: give {', '.join(SHAPES)}")
         shape = as_word(table["shape"], f"{name} shape")
@@ -96,7 +98,7 @@ class Obstacle(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), shape=shape, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse numbers that make no shape, and triangles that are not in the mesh."""
+        """Refuse numbers that do not define the shape, and triangles that are not in the mesh."""
         selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
         for key in ("radius", "half_angle", "friction"):
             if np.ndim(getattr(self, key, 0.0)):
@@ -117,10 +119,10 @@ class Obstacle(Physics):
         if self.history is not None and np.ndim(self.history) == 2 and self.by is not None:
             raise InputError(f"{name} has by and a history of displacements: leave one of them out")
         if self.history is not None and np.ndim(self.history) == 1 and getattr(self, self.driven) is None:
-            raise InputError(f"{name} history has factors, but there is no by that they belong to: give by")
+            raise InputError(f"{name} history has factors, but there is no by to multiply with them: give by")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Refuse a body that begins inside. A loaded body may lie inside, at the depth of its contact."""
+        """Refuse an obstacle that begins inside the body."""
         size, deepest = float(np.ptp(np.asarray(mesh.points), axis=0).max()), float(_depth_at_beginning(self, mesh))
         if deepest > 1e-9 * size:
             raise InputError(
@@ -133,7 +135,7 @@ class Obstacle(Physics):
             raise InputError(f"{name} position = {np.asarray(self.position).tolist()} is inside the body: move it out")
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held along the normal where the surface touches the obstacle at the beginning."""
+        """Nodes are held along the normal if their part of the surface touches the obstacle at the beginning."""
         d = _distances(self, mesh, mesh.points, self.displacement(0, 1, 0.0))
         near = np.asarray(d.value <= 1e3 * _TOUCHING * jnp.sqrt(_triangle_areas(self, mesh))[None])
         _, touching = np.nonzero(near)
@@ -142,16 +144,20 @@ class Obstacle(Physics):
         return nodes.ravel(), np.repeat(normals, nodes.shape[1], axis=0)
 
     def in_body(self, mesh: TetMesh, law: Law) -> "Obstacle":
-        """Take the default stiffness from the law: that of a layer with modulus K + 4/3 mu, K at most 3 mu."""
+        """Take the default stiffness from the law.
+
+        It is `HARDNESS` times the stiffness of a layer with the modulus K + 4/3 mu, with K limited to 3 mu.
+        """
         if self.stiffness is not None:
             return self
-        # Material under a contact can move sideways: a bulk modulus far above shear would make it needlessly hard.
+        # Material under a contact can move sideways. With a large bulk modulus the contact would be stiffer than
+        # needed.
         shear = law.shear_modulus()
         modulus = jnp.max(jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear))
         return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
 
     def at_beginning(self) -> "Obstacle":
-        """The obstacle at time 0 of its history; without one it has not moved yet."""
+        """The obstacle at time 0 of its history. Without a history it has not moved yet."""
         return replace(self, by=None) if self.history is None else self
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Obstacle":
@@ -159,7 +165,7 @@ class Obstacle(Physics):
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
-        """(3,) [m] at the end of step k; step 0 is the beginning of the run."""
+        """Displacement (3,) [m] at the end of step k; step 0 is the beginning of the run."""
         zero = jnp.zeros(3)
         if self.history is not None:
             return zero + history.value_at(self.by, k * dt, self.times, self.history)
@@ -182,15 +188,15 @@ class Touching(NodalForce):
     kinked: ClassVar[bool] = True
 
     def now(self, s: Number) -> jax.Array:
-        """Its displacement (3,) [m] at part s of the step."""
+        """Its displacement (3,) [m] at fraction s of the step, if it does not depend on the body."""
         return self.moved[0] + s * (self.moved[1] - self.moved[0])
 
     def place(self, x: jax.Array, s: Number) -> jax.Array:
-        """Its displacement (3,) [m] at positions x (V, 3) of the body and part s of the step."""
+        """Its displacement (3,) [m] at positions x (V, 3) of the body and fraction s of the step."""
         return self.now(s)
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Minus the pressures, shared out to the nodes of their triangles."""
+        """Minus the forces of the pressures, distributed to the nodes of their triangles."""
         return self.force_at(mesh, x, self.place(x, s))
 
     def force_at(self, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
@@ -203,10 +209,10 @@ class Touching(NodalForce):
         return 0.5 * jnp.sum(weighted_stiffness(self.obstacle, mesh) * depth**2)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of the energy: the part along the normal, and the part by the change of the normal."""
+        """Second derivative of the energy: a part along the normal, and a part from the change of the normal."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
-        # A surface that just touches counts as pressed: else a body that lies on a plane would begin without support.
+        # A surface that just touches counts as pressed: otherwise a body on a plane would have no support at first.
         inside = just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack(
             [
@@ -217,7 +223,7 @@ class Touching(NodalForce):
         return Attached(touching_nodes(self.obstacle, mesh), between_nodes(mesh, H))
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """The stiffness along the normal alone: the part by the change of the normal is never positive."""
+        """The stiffness along the normal only: the part from the change of the normal is never positive."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         k = k * just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack([jnp.stack([k * a * b for b in d.normal]) for a in d.normal])
@@ -225,7 +231,10 @@ class Touching(NodalForce):
 
 
 def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-    """Gradient of the energy (V, 3) [N] at positions x (V, 3): the force of the nodes on the obstacle, `moved` (3,)."""
+    """Gradient of the energy (V, 3) [N] at positions x (V, 3), with the obstacle displaced by `moved` (3,).
+
+    It is the force of the nodes on the obstacle.
+    """
     d = _distances(obstacle, mesh, x, moved)
     depth = depths(d, touching_distance(obstacle, mesh))
     push = weighted_stiffness(obstacle, mesh) * depth  # (Q, m), negative
@@ -233,59 +242,65 @@ def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
 
 
 def depths(d: Distance, near: jax.Array) -> jax.Array:
-    """Distances (Q, m) [m] of points inside, 0 of others. Points nearer than `near` (m,) count as pressed, as in the
-    stiffness: a minimum would have half the derivative at a point that just touches."""
+    """Distances (Q, m) [m] of points inside, 0 for other points.
+
+    Points nearer than `near` (m,) count as pressed, as in the stiffness: `minimum` would have half the derivative at a
+    point that just touches.
+    """
     pressed = d.value - jax.lax.stop_gradient(jnp.maximum(d.value, 0.0))
     return jnp.where(d.value <= near[None], pressed, 0.0)
 
 
 def shared_out(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, pushes: jax.Array) -> jax.Array:
-    """Share the forces of points (3, Q, m) [N] out to the nodes (V, 3)."""
+    """Distribute forces at points (3, Q, m) [N] to the nodes (V, 3)."""
     own = jnp.einsum("aq,iqm->ami", point_functions(mesh, x.dtype), pushes)
     return jnp.zeros_like(x).at[touching_nodes(obstacle, mesh)].add(own)
 
 
 def between_nodes(mesh: TetMesh, H: jax.Array) -> jax.Array:
-    """Stiffness (n, 3, n, 3, m) between the nodes of triangles whose points have H (3, 3, Q, m) [N/m]."""
+    """Stiffness (n, 3, n, 3, m) between nodes of triangles, from the stiffness H (3, 3, Q, m) [N/m] at their points."""
     N = point_functions(mesh, H.dtype)
     both = jnp.einsum("aq,bq->abq", N, N)
     return jnp.einsum("abq,ijqm->aibjm", both, H)
 
 
 def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-    """Largest depth () [m] of the surface at positions x (V, 3) in the obstacle; 0 where it is outside."""
+    """Maximum depth () [m] of the surface in the obstacle, at positions x (V, 3); 0 if all points are outside."""
     deepest = -jnp.min(_distances(obstacle, mesh, x, moved).value)
-    return jnp.where(deepest >= 0, deepest, 0.0)  # not a maximum, which has half the derivative at a point that touches
+    return jnp.where(deepest >= 0, deepest, 0.0)  # `maximum` would have half the derivative at a point that touches
 
 
-@jax.jit  # compiled, since checks of a sweep compute it for each row
+@jax.jit  # compiled, since the checks of a sweep call it for each row
 def _depth_at_beginning(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """How deep () [m] a run would begin inside the body; negative: the distance between them."""
+    """Depth () [m] of the obstacle in the body at the beginning of a run. A negative value is minus their distance."""
     return -jnp.min(_distances(obstacle, mesh, mesh.points, obstacle.displacement(0, 1, 0.0)).value)
 
 
 def touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Nodes (n, m) of the triangles, 3 or 6 each."""
+    """Nodes (n, m) of the triangles: n = 3 or more for each."""
     return jnp.stack(surface.triangle_nodes(mesh, obstacle.triangles))
 
 
 def point_functions(mesh: TetMesh, dtype: DTypeLike) -> jax.Array:
-    """Functions of a triangle's nodes at its points of contact (n, Q)."""
+    """Shape functions of a triangle's nodes at its contact points (n, Q)."""
     return jnp.asarray(surface.triangle_functions(mesh, _rule(mesh)[1]), dtype)
 
 
 def _rule(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Weights and points of contact on a triangle; with three, a surface of order 3 could enter between them."""
+    """Weights and contact points of a triangle.
+
+    A surface of order 3 has more than three: it could enter between three.
+    """
     return triangle_rule() if mesh.order == 3 else _POINTS
 
 
 def contact_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Points of the triangles (3, Q, m) [m] at positions x (V, 3)."""
+    """Contact points of the triangles (3, Q, m) [m] at positions x (V, 3)."""
     return jnp.einsum("aq,ami->iqm", point_functions(mesh, x.dtype), x[touching_nodes(obstacle, mesh)])
 
 
 def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
-    """Distances of points (3, Q, m) [m] from the obstacle, `moved` (3,)."""
+    """Distances of points (3, Q, m) [m] from the obstacle, which is displaced by `moved` (3,)."""
     place = jnp.asarray(obstacle.position, at.dtype) + moved
     axis, angle = jnp.asarray(obstacle.axis, at.dtype), jnp.deg2rad(jnp.asarray(obstacle.half_angle, at.dtype))
     y = [at[i] - place[i] for i in range(3)]
@@ -294,27 +309,29 @@ def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
 
 @partial(jax.jit, inline=True)
 def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> Distance:
-    """Distances of the points of the triangles (Q, m)."""
+    """Distances of the contact points of the triangles (Q, m)."""
     return distances(obstacle, contact_points(obstacle, mesh, x), moved)
 
 
 def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
-    """Whether points (Q, m) are inside, or so near that they count as touching."""
+    """Whether points (Q, m) are inside, or near enough to count as touching."""
     return d.value <= touching_distance(obstacle, mesh)[None]
 
 
 def touching_distance(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Distance (m,) [m] that counts as touching."""
+    """Maximum distance (m,) [m] that counts as touching."""
     return _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))
 
 
-#: Fewest and most points along the edge of a triangle at which a depth between the points of contact is looked for.
+#: To find a depth between contact points: minimum and maximum number of intervals along the edge of a triangle.
 _FEWEST, _MOST = 6, 24
 
 
 def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> tuple[float, float]:
-    """How much deeper [m] a round obstacle, `moved` (3,), is in the body at positions x (V, 3) than the contact points
-    tell; and its depth [m] in the reference shape, or a tenth of its radius if it is outside there.
+    """Depth [m] of a round obstacle in the body that the contact points miss; and its approach [m].
+
+    The obstacle is displaced by `moved` (3,), and the body is at positions x (V, 3). The approach is the depth in the
+    reference shape, or a tenth of the radius if the obstacle is outside of this shape.
     """
 
     def depth(y: jax.Array) -> float:
@@ -326,7 +343,10 @@ def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Arr
 
 
 def near_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Points of the triangles (3, Q, m) [m] at positions x (V, 3) that are nearer to each other than its radius."""
+    """Points of the triangles (3, Q, m) [m] at positions x (V, 3).
+
+    Their spacing is below the radius, where possible.
+    """
     radius, width = _radius_and_width(obstacle, mesh)
     n = int(np.clip(np.ceil(3 * width / radius), _FEWEST, _MOST))
     lattice = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]).T / n
@@ -335,13 +355,13 @@ def near_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
 
 
 def _radius_and_width(obstacle: Obstacle, mesh: TetMesh) -> tuple[float, float]:
-    """Radius [m], at least a thousandth of the width, and the width [m] of the largest triangle."""
+    """Radius of the obstacle [m] (at least a thousandth of the width), and width of the largest triangle [m]."""
     width = float(jnp.sqrt(jnp.max(_triangle_areas(obstacle, mesh))))
     return max(float(np.max(np.asarray(obstacle.radius))), 1e-3 * width), width
 
 
 def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> bool:
-    """Whether the surface at positions x (V, 3) touches the obstacle at its first place, and nowhere presses on it."""
+    """Whether the surface at positions x (V, 3) touches the obstacle at its first position, but without pressure."""
     d = _distances(obstacle, mesh, x, obstacle.displacement(0, 1, 0.0))
     nothing = d.value >= -_TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
     return bool(just_touching(obstacle, mesh, d).any() & nothing.all())
@@ -373,5 +393,5 @@ def three_numbers(value: object, name: str) -> jax.Array:
 
 
 def _numbers_of_shape(shape: str) -> tuple[str, ...]:
-    """The numbers that a shape needs or may have."""
+    """Names of the numbers that a shape needs or may have."""
     return (*SHAPES[shape], "radius") if shape == "cone" else SHAPES[shape]

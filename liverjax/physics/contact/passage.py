@@ -1,7 +1,7 @@
-"""A sphere or a cylinder that passes the surface of the body within a step.
+"""A check whether a sphere or a cylinder passes the surface of the body within a step.
 
-Contact knows how far the surface is from the obstacle, and no more: a sphere deep in the body touches nothing, and one
-that is half inside is pushed out to the wrong side.
+Contact depends only on the distance of the surface from the obstacle. So a sphere deep inside the body touches nothing,
+and a sphere with its centre inside the body is pushed to the wrong side.
 """
 
 import numpy as np
@@ -9,27 +9,27 @@ import numpy as np
 from liverjax.mesh.locate import around_a_point, around_a_point_in_plane, straight_corners
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Most places along the way of a step that are looked at.
+#: Maximum number of places that are checked along the path of a step.
 _MOST = 256
 
 
 def in_body(
     shape: str, axis: np.ndarray, mesh: TetMesh, x: np.ndarray, centres: np.ndarray, triangles: np.ndarray
 ) -> np.ndarray:
-    """Whether the centre of a sphere, or a part of a cylinder's axis, is in the body: (n,). Others have no centre.
+    """Whether the centre of a sphere, or a part of a cylinder's axis, is in the body, (n,). False for other shapes.
 
     Args:
-        shape: of the obstacle.
-        axis: of a cylinder (3,).
-        mesh: its elements.
-        x: positions (V, 3) [m] of its nodes.
-        centres: places (n, 3) [m].
-        triangles: surface (m, 3) that may touch the obstacle; other bodies in the mesh do not count.
+        shape: shape of the obstacle.
+        axis: axis of a cylinder (3,).
+        mesh: mesh of the body.
+        x: positions (V, 3) [m] of the nodes.
+        centres: positions of the obstacle (n, 3) [m].
+        triangles: surface (m, 3) that may touch the obstacle. Pieces of the mesh without such triangles are ignored.
     """
     found = np.zeros(len(centres), bool)
     if shape not in ("sphere", "cylinder"):
         return found
-    across = np.eye(3) if shape == "sphere" else np.linalg.svd(axis[None])[2][1:]  # a cylinder, seen along its axis
+    across = np.eye(3) if shape == "sphere" else np.linalg.svd(axis[None])[2][1:]  # a cylinder, along its axis
     places, nodes = centres @ across.T, x @ across.T
     if np.any(places.min(axis=0) > nodes.max(axis=0)) or np.any(places.max(axis=0) < nodes.min(axis=0)):
         return found
@@ -44,7 +44,7 @@ def in_body(
 
 
 def _of_touching_body(mesh: TetMesh, elements: np.ndarray, triangles: np.ndarray) -> bool:
-    """Whether some of the elements (n,) belong to a body with triangles (m, 3)."""
+    """Whether some of the elements (n,) belong to a connected piece that has some of the triangles (m, 3)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -57,14 +57,14 @@ def _of_touching_body(mesh: TetMesh, elements: np.ndarray, triangles: np.ndarray
 def passed_in_step(
     shape: str, axis: np.ndarray, mesh: TetMesh, positions: np.ndarray, centres: np.ndarray, triangles: np.ndarray
 ) -> str:
-    """What an obstacle does in the body within a long step: "has its centre in", "went through", or nothing.
+    """What an obstacle does in the body within a long step: "has its centre in", "went through", or "".
 
-    It went through if a place on its way is in the body at the beginning and at the end of the step: a body follows an
-    obstacle that leaves it, and goes before one that pushes it.
+    It went through if a place on its path is in the body at the beginning and also at the end of the step. Without a
+    passage this is not so: a body recovers behind an obstacle that leaves it, and moves away before one that pushes it.
 
     Args:
         positions: (2, V, 3) [m] at the beginning and at the end of the step.
-        centres: of the obstacle there (2, 3) [m].
+        centres: positions of the obstacle at these times (2, 3) [m].
         shape, axis, mesh, triangles: as in `in_body`.
     """
     way = centres[1] - centres[0]

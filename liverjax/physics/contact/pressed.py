@@ -1,11 +1,11 @@
-"""A rigid obstacle that a given force presses into the body, as a weight on an indenter: equilibrium gives its place.
+"""A rigid obstacle that a given force presses into the body, for example an indenter with a weight on it.
 
-The obstacle moves along its force alone. Its travel t follows from the balance of forces along that line,
+The obstacle moves only along the line of its force. Its travel t follows from the balance of forces along this line,
 
     dE/dt(x, t) = F,
 
-where E is the energy of the contact at positions x. When t is eliminated, t(x) adds -h h^T / E_tt to the stiffness of
-the contact, with h = d2E/dx dt. This dense matrix of rank one is not stored: products apply it, and a factorisation is
+where E is the energy of the contact at positions x. The elimination of t adds -h h^T / E_tt to the stiffness of the
+contact, with h = d2E/dx dt. This dense matrix of rank one is not stored: products apply it, and a factorisation is
 corrected for it.
 """
 
@@ -37,7 +37,7 @@ from liverjax.physics.contact.obstacle import (
 )
 from liverjax.solvers.attached import GivesWay
 
-#: Most steps of the search for the place of the obstacle.
+#: Maximum number of steps of the search for the position of the obstacle.
 _MOST_STEPS = 200
 
 
@@ -57,7 +57,7 @@ class PressedObstacle(Obstacle):
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse what `Obstacle` refuses, a missing force, a prescribed motion, and a history of displacements."""
+        """Refuse what `Obstacle` refuses, a missing force, a prescribed motion, and a history without factors >= 0."""
         super().check(mesh, name)
         history.check_times(self.times, self.history, name, (1,))
         if self.history is not None and np.any(np.asarray(self.history) < 0):
@@ -70,7 +70,7 @@ class PressedObstacle(Obstacle):
             raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give them")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Refuse also a force that leads the obstacle past the body."""
+        """Refuse what `Obstacle` refuses, and a force that moves the obstacle past the body."""
         super().check_place(mesh, name)
         if not self._meets(mesh, contact_points):
             if self._meets(mesh, near_points):
@@ -97,11 +97,11 @@ class PressedObstacle(Obstacle):
         return False
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """No nodes: the obstacle yields to the body."""
+        """No nodes are held, since the obstacle can move."""
         return np.zeros(0, int), np.zeros((0, 3))
 
     def at_beginning(self) -> "PressedObstacle":
-        """The obstacle under the force of time 0; without a history it is not pressed yet."""
+        """The obstacle under the force at time 0. Without a history this force is 0."""
         return self if self.history is not None else replace(self, times=jnp.zeros(1), history=jnp.zeros(1))
 
     def direction(self) -> jax.Array:
@@ -113,7 +113,7 @@ class PressedObstacle(Obstacle):
         """Size () [N] of the force at the end of step k; step 0 is the beginning of the run."""
         whole = jnp.linalg.norm(jnp.asarray(self.force, float))
         factor = k / steps if self.history is None else history.value_at(1.0, k * dt, self.times, self.history)
-        # Not a maximum: it would have half the derivative at a factor of 0.
+        # `maximum` would have half the derivative at a factor of 0.
         return jnp.where(factor >= 0, whole * factor, 0.0)
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
@@ -126,11 +126,11 @@ class PressedObstacle(Obstacle):
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """The force may act from time 0 on."""
+        """True: the force may act from time 0 on."""
         return True
 
     def freeze(self, memory: Any, step: Step) -> "Pressing":
-        """The force at the beginning and at the end of the step, and the travel of the obstacle before."""
+        """The force at the beginning and at the end of the step, and the travel at the beginning."""
         dt, dtype = 0.0 if step.dt is None else step.dt, step.x.dtype
         load = jnp.stack([jnp.asarray(self.load(n, step.steps, dt), dtype) for n in (step.k - 1, step.k)])
         return Pressing(
@@ -152,7 +152,7 @@ class PressedObstacle(Obstacle):
 
 @jax.jit
 def _gap_after(obstacle: PressedObstacle, at: jax.Array, travel: Number) -> jax.Array:
-    """Least distance () [m] from points (3, Q, m), after a travel [m] along the force."""
+    """Minimum distance () [m] between the obstacle and points (3, Q, m), after a travel [m] along the force."""
     return jnp.min(distances(obstacle, at, jnp.asarray(travel * obstacle.direction())).value)
 
 
@@ -173,21 +173,21 @@ class Pressing(Touching):
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
 
     def place(self, x: jax.Array, s: Number) -> jax.Array:
-        """Displacement (3,) [m] of the obstacle at positions x (V, 3) and part s of the step."""
+        """Displacement (3,) [m] of the obstacle at positions x (V, 3) and fraction s of the step."""
         return self.travel(self.points(x), s) * self.direction
 
     def travel(self, at: jax.Array, s: Number) -> jax.Array:
-        """Travel () [m] at which the contact balances the force; NaN if there is none."""
+        """Travel () [m] at which the contact balances the force; NaN if no such travel is found."""
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))
-        # Steps of Newton from the place change nothing but its derivatives: one gives the first, two the second.
+        # Newton steps from the solution change only its derivatives: one step gives the first, two give the second.
         for _ in range(2):
             held, slope, _ = self._resistance(at, found)
             found = found + (load - held) / jnp.where(slope > 0, slope, 1.0)
         return found
 
     def _resistance(self, at: jax.Array, travel: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """dE/dt [N] and its slope [N/m] at a travel, and the least distance [m]."""
+        """dE/dt [N] and its derivative [N/m] at a travel, and the minimum distance [m]."""
         d = distances(self.obstacle, at, travel * self.direction)
         depth, inside = depths(d, self.near), (d.value <= self.near[None]).astype(at.dtype)
         along = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
@@ -196,14 +196,17 @@ class Pressing(Touching):
         return -jnp.sum(self.hardness * depth * along), jnp.sum(slope), jnp.min(d.value)
 
     def _found(self, at: jax.Array, load: jax.Array) -> jax.Array:
-        """The travel by Newton's method, in steps of at most twice the depth: the force grows with the travel."""
+        """The travel, by Newton's method with steps of at most twice the depth.
+
+        The contact force grows with the travel.
+        """
         own = jax.lax.stop_gradient(self)
         first = own._resistance(at, own.before)[0]
-        # Positions are rounded too: a light force cannot be balanced better than hardness times that.
+        # Positions are rounded, too: the balance cannot be more accurate than hardness times this roundoff.
         size = jnp.max(jnp.abs(at)) + jnp.max(jnp.abs(jnp.asarray(own.obstacle.position, at.dtype)))
         rounded = size * jnp.max(own.hardness)
         enough = float(jnp.finfo(at.dtype).eps) * (16 * jnp.maximum(load, first) + rounded)
-        # No smaller depth can balance the force, even if all points touched.
+        # Minimum depth that can balance the force: if all points had this depth.
         least = load / jnp.sum(own.hardness)
 
         def unfinished(c: tuple) -> jax.Array:
@@ -224,15 +227,17 @@ class Pressing(Touching):
         return jnp.where(abs(held - load) <= 1e3 * enough, travel, jnp.nan)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy of the contact, less the work of the force."""
+        """Energy of the contact minus the work of the force."""
         at = self.points(x)
         travel = self.travel(at, 1.0)
         depth = jnp.minimum(distances(self.obstacle, at, travel * self.direction).value, 0.0)
         return 0.5 * jnp.sum(self.hardness * depth**2) - self.load[1] * travel
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay:
-        """The loss of stiffness by the obstacle's travel. With `definite` the change of the normals is left out, as in
-        the stiffness of the contact."""
+        """The loss of stiffness that the obstacle's travel causes.
+
+        With `definite` the change of the normals is left out, as in `definite` of the contact.
+        """
         at = self.points(x)
         d = distances(self.obstacle, at, self.travel(at, s) * self.direction)
         towards = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))

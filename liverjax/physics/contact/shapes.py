@@ -1,7 +1,8 @@
 """Rigid shapes: signed distance of points, its gradient (the normal) and its second derivative.
 
-A point is given relative to the shape's place: a point of the plane, the centre of a sphere, a point on the axis of a
-cylinder, the tip of a cone. Distances are positive outside. All functions take columns of any shape.
+A point is given relative to the position of the shape: a point of the plane, the centre of a sphere, a point on the
+axis of a cylinder, the tip of a cone. Distances are positive outside. Functions take columns x, y, z of any array
+shape.
 """
 
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 
 from liverjax.core.struct import Array, Number
 
-#: Shapes that a scene may name, and the numbers that each needs.
+#: Names of the shapes in scenes, and the numbers that each shape needs.
 SHAPES: dict[str, tuple[str, ...]] = {
     "plane": ("axis",),
     "sphere": ("radius",),
@@ -24,19 +25,20 @@ class Distance(NamedTuple):
     """Signed distance of points, with its first and second derivative."""
 
     value: jax.Array  # (…) [m]
-    normal: list[jax.Array]  # 3 of (…): gradient, of length 1
-    bent: list[list[jax.Array]]  # 3 x 3 of (…) [1/m]: second derivative
+    normal: list[jax.Array]  # 3 components (…): gradient, of length 1
+    bent: list[list[jax.Array]]  # 3 x 3 components (…) [1/m]: second derivative
 
 
 def distance(shape: str, y: list[jax.Array], axis: Any, radius: Number, half_angle: Number) -> Distance:
-    """Signed distance of points y (3 of any shape) [m] from the shape.
+    """Signed distance of points y (3 columns of any shape) [m] from the shape.
 
     Args:
         shape: one of `SHAPES`.
-        y: columns, from the place of the shape.
+        y: columns of the points, relative to the position of the shape.
         axis: unit vector (3,): the plane's normal to the free side, the cylinder's axis, the cone's axis inwards.
-        radius: [m] of sphere and cylinder; of the cone's rounded tip, whose lowest point is at its place.
-        half_angle: [rad] of the cone, between axis and side.
+        radius: radius [m] of sphere and cylinder, or of a cone's rounded tip. The lowest point of the rounded tip is at
+            the cone's position.
+        half_angle: angle [rad] between the cone's axis and its side.
     """
     if shape == "plane":
         zero = jnp.zeros_like(y[0])
@@ -57,7 +59,7 @@ def _normal_to(y: list[jax.Array], axis: Array) -> list[jax.Array]:
 
 def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Distance:
     """Distance from a sphere about a point, or from a cylinder about an axis normal to y."""
-    # On the centre itself no direction is nearest: any will do, without a division by 0.
+    # At the centre no direction is defined: any direction is taken, without a division by 0.
     r = jnp.sqrt(jnp.maximum(sum(c * c for c in y), 1e-30))
     n = [c / r for c in y]
     held = [[0.0] * 3 for _ in range(3)] if axis is None else [[a * b for b in axis] for a in axis]
@@ -66,8 +68,10 @@ def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Dis
 
 
 def _cone(y: list[jax.Array], axis: jax.Array, radius: Number, half_angle: Number) -> Distance:
-    """Distance from a cone: from its side or its tip. For a round tip it is the distance from a sharp cone further in,
-    less the radius."""
+    """Distance from a cone: from its side or its tip.
+
+    For a round tip it is the distance from a sharp cone further inside, minus the radius.
+    """
     c, s = jnp.cos(half_angle), jnp.sin(half_angle)
     y = [v - radius * a for v, a in zip(y, axis, strict=True)]
     along, tip, side = (

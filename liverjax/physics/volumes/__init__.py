@@ -1,1 +1,1 @@
-"""Volume changes that are averaged at nodes or have pressures as unknowns, against locking."""
+"""Forms of the volume change against locking: averages at nodes, or pressures as unknowns."""

@@ -1,12 +1,12 @@
 """Volume changes averaged at the nodes, against the volumetric locking of linear tetrahedra (Bonet and Burton 1998).
 
-The volumetric energy is sum_a V_a U(J_a) over nodes, J_a the mean J of the elements around node a weighted by their
-volumes, V_a a quarter of these. There are about five times fewer nodes than elements, so five times fewer constraints
-where the bulk modulus is large. The pressure of a node is p_a = U'(J_a); that of an element is the mean over its nodes.
-The stiffness is that at given pressures plus G^T D^-1 G, with G the derivative of the nodal volumes and D = V_a/U''.
-This is the system of a porous step in which nothing flows.
+The volumetric energy is the sum of V_a U(J_a) over the nodes. J_a is the mean J of the elements around node a, weighted
+by their volumes. V_a is a quarter of the sum of these volumes. There are about five times fewer nodes than elements. So
+a large bulk modulus gives five times fewer constraints. The pressure of a node is p_a = U'(J_a), and the pressure of an
+element is the mean over its nodes. The stiffness is the stiffness at given pressures plus G^T D^-1 G, with G the
+derivative of the nodal volumes and D = V_a/U''. This is the system of a porous step in which nothing flows.
 
-If elements have different volumetric energies, a node has their mean, weighted by volume.
+If elements have different volumetric energies, a node has the mean of these energies, weighted by volume.
 """
 
 from typing import Any
@@ -36,7 +36,7 @@ def _invariants(law: Law, J: jax.Array) -> Any:
 
 
 def nodal_energy(mesh: TetMesh, law: Law) -> Law:
-    """The volumetric energy of the nodes, with one bulk modulus per node (V,) if elements have different ones."""
+    """The volumetric energy of the nodes. It has one bulk modulus per node (V,) if the moduli of elements differ."""
     U = volumetric_part(law)
     if len(U.pieces()) == 1 and all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(U)):
         return U
@@ -98,7 +98,7 @@ class Averaged(VolumeStress):
         return averaged_pressure(mesh, self.law, J)
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
-        """p cof F, p linear in every element."""
+        """p cof F, with p linear in every element."""
         return scale_matrix(interpolated(mesh, pressure), cofactor(F))
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:

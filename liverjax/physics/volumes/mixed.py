@@ -4,15 +4,15 @@ With U(J) = K g(J)^2 / 2 the energy per volume is
 
     W_isochoric + gamma g^2 / 2 + p g - p^2 / (2 (K - gamma)),
 
-p linear in every element and continuous. For the best p this is U with g averaged by p's functions: so volume changes
-are limited on average, not at every point. The part gamma = min(mu, K/2) of the bulk modulus, a quarter of that in
-linear elements, stays with the displacements, which keeps their matrix positive; the solution does not depend on it as
-the mesh is refined. Pressures are unknowns together with the positions: if they were eliminated, Newton's method would
-not converge for large K.
+with p linear in every element and continuous. The optimal p gives U with g averaged by the functions of p. So volume
+changes are limited only on average, not at every point. The displacements keep the part gamma of the bulk modulus, so
+that their matrix is positive. It is gamma = min(mu, K/2), and a quarter of this in linear elements. When the mesh is
+refined, the solution no longer depends on gamma. Pressures are unknowns together with the positions: if they were
+eliminated, Newton's method would not converge for large K.
 
-Linear positions do not determine linear pressures: some pressures that alternate from node to node would have no
-effect, and they grow without bound for large K. So linear elements have a further term, - (p - mean of p)^2 / (2 mu),
-with the mean over the element (Bochev, Dohrmann and Gunzburger 2006): it decreases with the square of the element's
+Linear positions do not determine linear pressures: some pressures that alternate from node to node have no effect, and
+they would grow without bound for large K. So linear elements have a stabilisation term, - (p - mean of p)^2 / (2 mu),
+with the mean over the element (Bochev, Dohrmann and Gunzburger 2006). It decreases with the square of the element's
 size.
 """
 
@@ -37,10 +37,10 @@ from liverjax.tensors.places import given, taken
 
 
 def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = 'mixed'") -> None:
-    """Refuse laws of a body whose pressure cannot be an unknown of its own.
+    """Refuse the laws of a body if its pressure cannot be an unknown.
 
     Raises:
-        InputError: no isochoric split, or volumetric energies of several kinds.
+        InputError: a law without an isochoric part or bulk, or volumetric energies of several kinds.
     """
     kinds = set()
     for law in several:
@@ -54,13 +54,14 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
 
 
 def strain(kind: str, J: jax.Array) -> jax.Array:
-    """g(J) of U = K g^2 / 2, about J - 1: J - 1 ("quadratic"), ln J ("log"), or the analogue for "simo"."""
+    """g(J) of U = K g^2 / 2, close to J - 1: J - 1 for "quadratic", ln J for "log", a similar function for "simo"."""
     if kind == "log":
         return jnp.log(J)
     d = J - 1
     if kind == "quadratic":
         return d
-    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-d)^(n-2) / n, n = 3 …), whose closed form cancels near 1.
+    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-1)^n d^(n-2) / n, n = 3 …). The closed form has cancellation near
+    # 1.
     near = jnp.clip(d, -0.1, 0.1)
     series = 1 + sum((-1) ** n * near ** (n - 2) / n for n in range(3, 18))
     safe = jnp.where(jnp.abs(d) < 0.1, 1.0, d)
@@ -68,7 +69,7 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
     return d * jnp.sqrt(jnp.where(jnp.abs(d) < 0.1, series, whole))
 
 
-#: gamma over min(mu, K/2), by order. In linear elements this part causes locking, so less of it is more accurate.
+#: Order -> gamma over min(mu, K/2). In linear elements gamma causes locking, so a smaller gamma is more accurate.
 _PART = {1: 0.25, 2: 1.0, 3: 1.0}
 
 
@@ -102,8 +103,8 @@ class MixedVolume(Physics):
 class Mixed(VolumeStress):
     """Pressures as unknowns during a step."""
 
-    part: Number = param("Pa", "gamma, which stays with the displacements")
-    rest: Number = param("Pa", "K - gamma, carried by the pressures")
+    part: Number = param("Pa", "gamma, the part of K that the displacements keep")
+    rest: Number = param("Pa", "K - gamma, the part of K that the pressures carry")
     shear: Number = param("Pa", "shear modulus")
     before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
     unit: jax.Array = param("N/m^3", "pressure of an unknown of 1 m, so that all residuals are forces")
@@ -113,7 +114,7 @@ class Mixed(VolumeStress):
     unknown: ClassVar[bool] = True
 
     def _slopes(self, J: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """g and its first two derivatives at volume ratios J."""
+        """g and its first two derivatives with respect to J."""
 
         def first(J: jax.Array) -> tuple[jax.Array, jax.Array]:
             return jax.jvp(lambda J: strain(self.kind, J), (J,), (jnp.ones_like(J),))
@@ -127,28 +128,31 @@ class Mixed(VolumeStress):
         return scale_matrix((self.part * g + interpolated(mesh, pressure)) * g1, cofactor(F))
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Energy [J] with the pressures that are best for volume ratios J: gamma g^2/2 + p g/2."""
+        """Energy [J] with the optimal pressures for volume ratios J: gamma g^2/2 + p g/2."""
         g = strain(self.kind, J)
         return jnp.sum(mesh.weights * (0.5 * self.part * g * g)) + 0.5 * jnp.vdot(
             self.settled(mesh, J), integrals(mesh, g)
         )
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """Its stress and slope at given pressures."""
+        """Stress and slope at given pressures."""
         g, g1, g2 = self._slopes(determinant(F))
         whole = self.part * g + interpolated(mesh, pressure)
         return Scalars({"J": whole * g1}, {("J", "J"): self.part * g1 * g1 + whole * g2})
 
     def border(self, J: jax.Array) -> jax.Array:
-        """g': how g of a point changes with its volume ratio."""
+        """g', the derivative of g with respect to J."""
         return self._slopes(J)[1]
 
     def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
-        """Integrals (V,) [m^3] of p's functions times g - p/(K - gamma): 0 at a solution."""
+        """Integrals (V,) [m^3] of the functions of p times g - p/(K - gamma): 0 at a solution."""
         return integrals(mesh, strain(self.kind, J)) - self.compliance(mesh, pressure)
 
     def compliance(self, mesh: TetMesh, pressure: jax.Array) -> jax.Array:
-        """Integrals (V,) [m^3] of p's functions times p/(K - gamma); for linear elements with the stabilisation."""
+        """Integrals (V,) [m^3] of the functions of p times p/(K - gamma).
+
+        In linear elements the stabilisation term is added.
+        """
         if mesh.order > 1:
             return gathered(mesh, mesh.weights * interpolated(mesh, pressure) / self.rest)
         own = [taken(pressure, mesh.tetrahedra[:, a]) for a in range(4)]
@@ -166,7 +170,7 @@ class Mixed(VolumeStress):
         return given(none, mesh.tetrahedra.T, share)
 
     def settled(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Pressures (V,) [Pa] that balance volume ratios J: those of a solution there."""
+        """Pressures (V,) [Pa] that balance volume ratios J, as at a solution."""
         none, diagonal = jnp.zeros_like(self.before), self.diagonal(mesh)
 
         def solve(apply: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:

@@ -1,1 +1,1 @@
-"""What acts in reduced models besides the solid: fluid and supports."""
+"""Physics of reduced models in addition to the solid: fluid and supports."""

@@ -1,15 +1,15 @@
 """The fluid of a porous reduced model: pressures as sums of a few modes, and Darcy's law for their coordinates.
 
-The pressure is P = sum_k p_k psi_k. The discrete equation of the full model (`liverjax.physics.porosity`) is tested
-with the same modes, and its integrals are sums over the weighted points of the model:
+The pressure is P = sum_k p_k psi_k. The discrete equation of the full model (`liverjax.physics.porosity`) is projected
+on the same modes. Its integrals are sums over the weighted points of the model:
 
     A p = S p_before - c,    A = S + dt D,    c_k = sum_p w_p psi_k (J - J_before),
     S_kl = sum_p w_p J_before / K_lim sum_a N_a psi_ka psi_la,
     D_kl = sum_p w_p kappa / J_before (cof F_before grad psi_k) . (cof F_before grad psi_l),
 
-with the functions N_a of the vertices a. Storage is lumped at the vertices, as in the full model. As A is positive, p
-is eliminated, and the remaining equations of motion have an energy. With all modes and all points the equations are the
-full ones.
+with the shape functions N_a of the vertices a. Storage is lumped at the vertices, as in the full model. Since A is
+positive, p is eliminated, and the remaining equations of motion have an energy. With all modes and all points these are
+the full equations.
 """
 
 from typing import NamedTuple
@@ -33,25 +33,25 @@ from liverjax.tensors.places import given
 
 
 class ReducedFluid(NamedTuple):
-    """The state of the fluid that a step passes to the next."""
+    """The state of the fluid between two steps."""
 
     pressure: jax.Array  # coordinates p (m,) [Pa]
     F: jax.Array  # deformation gradients (9, S)
-    J_before: jax.Array | None  # volume ratios of the step before (S,); the lagged scheme
+    J_before: jax.Array | None  # volume ratios one step earlier (S,); only for the lagged scheme
 
 
 class Lumped(NamedTuple):
-    """Where the points store their fluid: at the vertices of their elements."""
+    """The points store their fluid at the vertices of their elements."""
 
-    vertices: jax.Array  # of each point's element (4, S)
-    parts: jax.Array  # of a point's volume that each of them has (4, S) [1]
+    vertices: jax.Array  # vertices of each point's element (4, S)
+    parts: jax.Array  # fraction of a point's volume at each vertex (4, S) [1]
 
 
 class ReducedSponge(NamedTuple):
-    """What of the sponge is the same in all steps."""
+    """Data of the sponge that are the same in all steps."""
 
     porosity: Porosity  # numbers at the points
-    lumped: Lumped | None  # None: there are more vertices than four a point, and each point stores for itself
+    lumped: Lumped | None  # None: more vertices than four per point, so fluid is stored at the points
 
 
 class Flowing(NamedTuple):
@@ -65,7 +65,7 @@ class Flowing(NamedTuple):
 
 
 def reduced_sponge(model: ReducedModel, scene: Scene) -> ReducedSponge:
-    """The sponge of a run. Storage is a sum over vertices or over points, of which there are fewer."""
+    """The sponge of a run. Storage is a sum over vertices, or over points if this needs fewer terms."""
     porosity, mesh = porosity_at_points(model, scene), scene.mesh
     if mesh.number_of_vertices > 4 * len(model.points):
         return ReducedSponge(porosity, None)
@@ -76,7 +76,7 @@ def reduced_sponge(model: ReducedModel, scene: Scene) -> ReducedSponge:
 
 
 def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
-    """The porosity; its numbers by element become numbers at the points (S,)."""
+    """The porosity, with parameters by element replaced by parameters at the points (S,)."""
     assert scene.porosity is not None
     own = porosity_of_elements(scene.porosity, scene.region, scene.mesh)
     elements = model.points % scene.mesh.number_of_elements
@@ -86,7 +86,7 @@ def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
 
 
 def fluid_at_rest(model: ReducedModel, scene: Scene) -> ReducedFluid:
-    """The initial pressure in reference volumes."""
+    """The fluid with the initial pressure and the reference volumes."""
     modes, porosity, S = model.pressures, scene.porosity, model.weights.shape[0]
     assert modes is not None and porosity is not None
     volumes = integrals(scene.mesh, jnp.ones_like(scene.mesh.weights))
@@ -109,7 +109,7 @@ def flowing(model: ReducedModel, sponge: ReducedSponge, memory: ReducedFluid, dt
 
 
 def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: Number) -> tuple[jax.Array, jax.Array]:
-    """Vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5] whose products are S and dt D; the step begins at F (9, S)."""
+    """Vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5] with products S and dt D, for a step that begins at F (9, S)."""
     modes, w = model.pressures, model.weights
     assert modes is not None
     matrix = as_matrix(F)
@@ -131,13 +131,13 @@ def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array
 
 
 def _squares(a: jax.Array) -> jax.Array:
-    """Products of vectors a (m, k, S) with each other: (m, m)."""
+    """Scalar products (m, m) of the vectors a (m, k, S)."""
     flat = a.reshape(a.shape[0], -1)
     return flat @ flat.T
 
 
 def pressure_coordinates(own: Flowing, J: jax.Array) -> jax.Array:
-    """Coordinates p (m,) [Pa] at the end of a step that ends with volume ratios J (S,)."""
+    """Coordinates p (m,) [Pa] at the end of a step with volume ratios J (S,) at its end."""
     if own.porosity.scheme == "lagged":
         return own.inverse @ own.stored
     return own.inverse @ (own.stored - (J - own.J) @ own.averages)
@@ -158,13 +158,13 @@ def _scalars(model: ReducedModel, porosity: Porosity, p: jax.Array, F: Matrix) -
 
 
 def volume_blocks(model: ReducedModel, own: Flowing, F: Matrix, pairs: tuple[tuple[int, int], ...]) -> list[Matrix]:
-    """Derivative of `volume_stress` at given pressures, as `invariant_terms.blocks` with the axes as shape vectors."""
+    """Derivative of `volume_stress` at given pressures: `invariant_terms.blocks` with the axes as shape vectors."""
     scalars = _scalars(model, own.porosity, pressure_coordinates(own, determinant(F)), F)
     return invariant_terms.blocks(invariant_terms.state_of(scalars, F), list(IDENTITY), pairs)
 
 
 def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.Array:
-    """The part of the tangent (n, n) [N/m] that is due to the change of the pressures with the coordinates."""
+    """The part of the tangent (n, n) [N/m] that the change of the pressures with the coordinates causes."""
     n = model.number_of_modes
     if own.porosity.scheme == "lagged":
         return jnp.zeros((n, n), model.slopes.dtype)
@@ -174,6 +174,6 @@ def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.
 
 
 def advanced_fluid(own: Flowing, F: jax.Array) -> ReducedFluid:
-    """The fluid after a step that ends with deformation gradients F (9, S)."""
+    """The fluid after a step with deformation gradients F (9, S) at its end."""
     lagged = own.porosity.scheme == "lagged"
     return ReducedFluid(pressure_coordinates(own, determinant(as_matrix(F))), F, own.J if lagged else None)

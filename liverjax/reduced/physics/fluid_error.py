@@ -1,11 +1,12 @@
-"""The error of a porous reduced run: the response of the linear sponge and its fluid to forces out of balance.
+"""The error of a porous reduced run: the response of the linear sponge and its fluid to out-of-balance forces.
 
-To first order the errors e of the motion and p of the pressure follow the linear equations at the reference shape,
+To first order, the error e of the motion and the error p of the pressure follow linear equations at the reference
+shape,
 
     (K + K_sponge) e - B^T p = load,    A p + B (e - e_before) = S p_before,
 
-with the matrices of `liverjax.reduced.physics.fluid` on the whole mesh (lagged: the change of volume of the step
-before).
+with the matrices of `liverjax.reduced.physics.fluid` on the whole mesh. The lagged scheme uses the change of volume of
+the previous step.
 """
 
 from collections.abc import Callable
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class LinearFluid(NamedTuple):
-    """Sparse matrices of the linear sponge: f free degrees of freedom, v unknown pressures."""
+    """Sparse matrices of the linear sponge, for f free degrees of freedom and v unknown pressures."""
 
     stiffness: "scipy.sparse.csr_array"  # of the drained sponge (f, f) [N/m]
     volumes: "scipy.sparse.csr_array"  # B, change of the volume at the vertices (v, f) [m^2]
@@ -37,15 +38,15 @@ class LinearFluid(NamedTuple):
 
 
 class ErrorBefore(NamedTuple):
-    """Errors at the ends of the last steps."""
+    """Errors at the end of the last step, and of the step before it."""
 
     motion: np.ndarray  # (f,) [m]
-    motion_before: np.ndarray  # of the step before (f,) [m]
+    motion_before: np.ndarray  # one step earlier (f,) [m]
     pressure: np.ndarray  # (v,) [Pa]
 
 
 def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
-    """The linear sponge of a scene whose numbers are by element, at the reference shape."""
+    """The linear sponge at the reference shape, for a scene with parameters by element."""
     import scipy.sparse
 
     mesh, porosity, dt = scene.mesh, scene.porosity, scene.solve.dt
@@ -57,7 +58,7 @@ def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
 
     shape = mesh.weights.shape
     J = scipy.sparse.hstack([slopes[i] for i in range(3)]).tocsc()
-    # Columns of x, y, z one after another become 3 node + component.
+    # Reorder the columns from all x, all y, all z to 3 node + component.
     J = J[:, np.arange(3 * mesh.number_of_nodes).reshape(3, -1).T.ravel()][:, free]
     unknown = np.flatnonzero(np.asarray(unknown_pressures(porosity, mesh, mesh.points.dtype)))
     values, vertex_slopes = values[:, unknown], [g[:, unknown] for g in vertex_slopes]
@@ -74,9 +75,7 @@ def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
 
 
 def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list]":
-    """Sparse matrices that give, at the points, values of a field of the vertices, three slopes of a field of the
-    nodes, and three slopes of a field of the vertices.
-    """
+    """Sparse matrices for the points: values of a vertex field, slopes of a nodal field, slopes of a vertex field."""
     import scipy.sparse
 
     E, D = mesh.number_of_elements, np.asarray(mesh.shape_vectors)
@@ -100,7 +99,7 @@ def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list
 def coupled_solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """A function (load (f,) [N], errors before) -> errors at the end of the step, (f,) [m] and (v,) [Pa].
+    """A function (load (f,) [N], earlier errors) -> errors (f,) [m] and (v,) [Pa] at the end of the step.
 
     Args:
         K: stiffness and inertia without the sponge (f, f) [N/m].

@@ -1,7 +1,7 @@
 """Supports in reduced models: springs between the body and a wall, and nodes that slide along an axis.
 
-Springs are linear in the motion, so their forces on the modes are a matrix (n, n) times the coordinates, exactly. Modes
-come from motions in which nodes slide, so they keep these nodes in their planes.
+Springs are linear in the motion, so their forces on the modes are exactly a matrix (n, n) times the coordinates. Modes
+come from motions in which nodes slide, so the modes also keep these nodes in their planes.
 """
 
 from typing import TYPE_CHECKING
@@ -24,7 +24,7 @@ def refuse_other_physics(scene: Scene) -> None:
     """Refuse named physics other than these supports.
 
     Raises:
-        InputError: membranes, ligaments, vessels, obstacles, springs with a history, nodes that slide along no axis.
+        InputError: membranes, ligaments, vessels, obstacles, springs with a history, sliding nodes in oblique planes.
     """
     for own in scene.physics:
         if isinstance(own, SlidingSupport):
@@ -40,7 +40,7 @@ def refuse_other_physics(scene: Scene) -> None:
 
 
 def identity_of_supports(scene: Scene) -> list[object]:
-    """Kinds and places of the supports, without their numbers."""
+    """Kinds and places of the supports, without their parameters."""
     found: list[object] = []
     for own in scene.physics:
         if isinstance(own, SlidingSupport):

@@ -1,1 +1,1 @@
-"""Checks of a scene, one question a file; `liverjax.scenes.scene_checks` asks all. Each refusal is one sentence."""
+"""Checks of a scene. Each file answers one question, and `liverjax.scenes.scene_checks` calls all of them."""

@@ -1,4 +1,4 @@
-"""Are the choices of the scene known, and do they go together? Numbers do not matter, so a traced scene passes too."""
+"""Are the choices of the scene known and compatible? Numbers are not checked, so a traced scene passes too."""
 
 import numpy as np
 
@@ -24,10 +24,11 @@ CHOICES = {
 
 
 def check_choices(scene: Scene) -> None:
-    """Refuse unknown or contradictory choices. Numbers are not checked, so a traced scene passes as well.
+    """Refuse unknown or incompatible choices. Numbers are not checked, so a traced scene passes, too.
 
     Raises:
-        InputError: unknown choices; a load or motion given twice, not at all, of wrong shape.
+        InputError: unknown or incompatible choices; a load or a motion that is given twice, not at all or in a wrong
+            shape.
     """
     check_kinds(scene)
     for key, allowed in CHOICES.items():
@@ -62,7 +63,7 @@ def check_choices(scene: Scene) -> None:
 
 
 def _refuse_what_moves_in_time(scene: Scene) -> None:
-    """Refuse histories in harmonic motion, and obstacles that move."""
+    """Refuse histories and moving obstacles in harmonic motion."""
     for name in histories(scene):
         raise InputError(f"{name}.history is for runs in time: give harmonic motion its amplitudes alone")
     for name, part in named_physics(scene):

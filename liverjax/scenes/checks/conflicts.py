@@ -9,12 +9,12 @@ from liverjax.physics.prescribed import free_places
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.scene import Scene, named_physics
 
-#: Part of the largest motion that counts as none: roundoff of a turn.
+#: A motion smaller than this fraction of the largest one counts as zero: it is roundoff, for example of a rotation.
 _NO_MOTION = 1e-12
 
 
 def check_moved_where_fixed(scene: Scene) -> None:
-    """Refuse a motion of nodes that are fixed along its axis; traced arrays and motions of 0 pass."""
+    """Refuse a motion along an axis along which its nodes are fixed. Traced arrays and motions of 0 pass."""
     for k, motion in enumerate(scene.displaced):
         by = motion.history if motion.by is None else motion.by
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((by, motion.nodes))):
@@ -37,7 +37,7 @@ def check_moved_where_fixed(scene: Scene) -> None:
 
 
 def check_plates_alone(scene: Scene) -> None:
-    """Refuse a plate's node that something else holds or moves, which would have no effect; traced arrays pass."""
+    """Refuse other supports or motions of a plate's nodes: they would have no effect. Traced arrays pass."""
     named = [(f"{kind}.{k}", part) for kind in ("fixed", "displaced") for k, part in enumerate(getattr(scene, kind))]
     every = named_physics(scene)
     plates = [(name, physics) for name, physics in every if physics.ties]
@@ -56,9 +56,7 @@ def check_plates_alone(scene: Scene) -> None:
 
 
 def check_normals(scene: Scene) -> None:
-    """Refuse a node in two planes given by normals, or held along some but not all axes of its plane's normal; traced
-    arrays pass.
-    """
+    """Refuse a node in two oblique planes, or held along some but not all axes of its normal; traced arrays pass."""
     slides = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, SlidingSupport)]
     nodes = [*(f.nodes for f in scene.fixed), *(d.nodes for d in scene.displaced), *(s.nodes for _, s in slides)]
     if all(slide.axis for _, slide in slides) or any(isinstance(n, jax.core.Tracer) for n in nodes):
@@ -90,7 +88,7 @@ def check_normals(scene: Scene) -> None:
 
 
 def check_prescribed_once(scene: Scene) -> None:
-    """Refuse a motion of a node along an axis along which it is fixed, or moved by another motion; host side."""
+    """Refuse a motion of a node along an axis if the node is fixed or already moved along this axis; host side."""
     taken: dict[tuple[int, str], str] = {}
     for kind in ("fixed", "displaced"):
         for k, condition in enumerate(getattr(scene, kind)):
@@ -104,7 +102,7 @@ def check_prescribed_once(scene: Scene) -> None:
 
 
 def check_motion_in_planes(scene: Scene) -> None:
-    """Refuse a prescribed motion that leads nodes off the plane in which they slide; host side.
+    """Refuse a prescribed motion that moves nodes out of the plane in which they slide; host side.
 
     Raises:
         InputError: one sentence that begins with the name of the motion.

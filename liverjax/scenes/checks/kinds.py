@@ -1,4 +1,4 @@
-"""Is every part of the scene of its type?"""
+"""Does every part of the scene have the right type?"""
 
 from liverjax import laws
 from liverjax.core.errors import InputError
@@ -12,7 +12,7 @@ from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.springpots import SpringpotSeries
 
-#: Types of the parts of a scene: of single parts, and of parts that may be several.
+#: Types of the parts of a scene: first of single parts, then of parts of which a scene may have several.
 PARTS = {
     "mesh": TetMesh,
     "law": laws.Law,
@@ -26,7 +26,7 @@ SEVERAL = {"region": Region, "fixed": Fixed, "displaced": Displaced, "traction":
 
 
 def check_kinds(scene: Scene) -> None:
-    """Refuse parts of a wrong type, such as numbers of nodes in place of `Fixed`."""
+    """Refuse parts of a wrong type, for example node numbers in place of a `Fixed`."""
     for key, kind in PARTS.items():
         own = getattr(scene, key)
         if own is not None and not isinstance(own, kind):

@@ -1,4 +1,4 @@
-"""Is every load, weight, motion and support given once, in its shape? Numbers do not matter here."""
+"""Is every load, weight, motion and support given once and in the right shape? The values are not checked here."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ MASSES = ("lumped", "consistent")
 
 
 def check_loads(scene: Scene) -> None:
-    """Refuse loads and motions that are given twice, not at all or in a wrong shape, and unknown axes.
+    """Refuse loads and motions that are given twice, not at all or in a wrong shape. Refuse unknown axes.
 
     Raises:
         InputError: one sentence that begins with the name of the load, motion or support.
@@ -46,7 +46,7 @@ def _check_traction(load: Traction, name: str) -> None:
 def _check_motion(motion: Displaced, name: str) -> None:
     history.check_times(motion.times, motion.history, name, (3,) if motion.by is None else (1,))
     check_axes(motion.axes, name)
-    # NumPy cannot tell the shape of a tuple of traced numbers.
+    # NumPy cannot determine the shape of a tuple of traced numbers.
     by: Any = motion.by
     shape = (3,) if isinstance(by, tuple | list) and len(by) == 3 and np.ndim(by[0]) == 0 else np.shape(by)
     if by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
@@ -58,7 +58,7 @@ def _check_motion(motion: Displaced, name: str) -> None:
 def _check_body(body: Body, nodes: int) -> None:
     if body.mass not in MASSES:
         raise InputError(f"[body] mass = {body.mass!r} is not known: use {' or '.join(MASSES)}")
-    # NumPy cannot tell the shape of a tuple of traced numbers.
+    # NumPy cannot determine the shape of a tuple of traced numbers.
     gravity = (len(body.gravity),) if isinstance(body.gravity, tuple) else np.shape(body.gravity)
     density = np.shape(body.density)
     if density not in ((), (nodes,)):

@@ -1,4 +1,4 @@
-"""Are the numbers of the scene within their bounds, alone and together? The mesh has checks of its own."""
+"""Is every number of the scene within its bounds, and do the numbers go together? The mesh is checked elsewhere."""
 
 from liverjax.core import bounds
 from liverjax.physics import porosity, viscosity
@@ -9,9 +9,9 @@ from liverjax.scenes.springpots import check_springpots
 
 
 def check_bounds(scene: Scene) -> None:
-    """Refuse numbers out of bounds, and directions without length; compiles nothing.
+    """Refuse numbers out of bounds, and directions of length 0. Nothing is compiled.
 
-    Traced ones pass; `check_mesh` checks the mesh.
+    Traced numbers pass. `check_mesh` checks the mesh.
 
     Raises:
         InputError: one sentence with the number's dotted name, value, bound and remedy.
@@ -30,7 +30,7 @@ def check_bounds(scene: Scene) -> None:
 
 
 def check_numbers(scene: Scene) -> None:
-    """Refuse numbers that cannot be used, alone or together. The mesh is not checked; host side.
+    """Refuse numbers that cannot be used, alone or in combination. The mesh is not checked; host side.
 
     Raises:
         InputError: numbers out of bounds, or that contradict each other in law, viscosity or porosity.

@@ -1,4 +1,4 @@
-"""Are the nodes and triangles of every part in the mesh, and can something act there?"""
+"""Are the nodes and triangles of every part in the mesh, and can the part act there?"""
 
 import jax
 import numpy as np
@@ -26,7 +26,7 @@ def check_known_nodes(scene: Scene) -> None:
     if not isinstance(mesh.volumes, jax.core.Tracer):
         wrong = int(np.sum(~(np.asarray(mesh.volumes) > 0)))
         if wrong:
-            raise InputError(f"mesh has {wrong} elements that are inside out or without volume: correct their vertices")
+            raise InputError(f"mesh has {wrong} elements that are inverted or without volume: correct their vertices")
 
 
 def check_places(scene: Scene) -> None:
@@ -52,13 +52,13 @@ def check_places(scene: Scene) -> None:
 
 
 def _has_vertices(mesh: TetMesh, nodes: object, name: str) -> None:
-    """Refuse a place of the fluid that holds only middles of edges: pressures belong to vertices."""
+    """Refuse a place of the fluid that contains only middles of edges, since only vertices have pressures."""
     if not np.any(np.asarray(nodes, int) < mesh.number_of_vertices):
         raise InputError(f"{name} meets only middles of edges, which have no pressure: make its place hold vertices")
 
 
 def _inlets_that_act(sponge: Porosity) -> None:
-    """Refuse inlets within a place whose pressure is given already; places may share an edge."""
+    """Refuse an inlet in a place where the pressure is already given. The places may share an edge."""
     given = [] if sponge.drained is None else [set(np.asarray(sponge.drained).tolist())]
     pressures = [(k, inlet) for k, inlet in enumerate(sponge.inlet) if inlet.nodes is not None]
     for k, inlet in pressures:

@@ -1,4 +1,4 @@
-"""Checks of the regions of a scene: one pass over them for numbers, one for elements; each refusal is one sentence."""
+"""Checks of the regions of a scene: one function checks their parameters, another one their elements."""
 
 import jax
 import numpy as np
@@ -16,11 +16,10 @@ from liverjax.scenes.scene import Scene
 
 
 def check_region_numbers(scene: Scene) -> None:
-    """Refuse numbers of regions that no step can use; traced ones pass.
+    """Refuse parameters of regions that no step can use. Traced parameters pass.
 
     Raises:
-        InputError: a part that the scene does not have, an unknown name, numbers out of bounds, another number of
-            modes.
+        InputError: a part that the scene does not have, an unknown name, values out of bounds, a wrong number of modes.
     """
     for k, region in enumerate(scene.region):
         _check_law(scene.law, region, f"region.{k}")
@@ -29,10 +28,10 @@ def check_region_numbers(scene: Scene) -> None:
 
 
 def check_region_elements(scene: Scene) -> None:
-    """Refuse regions of elements that no scene can use; host side.
+    """Refuse regions whose elements no scene can use; host side.
 
     Raises:
-        InputError: no or unknown elements, a region that changes nothing, two laws for an element.
+        InputError: no elements, unknown elements, a region that changes nothing, two laws for one element.
     """
     last = scene.mesh.number_of_elements - 1
     for k, region in enumerate(scene.region):
@@ -53,10 +52,10 @@ def _check_law(law: Law, region: Region, name: str) -> None:
 
 
 def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> None:
-    """Refuse viscous numbers of a region that no step can use; traced ones pass.
+    """Refuse viscous parameters of a region that no step can use. Traced parameters pass.
 
     Raises:
-        InputError: no [viscosity] in the scene, another number of modes, numbers out of bounds.
+        InputError: no [viscosity] in the scene, a wrong number of modes, values out of bounds.
     """
     own = region.viscosity
     if not own:
@@ -83,10 +82,10 @@ def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> No
 
 
 def check_region_porosity(porosity: Porosity | None, region: Region, name: str) -> None:
-    """Refuse porous numbers of a region that no step can use; traced ones pass.
+    """Refuse porous parameters of a region that no step can use. Traced parameters pass.
 
     Raises:
-        InputError: no [porosity] in the scene, an unknown name, numbers out of bounds.
+        InputError: no [porosity] in the scene, an unknown name, values out of bounds.
     """
     own: Content = dict(region.porosity or {})
     if not own:
@@ -108,12 +107,12 @@ def check_region_porosity(porosity: Porosity | None, region: Region, name: str) 
 
 
 def _check_hidden(regions: tuple[Region, ...], elements: int) -> None:
-    """Refuse a region whose numbers later regions replace in all of its elements."""
+    """Refuse a region without effect: later regions replace its parameters in all of its elements."""
     taken: dict[str, np.ndarray] = {}
     nothing = np.zeros(elements, bool)
     for k, region in reversed(list(enumerate(regions))):
         own, names = np.asarray(region.elements), _names_of(region)
-        law = taken.get("law", nothing)[own]  # a law of its own has all numbers anew
+        law = taken.get("law", nothing)[own]  # a complete law replaces all parameters
         if all(np.all(taken.get(n, nothing)[own] | (law if n.startswith("law.") else False)) for n in names):
             raise InputError(
                 f"region.{k} changes nothing: later regions give all of its elements the same numbers anew; leave it "
@@ -124,14 +123,14 @@ def _check_hidden(regions: tuple[Region, ...], elements: int) -> None:
 
 
 def _names_of(region: Region) -> set[str]:
-    """The numbers that a region changes."""
+    """Names of the parameters that a region changes."""
     own = {"law"} if isinstance(region.law, Law) else {f"law.{name}" for name in changed_numbers(region)}
     own |= {f"viscosity.{name}" for name in region.viscosity or {}}
     return own | {f"porosity.{name}" for name in region.porosity or {}}
 
 
 def _check_own_laws(regions: tuple[Region, ...]) -> None:
-    """Refuse regions that leave open which law an element has."""
+    """Refuse regions that do not determine which law an element has."""
     for k, region in enumerate(regions):
         if not isinstance(region.law, Law):
             continue

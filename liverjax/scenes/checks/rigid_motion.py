@@ -12,16 +12,20 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
-    """Name of each further physics (as in `check_physics`) -> number of nodal directions that it holds at first."""
+    """Name of a further physics (as in `check_physics`) -> number of nodal directions that it holds at first."""
     named = [(name, physics) for name, physics in named_physics(scene) if only is None or name in only]
     return {name: len(physics.holds(scene.mesh)[0]) for name, physics in named}
 
 
 def check_hold(scene: Scene, before: dict[str, int]) -> None:
-    """Refuse numbers with which physics hold less than `before` (see `holding`), if a static body is then loose.
+    """Refuse a static body that is loose because changed numbers let a physics hold fewer directions than `before`.
+
+    Args:
+        scene: `Scene` with the changed numbers.
+        before: see `holding`.
 
     Raises:
-        InputError: nothing holds a connected piece any more.
+        InputError: a connected piece of the body is no longer held.
     """
     still = scene.solve.kind == "static" or scene.points_are == "loaded"
     if still and any(number < before[name] for name, number in holding(scene, before).items()):
@@ -29,7 +33,7 @@ def check_hold(scene: Scene, before: dict[str, int]) -> None:
 
 
 def check_held(scene: Scene) -> None:
-    """Refuse a connected piece that nothing holds: a static solution does not exist then."""
+    """Refuse a connected piece that is not held: then no static solution exists."""
     loose = loose_piece(scene, lambda physics: physics.holds(scene.mesh))
     if loose:
         doubled = doubled_vertices(scene.mesh)
@@ -41,11 +45,11 @@ def check_held(scene: Scene) -> None:
 
 
 def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.ndarray]]) -> str:
-    """The first connected piece with a free rigid motion, in words, or "".
+    """The first connected piece with a free rigid motion, in words; "" if there is none.
 
     Args:
         scene: `Scene`.
-        holds: node numbers (n,) and directions (n, 3) that a further physics holds.
+        holds: function that gives the node numbers (n,) and the directions (n, 3) that a further physics holds.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -67,9 +71,9 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
 
 
 def _rigid_rank(points: np.ndarray, directions: np.ndarray, size: float) -> int:
-    """Rank of the six rigid motions as seen along held directions (n, 3) at points (n, 3) of a body of that size."""
+    """Rank of the six rigid motions, projected on held directions (n, 3) at points (n, 3) of a body of this size."""
     if not len(points):
         return 0
-    # A turn about e moves x by e x x, of which the part along d is (x x d) . e.
+    # A rotation about e moves x by e x x; the component of this motion along d is (x x d) . e.
     motions = np.concatenate([directions, np.cross(points / max(size, 1e-300), directions)], axis=1)
     return int(np.linalg.matrix_rank(motions, tol=1e-6))
