@@ -1,1 +1,1 @@
-"""Strain sweeps: moduli that change with the amplitude of an oscillation, and the law behind them."""
+"""Strain sweeps: moduli that change with the strain amplitude, and the hyperelastic law that explains them."""

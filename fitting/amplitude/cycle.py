@@ -1,11 +1,11 @@
-"""One steady cycle of large shear: storage and loss modulus of the first harmonic, and how large the third is.
+"""One steady cycle of large shear: storage and loss modulus of the first harmonic, and the size of the third harmonic.
 
-The sample is incompressible and isotropic, with a strain energy function W. The stress S (second Piola-Kirchhoff) that
-follows from W relaxes, at a rate that does not depend on the strain (chapter, section 4.2). In simple shear of amount
-g(t) = a sin(wt) the shear stress is S12 + g S22, whatever the pressure is. S is a sum of harmonics of w, and the memory
-multiplies harmonic n by m(nw) = G*(nw)/G0. In torsion between plates every ring of the sample is in simple shear, and
-its amount depends on the radius (a universal deformation: Rivlin 1949). So the torque is a sum over rings; a rheometer
-converts it into moduli as if the sample were linear.
+The sample is incompressible and isotropic, with a strain energy function W. The second Piola-Kirchhoff stress S from W
+relaxes at a rate that does not depend on the strain (chapter, section 4.2). In simple shear with the amount g(t) = a
+sin(wt), the shear stress is S12 + g S22 for every pressure. S is a sum of harmonics of w. The memory of the material
+multiplies harmonic n by m(nw) = G*(nw)/G0. In torsion between plates, every ring of the sample is in simple shear, with
+an amount that depends on the radius (a universal deformation: Rivlin 1949). So the torque is a sum over rings. A
+rheometer converts this torque into moduli as if the sample were linear.
 """
 
 from typing import NamedTuple
@@ -18,14 +18,17 @@ from liverjax.laws.base import Law
 from liverjax.laws.terms.stretch_terms import stress_at_constant
 from liverjax.tensors.matrices import pack, unpack
 
-#: Instants of a cycle, and rings between plates (Gauss' points). Stresses of harmonics beyond the 15th are left out.
+#: Number of instants in a cycle, and number of rings between the plates (Gauss points). Harmonics of the stress above
+#: the 15th are left out.
 INSTANTS, RINGS = 32, 8
-#: Number of shears at which the law is evaluated. S12/g and S22 are even in g: polynomials of g^2 interpolate them.
+#: Number of shears at which the law is evaluated. S12/g and S22 are even functions of g, so polynomials in g^2
+#: interpolate them.
 ASKED = 24
 
 
 class Reading(NamedTuple):
-    """Matrices that turn stresses at `ASKED` shears into the readings of a rheometer; the same for every law."""
+    """Matrices that convert stresses at `ASKED` shears to the readings of a rheometer. They are the same for every
+    law."""
 
     shears: np.ndarray  # (K,) above 0
     F: jax.Array  # (K, 3, 3)
@@ -33,11 +36,11 @@ class Reading(NamedTuple):
 
 
 def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel") -> Reading:
-    """Matrices for cycles with these strain amplitudes at the rim.
+    """The matrices for cycles with these strain amplitudes at the rim.
 
     Args:
         strains: amplitudes (A,) at the rim.
-        memories: m(nw) for n = 0 to `INSTANTS` / 2, complex (M, n); the reading is linear in m.
+        memories: m(nw) for n = 0 to `INSTANTS` / 2, complex (M, n). The reading is linear in m.
         plates: "parallel", or "cone" (cone and plate, where the strain is the same everywhere).
     """
     rho, weights = _radii_and_weights(plates)
@@ -64,11 +67,12 @@ def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
         return np.ones(1), np.ones(1)
     x, w = np.polynomial.legendre.leggauss(RINGS)
     rho = 0.5 * (1 + x)
-    return rho, 0.5 * w * 4 * rho**3  # 2 M / (pi R^3) over the strain at the rim, ring by ring
+    return rho, 0.5 * w * 4 * rho**3  # 2 M / (pi R^3) / (strain at the rim), ring by ring
 
 
 def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values (..., K) of Lagrange's polynomials of Chebyshev's nodes (K,) (barycentric; Berrut, Trefethen 2004)."""
+    """Values (..., K) of the Lagrange polynomials for Chebyshev nodes (K,) (barycentric form; Berrut, Trefethen
+    2004)."""
     k = np.arange(len(nodes))
     w = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / len(nodes))
     off = at[..., None] - nodes
@@ -79,10 +83,10 @@ def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Complex modulus of the first harmonic (A,) [Pa], and amplitude of the third over the first (A,).
+    """Complex modulus of the first harmonic (A,) [Pa], and amplitude of the third harmonic over the first (A,).
 
     Args:
-        law: law of the instantaneous stress; its volumetric energy is not used.
+        law: law of the instantaneous stress. Its volumetric energy is not used.
         r: the result of `reading`.
         shares: factors (M,) of the memories.
     """
@@ -93,7 +97,8 @@ def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array,
 
 
 def _instantaneous_stress(law: Law, F: jax.Array) -> jax.Array:
-    """Second Piola-Kirchhoff stress (K, 3, 3) of the isochoric energy; F is a constant, without derivatives."""
+    """Second Piola-Kirchhoff stress (K, 3, 3) of the isochoric energy. F is a constant: there are no derivatives by
+    F."""
     split = law.isochoric_part()
     if split is not None and split.stretch_energy is not None:
         return pack(stress_at_constant(split, unpack(F)))

@@ -1,4 +1,4 @@
-"""Hyperelastic laws from strain sweeps: least squares of the first harmonic from many starts."""
+"""Hyperelastic laws from strain sweeps: least squares on the first harmonic, from many starts."""
 
 import json
 import time
@@ -21,17 +21,19 @@ from fitting.readers.frequency_sweep import smooth_curve
 from liverjax.core.errors import InputError
 from liverjax.laws import Law
 
-#: If the loss tangent changes by more than this part over the sweep, the memory depends on the strain.
+#: If the loss tangent changes by more than this part over the sweep, the relaxation depends on the strain.
 CHANGED = 0.2
 
 
 class Memory(NamedTuple):
-    """Factor m(nw) of each harmonic n, from a Prony series; without a series 1 + i times one loss tangent."""
+    """Factor m(nw) for each harmonic n, from a Prony series. Without a series, the factor is 1 + i (loss tangent), with
+    one loss tangent."""
 
     series: Maxwell | None = None
 
     def of(self, omega: float) -> np.ndarray:
-        """m(nw) (1, n) of the series; without it (2, n), the second row to be multiplied by the loss tangent."""
+        """m(nw) (1, n) of the series. Without a series (2, n): the second row is to be multiplied by the loss
+        tangent."""
         n = np.arange(cycle.INSTANTS // 2 + 1)
         if self.series is None:
             return np.array([np.ones(len(n)), np.where(n == 0, 0, 1j)])
@@ -45,14 +47,14 @@ class StrainFit(NamedTuple):
     law: LawFit
     storage: np.ndarray  # (n,) [Pa]
     loss: np.ndarray  # (n,) [Pa]
-    third: np.ndarray  # (n,) amplitude of the torque's third harmonic over the first
+    third: np.ndarray  # (n,) amplitude of the third harmonic of the torque over the first
 
 
 def memory_from(path: Path) -> Memory:
     """Read the Prony series from the fit.json of a fitted frequency sweep.
 
     Raises:
-        InputError: no such file, or one without a series.
+        InputError: the file does not exist, or it has no series.
     """
     try:
         held = json.loads(path.read_text())
@@ -66,12 +68,13 @@ def memory_from(path: Path) -> Memory:
     return Memory(model)
 
 
-#: Least and largest product of frequency and relaxation time for a series to know the frequency, with its own times.
+#: A series covers an angular frequency if the product with its longest relaxation time is at least the first value, and
+#: the product with its shortest time at most the second.
 KNOWN = (0.5, 2.0)
 
 
 def outside_series(memory: Memory, omega: float) -> str | None:
-    """A sentence if the angular frequency omega [rad/s] lies beyond the relaxation times of the series; else None."""
+    """A sentence if the relaxation times of the series do not cover the angular frequency omega [rad/s]; else None."""
     if memory.series is None:
         return None
     times = np.asarray(memory.series.relaxation_times)
@@ -81,24 +84,25 @@ def outside_series(memory: Memory, omega: float) -> str | None:
         return None
     hertz = [f"{1 / (2 * np.pi * t):.3g}" for t in (times.max(), times.min())]
     return (
-        f"the sweep's {omega / 2 / np.pi:.3g} Hz lie {side} the frequencies that the series of --model knows "
-        f"({hertz[0]} to {hertz[1]} Hz): what relaxes {part} is missing in it, and all moduli of the law are off; give "
-        "the fit.json of a frequency sweep that contains this frequency"
+        f"the sweep's {omega / 2 / np.pi:.3g} Hz lie {side} the frequencies that the series of --model covers "
+        f"({hertz[0]} to {hertz[1]} Hz): this series does not contain {part} relaxation, so all moduli of the law are "
+        "wrong; give the fit.json of a frequency sweep that contains this frequency"
     )
 
 
 def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: str) -> StrainFit:
-    """Least squares of the relative misfit of G* at all amplitudes, the best of many starts.
+    """Minimise the squares of the relative misfit of G* at all amplitudes; the best of many starts.
 
-    Without a Prony series the loss tangent is one more number of the fit, and the modulus is valid at this frequency
-    only.
+    Without a Prony series, the loss tangent is one more parameter of the fit, and the modulus is valid only at this
+    frequency.
     """
     own = candidate if memory.series is not None else with_loss_tangent(candidate)
     memories = memory.of(sweep.angular_frequency)
     r = cycle.reading(sweep.strain, memories, plates)
     measured = sweep.storage + 1j * sweep.loss
     scale = float(np.abs(measured[0]) / np.abs(memories[0, 1]))
-    # Relative to each measured modulus itself, points that are low by chance would weigh most.
+    # If each residual were divided by its measured modulus, points that are low by chance would have the largest
+    # weight.
     sizes = smooth_curve(sweep.strain, np.abs(measured)) * np.exp(1j * np.angle(measured))
 
     def model(u: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -116,7 +120,7 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
     compiled = time.perf_counter()
     found = jax.block_until_ready(program(points))
     times = (time.perf_counter() - compiled, compiled - begin)
-    # G' and G'' of one sweep are one test, and their residuals are relative.
+    # G' and G'' of one sweep are one test, and their residuals are relative already.
     law = assessed(own, _as_curves(sweep), found, scale, times, of_tests=False)
     best = found.u[int(np.nanargmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
     G, third = (np.asarray(v) for v in model(best))
@@ -124,7 +128,7 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
 
 
 def with_loss_tangent(candidate: Candidate) -> Candidate:
-    """The candidate with one more number, the tangent of the loss angle."""
+    """The candidate with one more parameter, the tangent of the loss angle."""
 
     def values(u: jax.Array, scale: object) -> jax.Array:
         return jnp.concatenate([candidate.values(u[:-1], scale), u[-1:]])
@@ -141,14 +145,14 @@ def with_loss_tangent(candidate: Candidate) -> Candidate:
 
 
 def _as_curves(sweep: StrainSweep) -> list[Curve]:
-    """The two moduli against the shear at the rim, for the warnings of a fit."""
+    """The two moduli as curves over the shear at the rim, for the warnings of a fit."""
     F = np.tile(np.eye(3), (len(sweep.strain), 1, 1))
     F[:, 0, 1] = sweep.strain
     return [Curve(name, "simple_shear", F, (0, 1), G) for name, G in (("G'", sweep.storage), ("G''", sweep.loss))]
 
 
 def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
-    """Warnings about the fits for their reader; the best comes first."""
+    """Warnings about the fits, for the user. The best fit comes first in `fits`."""
     best = fits[0]
     told = list(best.law.warnings)
     tangents = sweep.loss / sweep.storage

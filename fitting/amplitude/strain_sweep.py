@@ -1,4 +1,4 @@
-"""A strain sweep from a file: moduli against the amplitude of the strain, at one frequency."""
+"""A strain sweep from a file: moduli over the strain amplitude, at one frequency."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,9 +11,9 @@ from fitting.readers.tables.text_tables import text_of
 from liverjax.core.errors import InputError
 
 FEWEST_POINTS, LARGEST_STRAIN, LARGEST_WITHOUT_UNIT = 4, 10.0, 2.0
-#: Largest strain of a sweep in percent below which the numbers may be fractions.
+#: If a column in percent has no strain [1] above this, its values may be fractions.
 SMALLEST_LARGEST = 0.01
-#: Change of temperature [K] above which a table has several sweeps.
+#: If the temperature changes by more than this [K], a table has several sweeps.
 LARGEST_DRIFT = 2.0
 
 
@@ -29,15 +29,17 @@ class StrainSweep(NamedTuple):
 
 
 def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | None = None) -> StrainSweep:
-    """Read a strain sweep: text, CSV or workbook with frequency, storage and loss modulus, and the strain's amplitude.
+    """Read a strain sweep from text, CSV or a workbook with frequency, storage modulus, loss modulus and strain
+    amplitude.
 
     Args:
-        path: path of the file; its strain column is named strain, with the unit % or 1.
+        path: path of the file. Its strain column is named strain, with the unit % or 1.
         table: name of one of several tables, or a part of the name.
         max_strain: points of larger strain [1] are left out.
 
     Raises:
-        InputError: no table with a strain, moduli of tension, several frequencies, too few points.
+        InputError: no table has a strain, the moduli are of tension, there are several frequencies or temperatures, or
+            there are too few points.
     """
     found = [t for t in tables_of(str(path), text_of(path, "a strain sweep").splitlines()) if "strain" in t.raw]
     if not found:
@@ -94,7 +96,7 @@ def _refuse_several_temperatures(path: Path, temperature: np.ndarray | None, kep
 
 
 def _of_unit(path: Path, unit: str, largest: float) -> list[str]:
-    """A note if the unit of the strains is missing or may be another one; refuse strains that are too large."""
+    """A note if the unit of the strains is missing or may be wrong. Strains that are too large are refused."""
     if largest > (LARGEST_STRAIN if unit else LARGEST_WITHOUT_UNIT):
         raise InputError(
             f"{path}: a strain of {largest:g} is too large: write it in % (strain_%), or as a fraction (strain_1)"

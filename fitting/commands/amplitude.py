@@ -13,10 +13,10 @@ def parser(prog: str) -> argparse.ArgumentParser:
     """Options of the command; --help shows `prog` as its name."""
     command = argparse.ArgumentParser(
         prog=prog,
-        description="Fit the numbers of a hyperelastic law to moduli that change with the amplitude of the strain, at "
+        description="Fit the parameters of a hyperelastic law to moduli that change with the strain amplitude, at "
         "one frequency, and show the third harmonic that the law predicts.",
-        epilog="The errors (±) are of noise alone: an error of the gap, of 50 µm of 1 mm, adds 5 % to every "
-        f"modulus and strain. {EXIT_CODES}",
+        epilog="The errors (±) come from noise alone. An error of the gap is not included: 50 µm in 1 mm changes "
+        f"every modulus and strain by 5 %. {EXIT_CODES}",
     )
     command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")
     command.add_argument(
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     candidates = hyperelastic.candidates(options.law, options.terms)
     sweep = read_strain_sweep(options.sweep, options.table, options.max_strain)
     memory = law_fit.Memory() if options.model is None else law_fit.memory_from(options.model)
-    plates = [] if options.plates else ["parallel plates are assumed: for a cone and a plate give --plates cone"]
+    plates = [] if options.plates else ["parallel plates are assumed; for cone and plate, give --plates cone"]
     for note in [*sweep.notes, *plates, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png"))

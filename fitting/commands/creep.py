@@ -1,4 +1,5 @@
-"""``python -m fitting creep FILE``: the command `relaxation` with the stress driven in place of the strain."""
+"""``python -m fitting creep FILE``: the command `relaxation` for a test in which the stress is imposed in place of the
+strain."""
 
 from fitting.commands.relaxation import parser, run
 

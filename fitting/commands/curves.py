@@ -35,11 +35,10 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def _with_finite_stress(fits: "list[LawFit]") -> "list[LawFit]":
-    """The fits whose law has a finite stress on the curves; the others are named, or refused if none is left."""
+    """The fits whose law has a finite stress on the curves. A warning names the other laws. If no law is left, they are
+    refused."""
     wrong = [f.label for f in fits if not np.isfinite(f.mean_relative_error)]
-    told = (
-        f"{', '.join(wrong)}: the stress is not finite on these curves: look at the law with python -m liverjax check"
-    )
+    told = f"{', '.join(wrong)}: the stress is not finite on these curves: check the law with python -m liverjax check"
     if len(wrong) == len(fits):
         raise InputError(told)
     if wrong:

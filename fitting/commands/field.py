@@ -1,4 +1,4 @@
-"""``python -m fitting field SCENE.toml DISPLACEMENTS.csv``: a map of stiffness, or a few numbers, of a body."""
+"""``python -m fitting field SCENE.toml DISPLACEMENTS.csv``: a stiffness map, or a few parameters, of a body."""
 
 import argparse
 import sys
@@ -19,7 +19,7 @@ from liverjax.scenes.scene import numbers_at
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation import gradients
 
-#: Size of the mesh's error over the noise above which there is a note.
+#: If the mesh error exceeds this many times the noise, a note is given.
 _TOLD = 0.3
 
 
@@ -38,17 +38,17 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="SCENE.toml DISPLACEMENTS.csv",
         help="x,y,z (or node),ux,uy,uz[,time][,sd]",
     )
-    command.add_argument("--name", default="law.mu", metavar="NAME", help="number to map (default law.mu)")
-    command.add_argument("--length", type=float, metavar="M", help="the map varies over it [m] (default: size / 10)")
+    command.add_argument("--name", default="law.mu", metavar="NAME", help="parameter to map (default law.mu)")
+    command.add_argument("--length", type=float, metavar="M", help="correlation length [m] (default: size / 10)")
     command.add_argument(
-        "--sphere", action="store_true", help="fit also a sphere of another stiffness, started from the map"
+        "--sphere", action="store_true", help="also fit a sphere of another stiffness, with a start from the map"
     )
     command.add_argument(
         "--parameters", metavar="NAME,…", help="these numbers instead of a map, e.g. law.mu,viscosity.ratios"
     )
     command.add_argument("--noise", type=float, metavar="M", help="standard deviation [m] if a file has no column sd")
     command.add_argument("--unit", default="m", help="unit of the lengths in the displacement files (default m)")
-    command.add_argument("--iterations", type=int, default=60, help="most iterations for each weight (default 60)")
+    command.add_argument("--iterations", type=int, default=60, help="maximum number for each weight (default 60)")
     command.add_argument("--resume", action="store_true", help="go on from the last iteration written to --out")
     command.add_argument(
         "--out", type=Path, default=Path("field"), metavar="DIR", help="folder of the results (default field)"
@@ -74,7 +74,7 @@ def _problem(options: argparse.Namespace) -> Problem:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find a map, or a few numbers, of scenes; exit code 1 if a solve or the fit did not converge."""
+    """Find a map, or a few parameters, of scenes. The exit code is 1 if a solve or the fit did not converge."""
     return (_map if options.parameters is None else _fit_few_numbers)(options, _problem(options))
 
 

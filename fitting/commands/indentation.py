@@ -15,8 +15,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
     """Options of the command; --help shows `prog` as its name."""
     command = argparse.ArgumentParser(
         prog=prog,
-        description="Identify Young's modulus and the contact point from an indentation curve: a rigid sphere, cone or "
-        "flat punch on a layer that is bonded below. Small strains, no friction, no adhesion.",
+        description="Identify Young's modulus and the contact point from an indentation curve: a rigid sphere, cone "
+        "or flat punch on a layer that is bonded to its base. Small strains, no friction, no adhesion.",
         epilog=COLUMNS + EXIT_CODES,
     )
     command.add_argument("file", type=Path, metavar="CURVE.csv", help="depth and force")
@@ -31,17 +31,19 @@ def parser(prog: str) -> argparse.ArgumentParser:
     return command
 
 
-#: Largest radius [m] that is believed, and thickness [m] of a layer that is hardly meant.
+#: Largest radius [m] that is accepted. Above the second value, a layer thickness [m] is probably a mistake.
 LARGEST, THICK = 0.2, 1.0
-#: Angle [degrees] of a cone whose angle is not given.
+#: Half-angle [degrees] of a cone if none is given.
 HALF_ANGLE = 45.0
 
 
 def _notes_on_shape(options: argparse.Namespace) -> list[str]:
-    """Notes on an angle that is assumed, and on numbers that the shape does not have."""
+    """Notes on an assumed angle, and on options that have no effect for this shape."""
     cone, told = options.shape == "cone", []
     if cone and options.half_angle is None:
-        told.append(f"a half-angle of {HALF_ANGLE:g} degrees is assumed: --half-angle gives another, E goes with 1/tan")
+        told.append(
+            f"a half-angle of {HALF_ANGLE:g} degrees is assumed; --half-angle sets another. E is in proportion to 1/tan"
+        )
     if not cone and options.half_angle is not None:
         told.append(f"--half-angle is for a cone: it changes nothing for a {options.shape}")
     if cone and options.radius:
@@ -52,7 +54,7 @@ def _notes_on_shape(options: argparse.Namespace) -> list[str]:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit the curve; exit code 1 if the modulus is not positive."""
+    """Fit the curve. The exit code is 1 if the modulus is not positive."""
     from fitting.methods.contact_point import fit_with_offset, fit_without_tilt
     from fitting.readers.indentation_curves import read_indentation
     from fitting.reports import indentation_report

@@ -7,7 +7,8 @@ from tqdm import tqdm
 
 
 def cost_bar(unit: str, description: str | None = None) -> tuple[tqdm, Callable[[int, float], None]]:
-    """A bar on standard error (off if that is not a terminal), and the function to call with every cost."""
+    """A progress bar on standard error, and the function to call with every cost. The bar is off if standard error is
+    not a terminal."""
     bar = tqdm(desc=description, unit=f" {unit}", disable=None, leave=False)
 
     def told(_: int, cost: float) -> None:
@@ -19,7 +20,8 @@ def cost_bar(unit: str, description: str | None = None) -> tuple[tqdm, Callable[
 
 @contextmanager
 def named_bar(description: str) -> Iterator[Callable[[str], None]]:
-    """A bar on standard error (off if that is not a terminal); it gives the function to call with each fit's name."""
+    """A progress bar on standard error. It yields the function to call with the name of each fit. The bar is off if
+    standard error is not a terminal."""
     with tqdm(desc=description, unit=" fits", disable=None, leave=False) as bar:
 
         def told(text: str) -> None:

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from fitting.readers.time_tests import TimeTest
 
 COLUMNS = """The file has a column of time and one of these: relaxation_modulus_Pa (creep: creep_compliance_1/Pa);
-strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. With two columns the model answers the
-measured drive, ramp included; torque and force need the sample's size. """
+strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. With two columns, the model follows
+the measured load, ramp included. Torque and force need the size of the sample. """
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
@@ -42,7 +42,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="S",
         help="duration of the ramp [s] if no column shows it; 0 with two columns: a step at 0 s, before the first row",
     )
-    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out the response before it")
+    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out earlier readings")
     command.add_argument("--radius", type=float, metavar="M", help="radius of the sample [m], for torque and force")
     command.add_argument("--height", type=float, metavar="M", help="height of the sample [m], for torque and force")
     shared_options.add_cards_and_samples(command)
@@ -54,13 +54,15 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
-    """Read the test that a TOML file describes; options that belong into the file are refused."""
+    """Read the test that a TOML file describes. Options that belong into the file are refused."""
     from fitting.rigs.described import read_described
 
     for name in ("radius", "height", "ramp", "min_time"):
         if getattr(options, name) or (name == "ramp" and options.ramp is not None):
             option = f"--{name.replace('_', '-')}"
-            raise InputError(f"{option} belongs into {options.file}, which describes the test: leave the option out")
+            raise InputError(
+                f"{option} belongs into the file {options.file} that describes the test: leave the option out"
+            )
     test = read_described(options.file)
     if test.kind != options.kind:
         raise InputError(
@@ -71,21 +73,22 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
 
 
 def _said_of_rows(test: "TimeTest") -> list[str]:
-    """Notes if a long record is fitted at some of its rows, and on what lies before the answers."""
+    """A note if only some rows of a long record are fitted, and a note on the time before the first reading."""
     from fitting.fits.time_tests import thinned
 
     number, every, told = len(thinned(test)), int(test.used.sum()), []
     if number < every:
-        told.append(f"{number} of {every} answers are fitted, spread over the log of the time since each load")
+        told.append(f"{number} of {every} readings are fitted, spread over the log of the time since each load")
     first, last = test.resolved
     told.append(
-        f"the answers begin {first:.3g} s after the load, and end at {last:.3g} s: what relaxed before is not in G0"
+        f"the readings begin {first:.3g} s after the load, and end at {last:.3g} s: G0 does not contain what relaxed "
+        "before"
     )
     return told
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit the test; exit code 1 if the fit did not converge."""
+    """Fit the test. The exit code is 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time as fits
     from fitting.fits.honesty import total_error
     from fitting.fits.simulated_rheometer import Simulation
@@ -112,7 +115,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))
     found = fits.choose_in_time(test, options.model, options.modes)
-    if options.file.suffix.lower() != ".toml":  # of a described rig the sizes act otherwise
+    if options.file.suffix.lower() != ".toml":  # in a described rig, the sizes act in another way
         default = Simulation()
         rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
         found.details["geometry_error"] = total_error.of_geometry(rig, None)

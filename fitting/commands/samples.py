@@ -1,4 +1,4 @@
-"""``python -m fitting SAMPLE1.csv SAMPLE2.csv …``: every sample by itself, and the population they come from."""
+"""``python -m fitting SAMPLE1.csv SAMPLE2.csv …``: every sample by itself, and the population of the samples."""
 
 import argparse
 import sys
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit all samples with one model in closed form; exit code 1 if one of the fits did not converge."""
+    """Fit all samples with one model in closed form. The exit code is 1 if one of the fits did not converge."""
     import numpy as np
 
     from fitting.fits import samples

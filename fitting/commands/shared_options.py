@@ -1,4 +1,5 @@
-"""Options that several commands share: number of modes, draws of the posterior, material cards, band of the sweep."""
+"""Options and steps that several commands share: number of modes, draws of the posterior, material cards, reading a
+sweep."""
 
 import argparse
 import contextlib
@@ -21,7 +22,7 @@ def add_modes(command: argparse.ArgumentParser) -> None:
 
 
 def refuse_copies(files: list[Path]) -> None:
-    """Refuse files with the same content: they are one measurement, which would count twice."""
+    """Refuse files with the same content: one measurement would count twice."""
     seen: dict[bytes, Path] = {}
     for file in (file for file in files if file.is_file()):
         first = seen.setdefault(file.read_bytes(), file)
@@ -47,7 +48,7 @@ def _whole_number_or_auto(text: str) -> int | str:
 
 
 def check_samples(count: int | None) -> None:
-    """Refuse a number of draws that is too small or too large."""
+    """Refuse a number of draws (--samples) that is too small or too large."""
     if count is not None and not 100 <= count <= 100000:
         raise InputError(f"--samples {count} is out of range: give 100 to 100000 draws of each chain, e.g. 1000")
 
@@ -62,7 +63,8 @@ def write_cards(out: Path, model: "Maxwell") -> None:
 
 
 def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
-    """Read a sweep without the points that the instrument spoils; with --max-frequency all points below it are kept."""
+    """Read a sweep without the points at which the instrument dominates. With --max-frequency, only the limits of the
+    band and the raw columns (`without_inertia`) decide which points are left out."""
     from fitting.readers import rheometer
 
     try:
@@ -78,8 +80,8 @@ def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
 
 
 def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") -> "Sweep":
-    """The sweep without the points that show the instrument. A known inertia of the sample is not taken for it; it
-    stays in the moduli."""
+    """The sweep without the points at which the instrument dominates. If the density of the sample is given, its
+    inertia is not mistaken for the instrument. This inertia stays in the moduli."""
     import numpy as np
 
     from fitting.fits import sample_inertia
@@ -91,7 +93,7 @@ def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") ->
         return kramers_kronig.without_instrument(sweep)
     try:
         bare = sample_inertia.taken_off(sweep, density, options.height)
-    except InputError:  # told with its remedy where the inertia is taken off
+    except InputError:  # the later step that subtracts the inertia raises this error with its remedy
         return kramers_kronig.without_instrument(sweep)
     kept = kramers_kronig.without_instrument(bare)
     told = tuple(note for note in kept.notes if note not in bare.notes)

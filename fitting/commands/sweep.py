@@ -52,8 +52,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
         help="further tests of the same material (relaxation, creep, sweep, shear waves): one Prony series for all",
     )
     command.add_argument("--table", metavar="NAME", help="which of several tables: its number, name or a part of it")
-    command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")
-    command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below it")
+    command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above this frequency")
+    command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below this frequency")
     shared_options.add_modes(command)
     command.add_argument(
         "--model",
@@ -81,7 +81,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     return command
 
 
-#: Value of `--master` without a temperature: the middle temperature is the reference.
+#: Value of the option --master without a temperature: the middle temperature is the reference.
 MIDDLE = "middle"
 
 
@@ -95,11 +95,11 @@ def _celsius(text: str) -> float | str:
 
 
 def _add_sample(command: argparse.ArgumentParser) -> None:
-    """Options of the sample between its plates and of its simulation."""
+    """Options for the sample between its plates, and for its simulation."""
     command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
     command.add_argument(
-        "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m]; it widens the errors of moduli"
+        "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m]; errors of moduli contain it"
     )
     command.add_argument(
         "--friction-error",
@@ -108,7 +108,7 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
         help="standard deviation of the friction of the instrument's bearing [N m s]: it is fitted too",
     )
     command.add_argument(
-        "--density", type=float, metavar="KG_M3", help="density of the sample, to take its inertia off (default: none)"
+        "--density", type=float, metavar="KG_M3", help="density of the sample, to subtract its inertia (default: none)"
     )
     command.add_argument(
         "--precompression",
@@ -144,13 +144,13 @@ def _add_outputs(command: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit the model; exit code 1 if the fit did not converge."""
+    """Fit the model. The exit code is 1 if the fit did not converge."""
     from fitting.methods import uncertainty
     from fitting.reports import sweep_report
 
     _check(options)
     if options.master is not None:
-        options.method = options.method or "closed-form"  # no plate was turned at the shifted frequencies
+        options.method = options.method or "closed-form"  # nothing was measured at the shifted frequencies
     elif len(options.sweep) > 1:
         from fitting.commands import samples
 
@@ -162,7 +162,7 @@ def run(options: argparse.Namespace) -> int:
     options.method = options.method or "torsion"
     shift: Content = {}
     shifted = ""
-    tests = _tests_to_predict(options)  # before the fit: a bad file would lose it
+    tests = _tests_to_predict(options)  # read before the fit: an error in a file must not lose the fit
     if options.master is None:
         sweep = shared_options.usable_sweep(options, options.sweep[0])
     else:
@@ -203,7 +203,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
-    """Write and print the master curve of the files; return it with its part of fit.json, and the printed table."""
+    """Write and print the master curve of the files. Return its sweep, its part of fit.json, and the printed table."""
     from fitting.master import master_curve, master_report, temperature_sweeps
     from fitting.readers import rheometer
 
@@ -224,7 +224,7 @@ def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
 
 
 def _tests_to_predict(options: argparse.Namespace) -> list["Measured"]:
-    """The tests that the fit is asked to predict."""
+    """The tests that the fit is to predict (--predict)."""
     if not options.predict:
         return []
     from fitting.commands.together import read_any
@@ -246,7 +246,7 @@ def _predictions(tests: list["Measured"], sweep: "Sweep", fit: "Fit") -> list[st
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse numbers that are impossible for a sample or a simulation."""
+    """Refuse values that are impossible for a sample or a simulation, and options that cannot be combined."""
     for name in ("radius", "height"):
         value = getattr(options, name)
         if value is not None and not 0 < value <= 0.2:
@@ -259,9 +259,9 @@ def _check(options: argparse.Namespace) -> None:
         )
     _check_friction(options)
     if options.density is not None and not 100 <= options.density <= 25000:
-        raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
+        raise InputError(f"--density {options.density} is not possible in kg/m^3: give e.g. --density 1060")
     if options.density is not None and options.method == "closed-form" and not (options.height or options.others):
-        raise InputError(f"--density {options.density:g} needs --height too: the inertia of the sample goes with both")
+        raise InputError(f"--density {options.density:g} needs --height too: the inertia of the sample depends on both")
     _check_precompression(options)
     _check_master(options)
     if len(options.sweep) > 1 and options.master is None:
@@ -285,7 +285,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _note_idle(options: argparse.Namespace) -> None:
-    """Print a note on options of the simulation that the closed form does not use."""
+    """Print a note on options that are for the simulation and have no effect on the closed form."""
     several = len(options.sweep) > 1 or bool(options.others) or options.master is not None
     if options.method == "torsion" or (options.method is None and not several):
         return
@@ -298,7 +298,7 @@ def _note_idle(options: argparse.Namespace) -> None:
 
 
 def _check_friction(options: argparse.Namespace) -> None:
-    """Refuse --friction-error without the sample's size, or with a fit that does not use it."""
+    """Refuse --friction-error if the size of the sample is missing, or if the fit does not use the friction."""
     error = options.friction_error
     if error is None:
         return
@@ -318,7 +318,7 @@ def _check_friction(options: argparse.Namespace) -> None:
 
 
 def _check_precompression(options: argparse.Namespace) -> None:
-    """Refuse an impossible compression, and options that do not go with a compression."""
+    """Refuse an impossible compression, and options that cannot be combined with a compression."""
     if options.precompression == 0:
         return
     from fitting.rigs import compression
@@ -340,7 +340,7 @@ def _check_precompression(options: argparse.Namespace) -> None:
 
 
 def _check_master(options: argparse.Namespace) -> None:
-    """Refuse options that do not go with a master curve."""
+    """Refuse options that cannot be combined with a master curve."""
     if options.master is None:
         if options.vertical:
             raise InputError("--vertical is for a master curve: give --master too")
@@ -352,7 +352,7 @@ def _check_master(options: argparse.Namespace) -> None:
         ("--precompression", options.precompression != 0),
     ):
         if asked:
-            raise InputError(f"--master shifts sweeps at all temperatures of the files: leave out {name}")
+            raise InputError(f"--master uses the sweeps at all temperatures of the files: leave out {name}")
 
 
 def _check_samples(options: argparse.Namespace) -> None:
@@ -371,7 +371,7 @@ def _check_samples(options: argparse.Namespace) -> None:
 
 
 def _check_together(options: argparse.Namespace) -> None:
-    """Refuse options that do not go with several tests."""
+    """Refuse options that cannot be combined with several tests."""
     for name, asked in (
         ("--method torsion", options.method == "torsion"),
         ("--profile", options.profile),
@@ -404,7 +404,7 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
-    """The fit in closed form, by default also the fit through the simulation, and the corrected sweep that they use."""
+    """The closed-form fit and, by default, the fit through the simulation; and the corrected sweep that both use."""
     from fitting.fits import instrument, sample_inertia, viscoelastic
     from fitting.fits.honesty import edges, total_error
     from fitting.methods import generalised_maxwell
@@ -429,7 +429,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     closed, corrected = instrument.without_error_of_inertia(closed, sweep)
     for note in corrected.notes[len(sweep.notes) :]:
         print(f"note: {note}", file=sys.stderr)
-    if options.gap_error:  # before the sentences that compare with the errors
+    if options.gap_error:  # before the sentences that use the errors
         closed = instrument.with_gap_error(closed, options.gap_error / simulation.height)
     if corrected is not sweep:
         dense = generalised_maxwell.spectrum(corrected)
@@ -440,13 +440,14 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         fits.append(_simulated(options, corrected, fits[0], simulation))
     for fit in fits:
         fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
-    for fit in fits if options.precompression else ():  # its errors contain those by the size of the sample
+    for fit in fits if options.precompression else ():  # its errors contain the errors from the size of the sample
         fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
     return fits, corrected
 
 
 def _simulated(options: argparse.Namespace, sweep: "Sweep", closed: "Fit", simulation: "Simulation") -> "Fit":
-    """The fit through the torsion simulation. With a density it is compared with moduli that contain the inertia."""
+    """The fit through the torsion simulation. If a density is given, the simulation is compared with moduli that
+    contain the inertia."""
     from fitting.fits import sample_inertia, simulated_rheometer
 
     density, height = simulation.density, simulation.height
@@ -476,20 +477,20 @@ def _simulation(options: argparse.Namespace) -> "Simulation":
 
 
 def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Posterior | None":
-    """Samples of the posterior of the last fit, if the user asks for them and the model has few numbers."""
+    """Samples of the posterior of the last fit, if the user asks for them and the model has only a few parameters."""
     from fitting.fits import posterior, sample_inertia
 
     if not options.samples:
         return None
     if fit.kind.prior is not None:
         print(
-            "note: --samples works with models of a few numbers only; the spectrum has its standard errors",
+            "note: --samples works only with models of a few parameters; for the spectrum, use its standard errors",
             file=sys.stderr,
         )
         return None
     if fit.method == "torsion":
         simulation = _simulation(options)
-        if simulation.density is not None:  # it shows moduli that contain the inertia
+        if simulation.density is not None:  # the simulated moduli contain the inertia
             inertia = (simulation.density, simulation.height)
             G = sample_inertia.shown(fit.storage + 1j * fit.loss, sweep.angular_frequency, *inertia)
             fit, sweep = fit._replace(storage=G.real, loss=G.imag), sample_inertia.put_back(sweep, *inertia)

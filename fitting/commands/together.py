@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit all tests in closed form; exit code 1 if the fit did not converge."""
+    """Fit all tests in closed form. The exit code is 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time
     from fitting.fits.honesty import total_error
     from fitting.fits.simulated_rheometer import Simulation
@@ -44,7 +44,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _without_sample_inertia(tests: "list[Measured]", density: float | None, height: float | None) -> "list[Measured]":
-    """The tests with the inertia of the sample taken off the sweeps, if its density and height are given."""
+    """The tests. The inertia of the sample is subtracted from the sweeps if the density and the height of the sample
+    are given."""
     from fitting.fits import sample_inertia
     from fitting.readers.frequency_sweep import Sweep
 
@@ -62,8 +63,8 @@ def _without_sample_inertia(tests: "list[Measured]", density: float | None, heig
 def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "Measured":
     """Read a file as a test in a rig, as shear waves, as a test in time, or as another sweep.
 
-    Another sweep is cut to the band that the user names, and points that the instrument spoils are left out, as in the
-    first sweep. A `whole` sweep is only predicted, so it is not cut.
+    Another sweep is cut to the band that the user gives. As in the first sweep, points at which the instrument
+    dominates are left out. A `whole` sweep is only predicted, so it is not cut.
     """
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion

@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from fitting.waves.kept_regions import Keep
 
 FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5", "progress_of_regions.h5")
-#: Largest memory of one factor [GB]; if a grid needs more, it is made coarser, or a larger --stride is demanded.
+#: Maximum memory of one matrix factor [GB]. A grid that needs more is made coarser; if --stride is given, a larger
+#: value is demanded.
 MOST_MEMORY = 4.0
-#: Longest length of a map over the organ's size: above it the map is uniform.
+#: Maximum correlation length of a map, divided by the size of the organ. Above it, the map would be uniform.
 LONGEST = 5.0
 
 
@@ -31,7 +32,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command = argparse.ArgumentParser(
         prog=prog,
         description="Find storage and loss modulus of an organ from harmonic waves on voxels (elastography): of the "
-        "whole, of regions, and as a map, each with standard deviations; also the usual direct inversion.",
+        "whole organ, of regions, and as a map, each with standard deviations. The usual direct inversion is computed "
+        "too.",
         epilog=EXIT_CODES,
     )
     command.add_argument(
@@ -48,7 +50,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--density", type=float, default=DENSITY, metavar="KG_M3", help=f"default {DENSITY:g}")
     command.add_argument("--stride", type=int, metavar="N", help="take means of N x N x N voxels (default: as needed)")
     command.add_argument("--no-map", action="store_true", help="only the whole and the regions")
-    command.add_argument("--length", type=float, metavar="M", help="the map varies over it [m] (default 2 bricks)")
+    command.add_argument("--length", type=float, metavar="M", help="correlation length [m] (default 2 bricks)")
     command.add_argument(
         "--samples", type=int, default=20, metavar="N", help="maps drawn from the posterior (default 20)"
     )
@@ -59,7 +61,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find moduli; exit code 1 if a fit did not converge."""
+    """Find the moduli. The exit code is 1 if a fit did not converge."""
     _check_waves(options)
     from fitting.reports.waves import report
     from fitting.waves import direct_inversion, elastography, stiffness_map, wave_field
@@ -98,7 +100,7 @@ def _check_length_of_map(length: float | None, organ: "Organ") -> None:
     size = float(np.ptp(np.asarray(organ.body.mesh.points), axis=0).max())
     if length is not None and length > LONGEST * size:
         raise InputError(
-            f"--length {length:g} m is much longer than the organ ({size:.2g} m), so that the map is uniform: give "
+            f"--length {length:g} m is much longer than the organ ({size:.2g} m), so the map would be uniform: give "
             f"metres, e.g. {size / 4:.1g}, or --no-map"
         )
 
@@ -114,13 +116,13 @@ def _kept_regions(options: argparse.Namespace, organ: "Organ") -> "Keep":
         for file in progress:  # of an earlier run
             file.unlink(missing_ok=True)
     elif not any(file.is_file() for file in progress):
-        print(f"note: {options.out} has nothing to resume: the search begins", file=sys.stderr)
+        print(f"note: {options.out} has no files to resume: a new search begins", file=sys.stderr)
     return kept_regions.kept_in(progress[1], options.resume, marks)
 
 
 @contextmanager
 def _forces_that_balance(data: Path) -> Iterator[None]:
-    """Raise an `InputError` with one clear sentence if the equations have no solution."""
+    """Raise an `InputError` with one sentence if the equations have no solution."""
     try:
         yield
     except np.linalg.LinAlgError:
@@ -131,7 +133,7 @@ def _forces_that_balance(data: Path) -> Iterator[None]:
 
 
 def _organ(options: argparse.Namespace, field) -> "Organ":
-    """The body of the voxels, made coarser if it does not fit into the memory."""
+    """The organ with the body of its voxels. The voxels are made coarser if they do not fit into the memory."""
     from fitting.waves import elastography, wave_field
 
     stride = options.stride or 1
@@ -148,14 +150,14 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
             )
         stride += 1
     if stride > 1:
-        print(f"note: means of {stride} x {stride} x {stride} voxels are taken", file=sys.stderr)
+        print(f"note: means of {stride} x {stride} x {stride} voxels are used", file=sys.stderr)
     for note in (*elastography.notes_on_gaps(coarse), *elastography.notes_on_layers(coarse)):
         print(f"note: {note}", file=sys.stderr)
     return elastography.organ_of(coarse, body, options.density)
 
 
 def _check_waves(options: argparse.Namespace) -> None:
-    """Refuse numbers that are impossible for a measurement."""
+    """Refuse values that are impossible for a measurement."""
     for name in ("length", "noise"):
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value > 0):

@@ -1,1 +1,1 @@
-"""The fits: sweeps, curves, several tests, maps of stiffness, numbers of scenes."""
+"""The fits: sweeps, curves, several tests, stiffness maps, parameters of scenes."""

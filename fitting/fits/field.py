@@ -1,12 +1,13 @@
-"""A map of stiffness from measured displacements: a smooth field of one number of the law, with its uncertainty.
+"""A stiffness map from measured displacements: a smooth field of one parameter of the law, with its uncertainty.
 
-The number of an element is the scene's number times exp(m). m is the element's mean of a nodal field (V,) with the
-prior of `fitting.methods.prior`. The minimum of chi^2/2 + |z|^2/2 over the whitened z is sought by Gauss-Newton in a
-trust region (Steihaug 1983). The Hessian I + J^T J is never made: each product needs a linearised run and its
-transpose. It is nowhere smaller than I, so the gradient's size is at least the distance to the minimum in standard
-deviations of the map. The prior's standard deviation of m is the regulariser's weight: it grows until chi^2 comes down
-to the number of measured components (discrepancy principle; Morozov 1966), or no longer falls. The uncertainty comes
-from the same Hessian. Lanczos iterations find its largest eigenvalues (Bui-Thanh et al. 2013).
+The parameter of an element is the value in the scene times exp(m). Here m is the mean over the element of a nodal field
+(V,) with the prior of `fitting.methods.prior`. A Gauss-Newton method in a trust region (Steihaug 1983) minimises
+chi^2/2 + |z|^2/2 over the whitened field z. The Hessian I + J^T J is never assembled: each product with it needs a
+linearised run and its transpose. No eigenvalue of this Hessian is below 1. The norm of the gradient is therefore an
+upper bound of the distance to the minimum, in standard deviations of the map. The prior's standard deviation of m sets
+the weight of the regularisation. This standard deviation grows until chi^2 is as low as the number of measured
+components (discrepancy principle; Morozov 1966), or until chi^2 no longer falls. The uncertainty comes from the same
+Hessian. Lanczos iterations find the largest eigenvalues of J^T J (Bui-Thanh et al. 2013).
 """
 
 import time
@@ -30,13 +31,13 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.scenes.scene import numbers_at
 
-#: Standard deviations of ln(modulus) to try, from a nearly uniform body to a free one.
+#: Standard deviations of ln(modulus) to try: from a nearly uniform body to a body whose stiffness may vary strongly.
 DEVIATIONS = (0.1, 0.2, 0.4, 0.8, 1.6)
-#: If the next deviation lowers chi^2 by less than this part, the search ends.
+#: If the next standard deviation lowers chi^2 by less than this fraction, the search ends.
 _WORTH = 0.02
-#: The search ends where the gradient says that the minimum is nearer than this, in standard deviations of the map.
+#: The search ends if the norm of the gradient is below this distance to the minimum, in standard deviations of the map.
 _NEAR = 0.05
-#: A map that is farther than this from its minimum has not converged.
+#: A map farther than this from its minimum has not converged (in standard deviations of the map).
 FAR = 0.1
 
 
@@ -48,21 +49,21 @@ class Field(NamedTuple):
     modulus: np.ndarray  # modulus of the elements (E,)
     sd: np.ndarray  # of m at the nodes (V,), with the data
     prior_sd: np.ndarray  # of m at the nodes (V,), without data
-    mesh_bias: np.ndarray | None  # part of m (V,) that the meshes cause: subtract it to correct; None: not known
+    mesh_bias: np.ndarray | None  # error of m (V,) by the meshes, to be subtracted from m; None: not known
     deviation: float  # standard deviation of the prior that was chosen
     length: float  # correlation length [m]
     chi2: float
     components: int
     reached: bool  # whether chi^2 came down to the number of components
-    distance: float  # to the minimum, in standard deviations of the map: the length of the next Gauss-Newton step
+    distance: float  # distance to the minimum: length of the next Gauss-Newton step, in standard deviations
     history: list[dict]  # one row per deviation: chi2, iterations, evaluations, seconds
-    eigenvalues: np.ndarray  # of J^T J in whitened z: the data determine directions above 1
+    eigenvalues: np.ndarray  # of J^T J in whitened z: the data determine the directions with eigenvalues above 1
     codes: tuple[int, ...]
     seconds: float
 
 
 def start_of(problem: Problem, name: str) -> jax.Array:
-    """The numbers of the elements (E,) before the fit.
+    """Values of the parameter at the elements (E,) before the fit.
 
     Raises:
         InputError: the scenes have different meshes, or `name` is not a positive number.
@@ -76,19 +77,20 @@ def start_of(problem: Problem, name: str) -> jax.Array:
     if isinstance(base, tuple) or jnp.ndim(base) > 1 or (jnp.ndim(base) == 1 and base.shape != (E,)):
         raise InputError(f"a field of {name!r} needs one number: name one of the list, e.g. {name}.0")
     if not np.all(np.asarray(base) > 0):
-        raise InputError(f"a field of {name!r} needs a positive number to begin with: change it in the scene")
+        raise InputError(f"a field of {name!r} must begin at a positive value: change the value in the scene")
     return jnp.broadcast_to(base, (E,))
 
 
 def values_at(problem: Problem, name: str, base: jax.Array, m: jax.Array) -> dict[str, jax.Array]:
-    """Numbers of the elements for the nodal field m (V,), by name."""
+    """Values of the parameter at the elements for the nodal field m (V,), by the name of the parameter."""
     corners = m[problem.scenes[0].mesh.tetrahedra]
     return {name: base * jnp.exp(jnp.mean(corners, axis=1))}
 
 
 @partial(jax.jit, static_argnames="name")
 def _linearised(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> Any:
-    """The residuals (n,) of the runs at m, their linear map J from changes of m, and the codes of the runs."""
+    """The residuals (n,) of the runs at m, the linear map J from changes of m to changes of the residuals, and the
+    codes of the runs."""
     return jax.linearize(lambda m: misfit(problem, values_at(problem, name, base, m)), m, has_aux=True)
 
 
@@ -103,7 +105,8 @@ def _pulled(J: Callable, r: jax.Array, m: jax.Array) -> jax.Array:
 
 
 class _LinearRuns(NamedTuple):
-    """The runs, linearised at a whitened field z: products with J, its derivatives by z, and its transpose."""
+    """The runs, linearised at a whitened field z: products with the Jacobian of the residuals by z, and with its
+    transpose."""
 
     p: smooth.Prior
     deviation: float
@@ -116,13 +119,13 @@ class _LinearRuns(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        """Whether the runs have an answer."""
+        """Whether the residuals and their derivatives are finite."""
         numbers = np.all(np.isfinite(self.r)) and np.all(np.isfinite(self.slope))
         return bool(numbers and status.NOT_FINITE not in self.codes)
 
     @property
     def cost(self) -> float:
-        """(chi^2 + |z|^2)/2; infinite without an answer: the search goes back."""
+        """(chi^2 + |z|^2)/2. If the runs are not finite, the cost is infinite and the search goes back."""
         return float(0.5 * (self.r @ self.r + self.z @ self.z)) if self.finite else np.inf
 
     def push(self, z: np.ndarray) -> jax.Array:
@@ -134,7 +137,7 @@ class _LinearRuns(NamedTuple):
         return self.deviation * smooth.to_whitened(self.p, np.asarray(_pulled(self.J, jnp.asarray(r), self.m)))
 
     def gradient(self) -> np.ndarray:
-        """Of the cost, by z (V,)."""
+        """The gradient of the cost by z (V,)."""
         return self.z + (self.slope if self.finite else 0.0)
 
     def hessian(self, z: np.ndarray) -> np.ndarray:
@@ -143,7 +146,7 @@ class _LinearRuns(NamedTuple):
 
 
 class _Search:
-    """State of a search: the functions that the minimiser calls, and the file from which a run is resumed."""
+    """State of a search: the functions that the minimiser calls, and the file from which a stopped run can go on."""
 
     def __init__(
         self, problem: Problem, name: str, base: jax.Array, p: smooth.Prior, file: Path | None, progress: Callable
@@ -151,14 +154,14 @@ class _Search:
         self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
         self.history: list[dict[str, float]] = []
         self.k, self.z = 0, np.zeros(len(p.root_mass))
-        self.last: list[_LinearRuns] = []  # two: a trial, and the point from which it was tried
+        self.last: list[_LinearRuns] = []  # a trial point, and the point from which the trial began
         self.evaluations = 0
         self.marks = {
             "name": name,
             "length": float(p.scale),  # the prior's scale is a power of the length
             "noise": mark_of(*(d.sd for d in problem.data)),
             "displacements": mark_of(*(a for d in problem.data for a in d._replace(sd=d.step))),
-            "search": "trust region",  # files of other searches may end elsewhere
+            "search": "trust region",  # files of other search methods may end at other points
             "scene": mark_of(base, *jax.tree.leaves(problem.scenes)),
         }
 
@@ -173,7 +176,7 @@ class _Search:
         self.evaluations += 1
         here = _LinearRuns(self.p, deviation, z.copy(), m, np.asarray(r), J, z, tuple(int(c) for c in codes))
         here = here._replace(slope=here.pull(here.r))
-        base = [one for one in self.last if np.array_equal(one.z, self.z)]  # trials begin there until one is lower
+        base = [one for one in self.last if np.array_equal(one.z, self.z)]  # trials begin there until a cost is lower
         self.last = [here, *(base or self.last)[:1]]
         return here
 
@@ -185,7 +188,7 @@ class _Search:
         self.progress(self.k, float(r @ r) / self.problem.components)
 
     def write(self) -> None:
-        """Write the current point; the file is never left half written."""
+        """Write the current point. The file is replaced as a whole, so it is never half written."""
         if self.file is None:
             return
         with whole(self.file) as new, h5py.File(new, "w") as f:
@@ -207,7 +210,7 @@ class _Search:
                 self.z, self.k = f["z"][:], int(f["k"][()])
                 self.history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
         except (OSError, KeyError):  # not HDF5, or from another program
-            raise InputError(f"{self.file} belongs to another fit: leave out --resume or name another --out") from None
+            raise InputError(f"{self.file} belongs to another fit: leave out --resume, or give another --out") from None
 
 
 _HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "seconds")
@@ -216,9 +219,9 @@ _HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "sec
 class MapOptions(NamedTuple):
     """Options of the search for a map, and of the file that keeps its progress."""
 
-    max_iterations: int = 60  # most iterations for each deviation of the prior
-    modes: int = 60  # most directions of the field for which the uncertainty is computed
-    file: Path | None = None  # HDF5 file for the point of every iteration; None: no file
+    max_iterations: int = 60  # maximum number of iterations for each deviation of the prior
+    modes: int = 60  # maximum number of directions with a computed uncertainty
+    file: Path | None = None  # HDF5 file, written after every iteration; None: no file
     resume: bool = False  # begin from that file if it exists
     #: Called after each iteration with the index of the deviation and chi^2 per component.
     progress: Callable[[int, float], None] = lambda weight, chi2: None
@@ -232,17 +235,17 @@ def estimate(
     options: MapOptions = MapOptions(),
     **changes: Any,
 ) -> Field:
-    """The field of `name` that explains the data.
+    """Estimate the field of the parameter `name` from the data.
 
     Args:
         problem: scenes with one mesh, and the measurements.
-        name: dotted name of a positive number of the law; the field begins at its value in the scenes.
+        name: dotted name of a positive parameter of the law. The field begins at its value in the scenes.
         length: correlation length of the prior [m].
         options: how to search, see `MapOptions`.
         changes: fields of `options` by their names, for example ``max_iterations=40``.
 
     Raises:
-        InputError: as `start_of`; or `file` belongs to another fit.
+        InputError: see `start_of`; or `file` belongs to another fit; or the scene cannot be computed at the start.
     """
     begin = time.perf_counter()
     base, problem = start_of(problem, name), with_solvers(problem, {})
@@ -280,9 +283,9 @@ def estimate(
 
 
 def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
-    """Try one deviation after another, each from the last field, until chi^2 is down to the noise."""
+    """Try one deviation after another until chi^2 is as low as the noise. Each search begins at the last field."""
     while True:
-        # A row of a finished search is there already if a run was stopped after it.
+        # If a run was stopped after this search had finished, the row of this search exists already.
         finished = len(search.history) > search.k and search.history[search.k]["iterations"] < max_iterations
         if not finished:
             search.history = [*search.history[: search.k], _minimised(search, max_iterations)]
@@ -318,13 +321,13 @@ def _measured_directions(here: _LinearRuns, n: int, modes: int) -> tuple[np.ndar
     """Largest eigenvalues (k,) of J^T J in whitened z, and their directions (n, k)."""
     k = min(modes, n - 2, len(here.r))
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=lambda z: here.pull(here.push(z)), dtype=float)
-    # The prior determines directions with an eigenvalue far below 1: they need no accuracy.
+    # The prior determines the directions with an eigenvalue far below 1: these eigenvalues need not be accurate.
     values, vectors = scipy.sparse.linalg.eigsh(operator, k=k, ncv=min(n, 2 * k + 1), tol=1e-2, v0=np.ones(n))
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
 
 
 def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """(I + J^T J)^-1 g (V,), to 1 %: what it is used for is of first order only."""
+    """(I + J^T J)^-1 g (V,), with a relative tolerance of 1 %. This is enough for estimates of first order."""
     n, shrink = len(g), values / (1 + values)
 
     def solved(z: np.ndarray) -> np.ndarray:
@@ -337,7 +340,8 @@ def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: n
 
 
 def _bias_of_map(search: _Search, here: _LinearRuns, values: np.ndarray, vectors: np.ndarray) -> np.ndarray | None:
-    """The change of the field m (V,) by the meshes: (I + J^T J)^-1 J^T times their error in the residuals."""
+    """The change of the field m (V,) by the error of the meshes: (I + J^T J)^-1 J^T times this error in the residuals.
+    None if this error is not known."""
     left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, here.m))
     if left_out is None or not np.all(np.isfinite(left_out)):
         return None
@@ -355,7 +359,8 @@ def distance_sentence(found: Field) -> str | None:
     )
 
 
-#: Least standard deviation of the logarithm, at the best known node, from which the data leave the map's level open.
+#: If the standard deviation of the logarithm exceeds this value even at the best known node, the data do not determine
+# the level of the map.
 OPEN = 0.5
 
 
@@ -365,14 +370,15 @@ def level_sentence(found: Field) -> str | None:
     if not least > OPEN:
         return None
     return (
-        f"the data leave the level of the map open: at no node is it known better than to a factor of "
-        f"{np.exp(least):.2g}; motions alone determine ratios, so give a traction or a measured force"
+        "the data do not determine the level of the map: at no node is the map known better than to a factor of "
+        f"{np.exp(least):.2g}; displacements alone determine only ratios of moduli, so give a traction or a measured "
+        "force"
     )
 
 
 def bias_sentence(found: Field) -> str | None:
-    """A sentence if the mesh moves the map by more than its standard deviation at some node; None if it does not, or if
-    this is not known.
+    """A sentence if the mesh error moves the map at some node by more than the standard deviation there. None if it
+    does not, or if the mesh error is not known.
     """
     if found.mesh_bias is None:
         return None
@@ -381,8 +387,8 @@ def bias_sentence(found: Field) -> str | None:
         return None
     largest = np.abs(found.mesh_bias)[beyond].max()
     if largest > LARGEST_BIAS:
-        return f"the mesh moves the map by a third or more ({largest:.0%}): too much to be corrected; refine the mesh"
+        return f"the mesh error moves the map by a third or more ({largest:.0%}): too much to correct; refine the mesh"
     return (
-        f"the mesh moves the map by up to {largest:.0%}, and by more than the standard deviation at "
-        f"{beyond.mean():.0%} of the nodes: subtract mesh_bias from its logarithm, or refine the mesh"
+        f"the mesh error moves the map by up to {largest:.0%}, and by more than the standard deviation at "
+        f"{beyond.mean():.0%} of the nodes: subtract mesh_bias from the logarithm of the map, or refine the mesh"
     )

@@ -1,9 +1,9 @@
-"""A stiff or soft sphere in a uniform body, from measured displacements: where, how large, how stiff.
+"""A stiff or soft sphere in a uniform body: its place, size and stiffness are estimated from measured displacements.
 
-The sphere has few parameters, unlike a map. A smooth map spreads a sharp edge, so its peak does not measure the modulus
-of an inclusion. The map only gives the start. The edge is smooth over a length in proportion to the element size, so
-the residuals can be differentiated by the sphere's place. Errors of radius and modulus compensate each other: the
-elements should be much smaller than the sphere, or quadratic.
+Unlike a map, the sphere has few parameters. A smooth map spreads a sharp edge, so its peak is not the modulus of an
+inclusion. The map only gives the start values. The edge of the sphere is smooth over a length in proportion to the
+element size, so the residuals have derivatives by the position of the sphere. Errors of radius and modulus compensate
+each other. The elements should therefore be quadratic, or much smaller than the sphere.
 """
 
 from typing import Any
@@ -19,19 +19,20 @@ from liverjax.core.struct import Number
 from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Width of the edge divided by the mean distance of two integration points.
+#: Width of the edge divided by the mean distance between neighbouring integration points.
 _EDGE = 0.25
 NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion")
 
 
 def edge_width(mesh: TetMesh) -> float:
-    """Width of the edge [m]: a quarter of the distance of two points at which the elements are integrated."""
+    """Width of the edge [m]: a quarter of the mean distance between neighbouring integration points."""
     size = float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
     return _EDGE * size / mesh.order
 
 
 def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> jax.Array:
-    """The part of each element (E,) inside the sphere: 1 inside, 0 outside, smooth between; a mean over its points."""
+    """The part of each element (E,) inside the sphere: 1 inside, 0 outside, smooth between. It is a mean over points in
+    the element."""
     corners = mesh.points[mesh.tetrahedra]
     L = np.full((4, 1), 0.25) if mesh.order == 1 else basis(mesh.order).L
     points = jnp.einsum("kq,eki->qei", L, corners)
@@ -40,9 +41,9 @@ def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> j
 
 
 def start_from(problem: Problem, field: Field) -> np.ndarray:
-    """Start u of the sphere from the map: elements whose ln(modulus) differs from the background by more than half of
-    the largest difference, both in standard deviations of the map. A weak prior leaves large values where the data tell
-    little, at corners for example.
+    """Start u of the sphere from the map. The sphere consists of the elements whose ln(modulus) differs from the
+    background by more than half of the largest difference. Both differences are in standard deviations of the map: with
+    a weak prior, the map may have large values where the data tell little, for example at corners.
     """
     mesh = problem.scenes[0].mesh
     middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
@@ -62,13 +63,12 @@ def start_from(problem: Problem, field: Field) -> np.ndarray:
 
 
 def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> Estimate:
-    """Centre and radius [m] of the sphere, the number `name` outside and inside, with standard errors.
+    """Centre and radius [m] of the sphere, and the parameter `name` outside and inside, with standard errors.
 
     Args:
         problem: scenes with one mesh, and the measurements.
-        name: dotted name of a positive number of the law.
-        start: centre (3,), ln(radius), and logarithms of the background over the scene's number, and of the sphere's
-            over the background's, (6,).
+        name: dotted name of a positive parameter of the law.
+        start: (6,) centre (3,), ln(radius), ln(background / value in the scene), ln(inclusion / background).
         options: options of `fitting.fits.scene_numbers.fit`.
     """
     base, mesh = start_of(problem, name), problem.scenes[0].mesh

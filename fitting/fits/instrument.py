@@ -1,10 +1,11 @@
-"""Errors of the instrument in a fit, shared by all points: inertia, friction, gap, each with a prior; and compression.
+"""Errors of the instrument that all points of a fit share (inertia, friction, gap), each with a prior. Also the fit of
+a compressed sample.
 
 The instrument subtracts its inertia I. If its true inertia is I (1 + delta), G' is too small by delta I omega^2 / K.
-Without a prior, such a term would fit the model's misfit. Here delta has a normal prior around 0 with the standard
-deviation `raw_torque.UNCERTAINTY`. It is fitted only if the file has raw columns, and it is used only if it stays the
-same when the end of the band is left out. The friction b of the bearing adds b omega / K to G''; its error has a normal
-prior around 0 with the standard deviation that the user gives.
+Without a prior, this term would fit the misfit of the model. Here delta has a normal prior around 0 with the standard
+deviation `raw_torque.UNCERTAINTY`. delta is fitted only if the file has raw columns. It is used only if it stays the
+same when the upper end of the band is left out. The friction b of the bearing adds b omega / K to G''. The error of b
+has a normal prior around 0 with the standard deviation that the user gives.
 """
 
 from typing import Any, NamedTuple
@@ -23,11 +24,13 @@ from fitting.readers.frequency_sweep import Sweep, some
 from fitting.rigs import compression
 from liverjax import laws
 
-#: Standard error of an error of the instrument, over that before, from which the data do not tell it.
+#: If the standard error of an instrument error, divided by its prior standard deviation, is at least this, the data do
+#: not determine the instrument error.
 UNTOLD = 0.9
-#: Most rounds of fit and correction, and most halvings of a correction that would leave a modulus of 0 or less.
+#: Maximum number of rounds of fit and correction; and maximum number of halvings of a correction that would make a
+#: modulus 0 or negative.
 ROUNDS, HALVINGS = 20, 30
-#: Step in standard deviations of the prior that is none: exact data have no error with which to compare.
+#: A step below this many prior standard deviations counts as 0. Exact data have no standard error to compare it with.
 SETTLED = 1e-6
 
 
@@ -40,7 +43,7 @@ class Nuisance(NamedTuple):
 
     @property
     def reported(self) -> str:
-        """Its name in fit.json, for what is true less what was subtracted."""
+        """Its name in fit.json. The value there is the true quantity minus the subtracted quantity."""
         return "friction_off_by_N_m_s" if self.name == "friction" else "inertia_off_by"
 
     def told(self, deviations: float) -> str:
@@ -49,12 +52,12 @@ class Nuisance(NamedTuple):
         return _cent(value) if self.name == "inertia" else f"{value:.2g} N m s"
 
     def compared(self, deviations: float) -> str:
-        """What is true beside what was subtracted, for a sentence."""
+        """Comparison of the true quantity with the subtracted quantity, as text for a sentence."""
         return f"{self.told(abs(deviations))} {'larger' if deviations > 0 else 'smaller'} than what it subtracted"
 
 
 class InstrumentErrors(NamedTuple):
-    """Errors of what the instrument subtracted, in standard deviations of their priors."""
+    """Errors of the quantities that the instrument subtracted, in standard deviations of their priors."""
 
     values: np.ndarray  # (k,)
     covariance: np.ndarray  # (k, k)
@@ -64,14 +67,15 @@ class InstrumentErrors(NamedTuple):
 
     @property
     def steady(self) -> np.ndarray:
-        """Which errors (k,) were found, and change by at most two standard errors without the last half decade."""
+        """For each instrument error (k,): whether it was found, and changes by at most two standard errors if the last
+        half decade of the sweep is left out."""
         if self.part is None or self.part_errors is None or not self.found:
             return np.zeros(len(self.values), bool)
         return np.abs(self.values - self.part) <= 2 * self.part_errors
 
 
 def nuisances_of(sweep: Sweep) -> list[Nuisance]:
-    """The errors of the instrument for which the sweep has the inertia or the friction."""
+    """The errors of the instrument (inertia, friction) for which the sweep has data."""
     out = []
     if sweep.inertia is not None:
         out.append(Nuisance("inertia", raw_torque.UNCERTAINTY * sweep.inertia + 0j, raw_torque.UNCERTAINTY))
@@ -83,8 +87,8 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
 def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     """Fit the instrument's errors together with the Prony modes; return the fit and the corrected sweep.
 
-    Fit and sweep stay as they are if the sweep has no data of the instrument, or if the model has no free Prony modes.
-    If one of the errors changes with the band, all of them are reported but not used.
+    Fit and sweep are returned unchanged if the sweep has no data of the instrument, or if the model has no free Prony
+    modes. If one of the errors changes with the band, all errors are reported but none is used.
     """
     known = nuisances_of(sweep)
     if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
@@ -116,7 +120,8 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
 
 
 def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
-    """The errors fitted together with the modes, and the correction (k,) of the sweep in their standard deviations."""
+    """The instrument errors that were fitted together with the modes, and the correction (k,) of the sweep in standard
+    deviations of their priors."""
     told = fit.details.get("instrument")
     if told is None or told["moves_with_the_band"]:
         return [], np.zeros(0)
@@ -125,7 +130,7 @@ def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
 
 
 def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]:
-    """A sentence on each error that changes with the band, or that was not found."""
+    """A sentence on each instrument error that changes with the band, or one sentence if the errors were not found."""
     out, e = [], np.sqrt(np.diag(errors.covariance))
     if not errors.found:
         each = " and ".join(n.name for n in known)
@@ -167,7 +172,7 @@ def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[s
 
 
 def directions(sweep: Sweep, known: list[Nuisance]) -> np.ndarray:
-    """Change of the residuals (2n, k) by one standard deviation of each error."""
+    """Change of the residuals (2n, k) if each instrument error changes by one standard deviation of its prior."""
     scales = np.concatenate(sweep.deviations)
     return np.stack([np.concatenate([n.moved.real, n.moved.imag]) / scales for n in known], axis=1)
 
@@ -178,8 +183,8 @@ def _shifted(sweep: Sweep, known: list[Nuisance], values: np.ndarray) -> Sweep:
 
 
 def _with_noise_as_measured(sweep: Sweep) -> Sweep:
-    """The sweep with the noise of what was measured as weights: a correction takes a part of the moduli away, but not
-    its noise.
+    """The sweep whose weights come from the noise of the measured moduli. A correction subtracts a part of the moduli,
+    but not the noise of this part.
     """
     if sweep.storage_sd is not None:
         return sweep
@@ -198,9 +203,9 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
         J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
         noise = max(fit.uncertainty.noise, 1e-12)
         d = directions(here, known)
-        own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # the part that the modes cannot fit
+        own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # the part of d that the modes cannot fit
         precision = own.T @ own / noise**2 + np.eye(len(known))
-        # The prior is on the whole error; the residuals show the part that is not corrected yet.
+        # The prior holds for the whole error, but the residuals contain only the part that is not corrected yet.
         whole = np.linalg.solve(precision, own.T @ r / noise**2 - values)
         covariance = np.linalg.inv(precision)
         step = _halved_until_positive(sweep, known, values, whole)
@@ -212,14 +217,14 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
 
 
 def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:
-    """The modes fitted to other moduli, from where they are."""
+    """The modes fitted to other moduli, starting from their present values."""
     return viscoelastic.modes_from(sweep, fit.solution.u[None], fit.kind)._replace(details=fit.details)
 
 
 def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:
     """The step, halved until all corrected moduli are positive; 0 if no part of it is possible.
 
-    The modes explain a part of a large error, so the first step may be far too long.
+    The modes can fit a part of a large error, so the first step may be far too long.
     """
     for _ in range(HALVINGS):
         moved = _shifted(sweep, known, values + step)
@@ -255,12 +260,13 @@ def with_gap_error(fit: Fit, relative: float) -> Fit:
 
 
 def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) -> Fit:
-    """The fit in closed form of a compressed sample, with the numbers of the sample at rest.
+    """The closed-form fit of a compressed sample, with the parameters of the sample at rest (not compressed).
 
-    Storage modulus, loss modulus and residuals of the fit still are those of the compressed sample.
+    Storage modulus, loss modulus and residuals of the fit still describe the compressed sample.
 
     Args:
-        fit: fit of the measured moduli. Moduli among its own numbers are divided by the factors, too.
+        fit: fit of the measured moduli. If the model has parameters that are moduli, they are divided by the factors
+            too.
         sweep: the measured moduli.
         factors: factors by which the compression changes the relaxing and the equilibrium moduli.
     """
@@ -292,7 +298,8 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
 
 
 def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
-    """The kind whose u describe the sample at rest: relaxing and equilibrium part are divided by their factors."""
+    """The kind whose variables u describe the sample at rest: its relaxing part and its equilibrium part are divided by
+    their factors."""
     seen, shown, moduli = kind.maxwell, kind.values, kind.moduli
     if shown is None or moduli is None:
         return kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
@@ -309,7 +316,8 @@ def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
 
 
 def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, object]]:
-    """New Prony modes for a model at rest: the modes of the measured moduli mix relaxing and equilibrium part."""
+    """New Prony modes for the model of the sample at rest. The modes of the measured moduli cannot be used: they mix
+    the relaxing and the equilibrium part."""
     own, omega = kind.moduli, sweep.angular_frequency
     assert own is not None
     solid = kind.names[0] == "equilibrium_modulus"
@@ -347,6 +355,6 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
 
 
 def _changed(fit: Fit, before: compression.Shares, after: compression.Shares) -> float:
-    """G0 by the factors `after` over G0 by the factors `before`; both parts of the measured moduli stay."""
+    """Ratio of G0 with the factors `after` to G0 with the factors `before`. The measured moduli do not change."""
     stands = float(fit.model.equilibrium_modulus) / float(fit.model.shear_modulus)
     return (1 - stands) * before.relaxing / after.relaxing + stands * before.equilibrium / after.equilibrium

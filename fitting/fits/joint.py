@@ -1,7 +1,7 @@
-"""One set of Prony parameters from several tests at once: a sweep, creep, tension, indentation, each with its noise.
+"""One set of Prony parameters from several tests at once (sweep, creep, tension, indentation), each with its own noise.
 
-Residuals of all tests, divided by their noise, are minimised together by Levenberg-Marquardt (forward mode through
-every rig); the law is scaled to G0, as in the torsion fit.
+Residuals of all tests, divided by their noise, are minimised together by Levenberg-Marquardt (forward-mode derivatives
+through every rig). The law is scaled to G0, as in the torsion fit.
 """
 
 import time
@@ -41,7 +41,8 @@ class Test(NamedTuple):
 
 
 def sweep(data: Sweep) -> Test:
-    """A frequency sweep in closed form; its noise is from the file, or from the misfit of the best Prony modes."""
+    """A frequency sweep in closed form. Its noise comes from the file, or else from the misfit of the best Prony
+    modes."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
@@ -62,26 +63,29 @@ def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.
 
 
 def _noise_of(data: Sweep) -> np.ndarray:
-    """Standard deviations (2n,) [Pa] of the moduli. Without standard deviations in the file the scales are only
-    weights, and the misfit of Prony modes gives the noise.
+    """Standard deviations (2n,) [Pa] of the moduli. If the file has no standard deviations, the scales are only
+    weights. Then the misfit of Prony modes gives the noise.
     """
     scales = np.concatenate(data.deviations)
     if data.noise_given:
         return scales
     _, tried = viscoelastic.choose_modes(data, generalised_maxwell.refuse_impossible(data))
-    # Modes that this sweep does not determine count too: the other tests may determine them.
+    # Fits with modes that this sweep does not determine count too: the other tests may determine these modes.
     return scales * max(QUIETEST, min(fit.uncertainty.noise for fit in tried))
 
 
 def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
-    """A test in a rig of `fitting.rigs.glued`: readings (T,) [N] or [m] and their noise, a number or (T,).
+    """A test in a rig of `fitting.rigs.glued`, with readings (T,) [N] or [m] and the standard deviation of their noise:
+    one number, or (T,).
 
     Raises:
-        InputError: the readings are not as many as the rig's steps, or the noise is not positive.
+        InputError: the number of readings differs from the number of steps of the rig, or the noise is not positive.
     """
     measured = np.asarray(measured, float)
     if measured.shape != (rig.scene.solve.steps,):
-        raise InputError(f"{name}: {measured.size} readings for {rig.scene.solve.steps} steps: give one per step")
+        raise InputError(
+            f"{name}: {measured.size} readings for {rig.scene.solve.steps} steps: give one reading per step"
+        )
     if np.shape(sd) not in ((), measured.shape):
         raise InputError(f"{name}: sd has shape {np.shape(sd)}: give one number, or one per reading {measured.shape}")
     sd = np.broadcast_to(np.asarray(sd, float), measured.shape)
@@ -103,17 +107,17 @@ def fit(
     max_iterations: int = 30,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Estimate:
-    """The Maxwell parameters that explain all tests, with standard errors (names of `uncertainty.parameter_names`).
+    """Fit the Maxwell parameters to all tests, with standard errors. `uncertainty.parameter_names` gives their names.
 
-    If tests are simulated in rigs, `mesh_bias` is the part of each value that their meshes cause: subtract it to
-    correct. A warning is given if it is more than the standard error.
+    If tests are simulated in rigs, `mesh_bias` is the error of each value that the meshes cause. Subtract it to correct
+    the value. A warning is given if it is larger than the standard error.
 
     Args:
         tests: one or more.
         start: first values of the parameters; the number of modes does not change.
-        law: the law of all tests; the fit scales it to G0.
-        part: part of the stress that relaxes, as in `Prony`.
-        max_iterations, progress: as in `levenberg_marquardt_host`.
+        law: one law for all tests. The fit scales its shear modulus to G0.
+        part: which part of the stress relaxes, see `Prony`.
+        max_iterations, progress: see `levenberg_marquardt_host`.
     """
     _check_joint(tests, start, law)
     begin = time.perf_counter()
@@ -157,7 +161,7 @@ def fit(
 
 
 def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law: Law) -> None:
-    """Refuse a start from which no search can begin."""
+    """Refuse invalid tests, an invalid law or an invalid start."""
     if not tests:
         raise InputError("tests is empty: give one test or more")
     if not callable(getattr(law, "shear_modulus", None)):
@@ -165,7 +169,8 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
     ratios, times = (np.atleast_1d(np.asarray(v, float)) for v in (start.ratios, start.relaxation_times))
     if ratios.shape != times.shape or ratios.ndim != 1:
         raise InputError(
-            f"start has {ratios.size} ratios and {times.size} relaxation_times: give each mode one of both"
+            f"start has {ratios.size} ratios and {times.size} relaxation_times: give one ratio and one time for each "
+            "mode"
         )
     if not (np.isfinite(start.shear_modulus) and start.shear_modulus > 0):
         raise InputError(f"start: shear_modulus = {start.shear_modulus} must be above 0 Pa: give e.g. 1000.0")
@@ -176,7 +181,7 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> np.ndarray:
-    """Errors (n,) of the readings by their meshes, divided by the noise."""
+    """Errors (n,) of the readings that the meshes cause, divided by the standard deviation of the noise."""
     return np.concatenate(
         [
             np.zeros(len(test.sd)) if test.mesh_error is None else np.asarray(test.mesh_error(*material)) / test.sd

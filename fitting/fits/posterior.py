@@ -1,12 +1,12 @@
 """Samples of the posterior of a fit, from the data and a stated prior.
 
-The likelihood is that of the fit: independent errors on the given scales. Their size s is integrated out. If the data
-have no standard deviations, the prior of s is 1 / s. If they have, it is 1 / s for s > 1: the deviations may be
-enlarged, never reduced.
+The likelihood is the same as in the fit: the errors are independent, with the given scales times a common factor s.
+This factor s is integrated out, with the prior 1 / s. If the data have standard deviations, the prior is 1 / s for s >
+1 and else 0: the standard deviations may be enlarged, but never reduced.
 
-Errors of the instrument that are fitted together with the modes of a sweep are numbers of the posterior too, with their
-priors. A sweep does not determine the gap, so the gap's error is drawn independently: one factor for all moduli of a
-draw.
+If errors of the instrument are fitted together with the modes of a sweep, the posterior contains these errors too, with
+their priors. A sweep does not determine the gap. So the error of the gap is drawn independently, as one factor for all
+moduli of a draw.
 """
 
 import time
@@ -35,9 +35,9 @@ from fitting.readers.rheometer import Sweep
 from fitting.readers.time_tests import TimeTest
 from liverjax.core.compiled import compiled
 
-#: The prior of relaxation times ends this factor beyond the times that the data resolve.
+#: The prior of relaxation times extends by this factor beyond the times that the data resolve.
 BEYOND = 10.0
-#: The prior of the moduli of a fractional model ends this factor beyond the measured ones.
+#: The prior of the moduli of a fractional model extends by this factor beyond the measured moduli.
 MODULI_BEYOND = 1e3
 PRIORS = {
     "prony": "G0 log-uniform from the smallest measured modulus to 1000 times the largest; relaxation times "
@@ -49,19 +49,19 @@ PRIORS = {
 
 
 class Posterior(NamedTuple):
-    """Draws of the reported numbers."""
+    """Draws of the reported parameters."""
 
     names: tuple[str, ...]
     draws: np.ndarray  # (chains, N, K)
     r_hat: np.ndarray  # (K,)
-    chains: Chains  # the same draws in the coordinates of the fit, and how they were found
+    chains: Chains  # the same draws in the coordinates of the fit, with details of the sampling
     prior: str  # in words
     seconds: float
     simulated: dict[str, float] | None = None  # number of simulated draws, and their largest difference
     times: tuple[float, float] | None = None  # ends [s] of the prior of relaxation times
 
     def warnings(self) -> list[str]:
-        """Warnings if there are too few draws, if the prior cuts the posterior, or if the linear rig is not accurate
+        """Warnings if the chains do not agree, if the prior cuts the posterior, or if the linear rig is not accurate
         enough.
         """
         worst = int(np.argmax(self.r_hat))
@@ -99,23 +99,24 @@ class Posterior(NamedTuple):
         return out
 
 
-#: Ratio to an end of the prior that is near it, and the part of the draws near it that is told.
+#: A draw within this factor of an end of the prior is near it; and the part of draws near an end that is reported.
 NEAR, CUT = 1.25, 0.025
-#: R-hat below which the chains agree, and the smallest relative error of data: with none a posterior is a point.
+#: R-hat below which the chains agree; and the smallest relative error of data. Without any error, the posterior would
+#: be a point.
 AGREED, QUIETEST = 1.01, 1e-6
 
 
 class Target(NamedTuple):
-    """A posterior density of u, and the numbers to report."""
+    """A posterior density of the coordinates u, and the parameters to report."""
 
-    residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), errors divided by their scales
+    residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), residuals divided by their scales
     prior: "Modes | Springpots | WithInstrument"
     deviations_given: bool
-    weight: float = 1.0  # residuals of independent noise that measure as much, over their number
+    weight: float = 1.0  # number of independent residuals over number of residuals
 
     def log_likelihood(self, u: np.ndarray) -> np.ndarray:
         """Log likelihood of u (W, P), up to a constant, with the size of the errors integrated out."""
-        with np.errstate(all="ignore"):  # an overflow is a point without likelihood
+        with np.errstate(all="ignore"):  # a point at which numbers overflow has likelihood 0
             r = self.residuals(u)
             return self.weight * log_likelihood(np.sum(r * r, axis=-1), r.shape[-1], self.deviations_given)
 
@@ -137,7 +138,7 @@ def target(
     """The posterior of a model.
 
     Args:
-        kind: what u means: Prony modes or a fractional model.
+        kind: the meaning of u: Prony modes or a fractional model.
         residuals: u (W, P) -> (W, m), divided by their scales.
         resolved: shortest and longest relaxation time [s] that the data resolve.
         size: measured moduli (n,) [Pa].
@@ -154,11 +155,11 @@ def target(
 
 
 class Modes(NamedTuple):
-    """Prior and numbers of Prony modes, in the coordinates of `generalised_maxwell.natural` or `natural_fluid`."""
+    """Prior and parameters of Prony modes, in the coordinates of `generalised_maxwell.natural` or `natural_fluid`."""
 
     fluid: bool
     modulus: tuple[float, float]  # ends of log G0
-    times: tuple[float, float]  # ends of the logs of times
+    times: tuple[float, float]  # ends of the log times
     words: str = PRIORS["prony"]
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
@@ -170,7 +171,7 @@ class Modes(NamedTuple):
             log_time = np.log(model.relaxation_times)
             inside = (log_time[:, -1] > self.times[0]) & (log_time[:, 0] < self.times[1])
             inside &= (u[:, 0] > self.modulus[0]) & (u[:, 0] < self.modulus[1])
-            # The slopes of ratios by their logits (softmax), and of log times by the logs of their gaps.
+            # Derivatives of the ratios by their logits (softmax), and of the log times by the logs of their gaps.
             gaps = u[:, u.shape[-1] - model.ratios.shape[-1] + 1 :]
             found = np.log(shares).sum(axis=-1) + gaps.sum(axis=-1)
         return np.where(inside & np.isfinite(found), found, -np.inf)
@@ -178,7 +179,7 @@ class Modes(NamedTuple):
     def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
         """Draw u (count, parameters) from the prior."""
         modes = parameters // 2
-        share = rng.standard_exponential((count, modes + (not self.fluid)))  # their ratios are uniform on the simplex
+        share = rng.standard_exponential((count, modes + (not self.fluid)))  # normalised: uniform on the simplex
         log_time = -np.sort(-rng.uniform(*self.times, (count, modes)), axis=1)
         top = rng.uniform(*self.modulus, (count, 1))
         gaps = np.log(-np.diff(log_time, axis=1))
@@ -188,19 +189,19 @@ class Modes(NamedTuple):
         return (generalised_maxwell.natural_fluid if self.fluid else generalised_maxwell.natural)(u)
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Names of the reported numbers, for this number of coordinates."""
+        """Names of the reported parameters, for this number of coordinates."""
         first, *others = parameter_names(parameters // 2)
         return (first, *others) if self.fluid else (first, "equilibrium_modulus", *others)
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Moduli, ratios and times (n, K) of u (n, P)."""
+        """Moduli, ratios and times (n, K), for u (n, P)."""
         model = self._model(u)
         moduli = [model.shear_modulus] if self.fluid else [model.shear_modulus, model.equilibrium_modulus]
         return np.concatenate([np.stack(moduli, axis=-1), model.ratios, model.relaxation_times], axis=-1)
 
 
 class Springpots(NamedTuple):
-    """Prior and numbers of a fractional model; u are its free numbers in `springpots`: log moduli and logits."""
+    """Prior and parameters of a fractional model. u has its free entries in `springpots`: log moduli and logits."""
 
     model: Fractional
     moduli: tuple[float, float]  # ends of their logs
@@ -209,7 +210,7 @@ class Springpots(NamedTuple):
 
     @property
     def _moduli(self) -> np.ndarray:
-        """Whether each free number is a modulus; the others are logits of exponents."""
+        """For each free entry of u: whether it is a log modulus. The other entries are logits of exponents."""
         return np.array([k % 2 == 0 for k in self.model.free])
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
@@ -225,16 +226,17 @@ class Springpots(NamedTuple):
         return np.where(self._moduli, moduli, scipy.special.logit(rng.random((count, parameters))))
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Names of the reported numbers."""
+        """Names of the reported parameters."""
         return self.model.names
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """The model's own numbers (n, K) of u (n, P)."""
+        """Parameters (n, K) of the fractional model, for u (n, P)."""
         return self.values(u)
 
 
 class WithInstrument(NamedTuple):
-    """Prior and numbers of Prony modes and of errors of the instrument; these end u, in standard deviations."""
+    """Prior and parameters of Prony modes and of errors of the instrument. The last entries of u are these errors, in
+    standard deviations of their priors."""
 
     modes: Modes
     errors: list[Nuisance]
@@ -246,7 +248,7 @@ class WithInstrument(NamedTuple):
         return "; ".join([self.modes.words, *each])
 
     def apart(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers of the modes, and errors of the instrument, of u (..., P)."""
+        """Split u (..., P) into the coordinates of the modes and the errors of the instrument."""
         return u[..., : -len(self.errors)], u[..., -len(self.errors) :]
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
@@ -260,17 +262,17 @@ class WithInstrument(NamedTuple):
         return np.concatenate([modes, rng.standard_normal((count, len(self.errors)))], axis=1)
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Names of the reported numbers, for this number of coordinates."""
+        """Names of the reported parameters, for this number of coordinates."""
         return (*self.modes.names(parameters - len(self.errors)), *(n.reported for n in self.errors))
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Moduli, ratios, times and errors of the instrument (n, K) of u (n, P)."""
+        """Moduli, ratios, times and errors of the instrument (n, K), for u (n, P)."""
         modes, errors = self.apart(u)
         return np.concatenate([self.modes.numbers(modes), errors * [n.unit for n in self.errors]], axis=1)
 
 
 def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
-    """Independent chains of `count` draws of the posterior.
+    """Sample independent chains, with `count` draws of the posterior in each.
 
     Args:
         at: the density.
@@ -290,8 +292,8 @@ def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
 
 
 def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:
-    """The draws with the error of the gap, if the fit has one: a factor of all moduli of a draw, which is log-normal so
-    that no modulus is negative."""
+    """The draws with the error of the gap, if the fit has one. This error is a factor of all moduli of a draw. The
+    factor is log-normal, so that no modulus is negative."""
     relative, kind = fit.details.get("gap_error"), fit.kind
     if not relative:
         return found
@@ -323,7 +325,7 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
 
 
 def _beside_instrument(fit: Fit, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> tuple[Target, int]:
-    """The posterior of Prony modes and of the errors of the instrument that the fit has, and the length of u."""
+    """The posterior of Prony modes and of the instrument errors in the fit; and the length of u."""
     own, parameters = _sweep_target(fit.kind, sweep, residuals), len(fit.solution.u)
     known, corrected_by = instrument.used_errors(fit, sweep)
     if not known or not isinstance(own.prior, Modes):
@@ -342,16 +344,17 @@ def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np
     return target(kind, residuals, sweep.resolved, size, sweep.noise_given)
 
 
-#: Number of draws that are simulated, and the difference of their log density above which a warning is given.
+#: Number of draws that are simulated; a warning is given if their log density differs by more than DIFFERENT.
 SIMULATED, DIFFERENT = 12, 0.1
 
 
 def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a fit of Prony modes through the torsion simulation.
 
-    The density is that of the linear rig, with its recursion in time. A complex factor for each frequency corrects it
-    to the simulation at the minimum. Some draws are then simulated in full. `Posterior.simulated` has the largest
-    difference between their simulated and their approximate log likelihood: it shows how good the approximation is.
+    The density is computed with the linear rig and its recursion in time. For each frequency, a complex factor corrects
+    the linear rig to the simulation at the minimum. Then some draws are simulated in full. `Posterior.simulated` has
+    the largest difference between the simulated and the approximate log likelihood of these draws. It shows how good
+    the approximation is.
     """
     data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
     rig, law, omega, _, measured, _ = data
@@ -377,7 +380,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
         partial(simulated_rheometer.with_jacobian, simulation=simulation, kind=fit.kind), modes[0], data, short=True
     )
     exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in modes])
-    exact += own.residuals(some) - residuals(modes)  # change by the errors of the instrument
+    exact += own.residuals(some) - residuals(modes)  # changes by the errors of the instrument
     likelihood = log_likelihood(np.sum(exact**2, axis=-1), exact.shape[-1], own.deviations_given)
     apart = float(np.max(np.abs(likelihood - own.log_likelihood(some))))
     checked = {"draws": float(SIMULATED), "largest_difference": apart}
@@ -387,7 +390,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
 def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a relaxation or creep test in closed form, of Prony modes or of a fractional model.
 
-    If neighbouring answers share their noise, the likelihood counts only as many answers as are independent.
+    If neighbouring readings share their noise, the likelihood counts only the number of independent readings.
     """
     if fit.kind.values is None:
         one, data = time_tests.residuals_in_time(test, fit.kind)

@@ -1,7 +1,7 @@
-"""Inertia of a cylinder in oscillating torsion, in closed form: what it adds to the modulus that a rheometer shows.
+"""Inertia of a cylinder in oscillating torsion, in closed form: how it changes the modulus that a rheometer measures.
 
-Shear waves run along the axis, with the wave number k = omega sqrt(rho/G*). The torque at the plate that turns, over
-its angle, shows G* k h cot(k h) in place of G* (Schrag 1977, Trans. Soc. Rheol. 21, 399).
+Shear waves run along the axis, with the wave number k = omega sqrt(rho/G*). The torque at the turning plate, divided by
+its angle, gives G* k h cot(k h) in place of G* (Schrag 1977, Trans. Soc. Rheol. 21, 399).
 """
 
 import numpy as np
@@ -10,15 +10,15 @@ from fitting.methods.host import Array, arrays_of
 from fitting.readers.frequency_sweep import Sweep
 from liverjax.core.errors import InputError
 
-#: Most |k h| at which the inertia is taken off. At pi/2 the sample alone is in resonance and shows no storage modulus;
-#: at pi it shows a modulus without bound.
+#: Maximum |k h| up to which the inertia is subtracted. At pi/2 the sample alone is in resonance, and its measured
+#: storage modulus is 0. At pi, its measured modulus is infinite.
 MOST = 2.5
-#: Part of the modulus from which a note states the inertia.
+#: If the inertia changes the modulus by more than this part, a note gives the change.
 WORTH_A_NOTE = 0.001
 
 
 def shown(G: Array, omega: Array, density: float, height: float) -> Array:
-    """The modulus (n,) [Pa] that a rheometer shows of a sample of complex modulus G (n,) [Pa], of NumPy or JAX.
+    """The modulus (n,) [Pa] that a rheometer measures on a sample of complex modulus G (n,) [Pa], in NumPy or JAX.
 
     Args:
         G: complex modulus (n,) [Pa].
@@ -32,7 +32,8 @@ def shown(G: Array, omega: Array, density: float, height: float) -> Array:
 
 
 def rate_in_steps(omega: Array, steps: int) -> Array:
-    """The frequency (n,) [rad/s] whose square inertia has in a steady cycle of Newmark's average accelerations."""
+    """The frequency (n,) [rad/s] whose square multiplies the inertia in a steady cycle of Newmark's average
+    acceleration method."""
     half = np.pi / steps
     return np.tan(half) / half * omega
 
@@ -54,10 +55,11 @@ def modulus_of(seen: np.ndarray, omega: np.ndarray, density: float, height: floa
 
 
 def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
-    """The sweep of the sample's own moduli, from one with the inertia in it; a note states the largest change.
+    """The sweep with the moduli of the sample, from measured moduli that contain the inertia. A note gives the largest
+    change.
 
     Raises:
-        InputError: a frequency at which the inertia leaves nothing of the modulus.
+        InputError: at one frequency, no positive modulus is left without the inertia.
     """
     seen = sweep.storage + 1j * sweep.loss
     G = modulus_of(seen, sweep.angular_frequency, density, height)
@@ -81,6 +83,6 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
 
 
 def put_back(sweep: Sweep, density: float, height: float) -> Sweep:
-    """The sweep as a rheometer shows it: the inverse of `taken_off`, without its note."""
+    """The sweep as a rheometer measures it: the inverse of `taken_off`, without the note."""
     seen = shown(sweep.storage + 1j * sweep.loss, sweep.angular_frequency, density, height)
     return sweep._replace(storage=seen.real, loss=seen.imag)

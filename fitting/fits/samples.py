@@ -1,4 +1,5 @@
-"""Several samples of one material: each fitted by itself, with one model for all, and the population they come from."""
+"""Several samples of one material. Each sample is fitted by itself, with the same model for all; then the population of
+the samples is estimated."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +20,7 @@ from liverjax.core.errors import InputError
 
 
 class Samples(NamedTuple):
-    """Fits of all samples with one model, and the population of each of its numbers."""
+    """Fits of all samples with one model, and the population of each parameter of this model."""
 
     sweeps: list[Sweep]
     fits: list[Fit]
@@ -29,11 +30,12 @@ class Samples(NamedTuple):
 
     @property
     def kind(self) -> Kind:
-        """Kind of the model that all share."""
+        """Kind of the common model of all samples."""
         return self.fits[0].kind
 
     def values(self, k: int) -> dict[str, tuple[float, float]]:
-        """Numbers of sample k by the names of the population, with their errors; 0 for a strength that it lacks."""
+        """Parameters of sample k with their errors, by the names of the populations. A strength that the sample does
+        not have is 0."""
         own = values_of_sample(self.fits[k])
         return {name: own.get(name, (0.0, np.inf)) for name in self.populations}
 
@@ -42,7 +44,7 @@ class _Candidate(NamedTuple):
     label: dict
     fits: list[Fit]
     criterion: float  # summed over the samples
-    able: bool  # at least half of the samples determine all its numbers
+    able: bool  # at least half of the samples determine all its parameters
 
 
 def fit(
@@ -51,7 +53,8 @@ def fit(
     modes: int | str = "auto",
     progress: Callable[[str], None] = lambda text: None,
 ) -> Samples:
-    """Choose the model with the lowest sum of criteria among those that half of the samples determine.
+    """Choose the model with the lowest sum of criteria. Only models that at least half of the samples determine can be
+    chosen.
 
     Args:
         sweeps: two or more.
@@ -98,7 +101,8 @@ def _candidate_for_all(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Ca
 def _modes_for_all(
     sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable
 ) -> list[_Candidate]:
-    """Fits of 1, 2, … Prony modes; the search ends after two that do not lower the summed criterion."""
+    """Fits of 1, 2, … Prony modes. The search ends after two numbers of modes in a row that do not lower the summed
+    criterion."""
     largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
     numbers = range(1, min(largest, min(map(uncertainty.supported_modes, sweeps))) + 1)
     if modes != "auto":
@@ -120,7 +124,8 @@ def _modes_for_all(
 
 
 def values_of_sample(fit: Fit) -> dict[str, tuple[float, float]]:
-    """Numbers of a fit with their standard errors: those of `edges.values`, and the strengths of a spectrum."""
+    """Parameters of a fit with their standard errors: the parameters of `edges.values`, and the strengths of a
+    spectrum."""
     out = edges.values(fit)
     if fit.kind.effective is not None and fit.parameters is not None:
         rows = zip(fit.kind.names, fit.parameters.values, fit.parameters.standard_errors, strict=True)
@@ -134,25 +139,28 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     for name in (*(n for n in known[0] if "[" not in n), *names):
         pairs = np.array([row.get(name, (0.0, np.inf)) for row in known])
         found = population(pairs[:, 0], pairs[:, 1])
-        if found is not None and name.startswith("ratios["):  # a part of the modulus
+        if found is not None and name.startswith("ratios["):  # a ratio cannot exceed 1
             of_mean, of_new = ((low, min(1.0, high)) for low, high in (found.mean_interval, found.new_interval))
             found = found._replace(mean_interval=of_mean, new_interval=of_new)
         out[name] = found
     return out
 
 
-#: Chance, for all samples together, below which one that differs from the others is named; fewest samples for it.
+#: A sample that differs from the others is reported below this probability, which holds for all samples together; and
+#: minimum number of samples for this test.
 _STRANGE, _FEWEST = 0.05, 4
-#: Least ratio to the others of a sample that is named, and largest error of the logarithm with which it is judged.
+#: Minimum ratio to the mean of the others from which a sample is reported; and maximum standard error of a logarithm
+#: that is compared.
 _APART, _UNSURE = 1.3, 0.5
-#: Ratio of moduli of one material from which their units are in doubt.
+#: If moduli of one material differ by this factor, their units may be wrong.
 _OTHER_UNIT = 100.0
 
 
 def outliers(found: Samples) -> list[str]:
-    """A sentence on each sample with a number that does not belong to the others' (t-tests on logarithms, Bonferroni).
+    """A sentence on each sample with a parameter far from the other samples (t-tests on logarithms, Bonferroni
+    correction).
 
-    Strengths of a spectrum are not compared: neighbours on the grid exchange parts.
+    The strengths of a spectrum are not compared: one strength may grow while its neighbour on the grid falls.
     """
     names = [n for n in found.populations if not n.startswith("strengths[")]
     told: dict[int, list[tuple[float, str, float, float]]] = {}
@@ -163,11 +171,11 @@ def outliers(found: Samples) -> list[str]:
     out = []
     for sample, own in told.items():
         which = ", and ".join(
-            f"its {name} is {ratio:.2g} times the mean of the others, {mean:.4g} (by chance: {chance:.1g})"
+            f"its {name} is {ratio:.2g} times the mean of the others, {mean:.4g} (probability by chance: {chance:.1g})"
             for chance, name, ratio, mean in own
         )
         what = "its units and sizes"
-        if not any(name.endswith(("modulus", "springpot")) for _, name, _, _ in own):  # no number has a unit of stress
+        if not any(name.endswith(("modulus", "springpot")) for _, name, _, _ in own):  # no parameter is a stress
             what = "its temperature, the unit of its frequency, and the sample"
         source = Path(found.sweeps[sample].source).name
         out.append(f"{source}: {which}: check {what}; it widens the population's intervals")
@@ -179,15 +187,16 @@ def outliers(found: Samples) -> list[str]:
 
 
 def _known_logarithms(found: Samples, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The samples that determine a number, its logarithms, and their errors."""
+    """The samples that determine the parameter `name`, the logarithms of its values, and the errors of these
+    logarithms."""
     pairs = np.array([found.values(k)[name] for k in range(len(found.fits))])
     known = np.flatnonzero((pairs[:, 0] > 0) & (pairs[:, 1] < _UNSURE * pairs[:, 0]))
     return known, np.log(pairs[known, 0]), pairs[known, 1] / pairs[known, 0]
 
 
 def _strangers(found: Samples, name: str) -> list[tuple[int, float, float, float]]:
-    """Samples with a number far from the others', the chance of one so far among all samples, its ratio to the mean of
-    the others, and this mean.
+    """Samples with a parameter far from the other samples. For each: its index, the probability that one of all samples
+    is so far away by chance, its ratio to the mean of the others, and this mean.
     """
     known, logs, errors = _known_logarithms(found, name)
     out = []
@@ -202,7 +211,8 @@ def _strangers(found: Samples, name: str) -> list[tuple[int, float, float, float
 
 
 def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[str]:
-    """A sentence if some samples have a modulus far above that of the others; few samples allow no test."""
+    """A sentence if some samples have a modulus far above or below the others. It also works for few samples, where no
+    test is possible."""
     order = np.argsort(logs)
     gaps = np.diff(logs[order])
     if not len(gaps) or gaps.max() < np.log(_OTHER_UNIT):
@@ -221,7 +231,8 @@ def _place(name: str) -> int:
 
 
 def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
-    """Prony modes at the means of the population. Modes without a mean are left out; other numbers get the median."""
+    """Prony modes at the means of the population. Modes without a mean are left out. Other parameters without a mean
+    get the median."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}

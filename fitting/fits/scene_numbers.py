@@ -1,4 +1,4 @@
-"""Fit a few numbers of one or more scenes to measured displacements: Gauss-Newton, with standard errors."""
+"""Fit a few parameters of one or more scenes to measured displacements by Levenberg-Marquardt, with standard errors."""
 
 import time
 import warnings
@@ -35,7 +35,7 @@ class Problem(NamedTuple):
 
 
 def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
-    """Residuals (n,) of all scenes with the numbers `values`, and the worst status code of each scene."""
+    """Residuals (n,) of all scenes with the parameters `values`, and the worst status code of each scene."""
     parts, codes = [], []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         result = lj.simulate(lj.with_parameters(scene, values), store=store)
@@ -45,15 +45,16 @@ def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "a
 
 
 def with_solvers(problem: Problem, values: Mapping[str, object]) -> Problem:
-    """The problem with the linear solvers that its scenes need at these numbers, which a program does not know."""
+    """The problem with the linear solvers that its scenes need for these parameters. A compiled program cannot choose
+    the solvers, because it does not know the values."""
     return problem._replace(scenes=tuple(with_solver(scene, [values]) for scene in problem.scenes))
 
 
 class Unknowns(NamedTuple):
-    """The unknowns u (n,) of Gauss-Newton, and the functions that give the numbers of the scenes from u."""
+    """The unknowns u (n,) of the fit, and the functions that compute the parameters of the scenes from u."""
 
     start: np.ndarray  # first u (n,)
-    values_of: Callable[[jax.Array], Content]  # u -> numbers of the scenes by dotted name
+    values_of: Callable[[jax.Array], Content]  # u -> parameters of the scenes by dotted name
     natural_of: Callable[[jax.Array], jax.Array]  # u -> the parameters to report (m,)
     names: Sequence[str]  # names of these parameters
 
@@ -69,10 +70,11 @@ def fit(
 
     Args:
         problem: scenes and data.
-        unknowns: u, and how numbers and parameters follow from it.
+        unknowns: u, and the functions from u to the parameters of the scenes and to the reported parameters.
         max_iterations, progress: see `levenberg_marquardt_host`.
-        mesh_error: estimate the error of the meshes, and the change of the parameters by it (`mesh_bias`); a warning is
-            given if the change is more than the standard error. It needs one more run, and one linear solve per step.
+        mesh_error: estimate the error of the meshes, and how far it moves the parameters (`mesh_bias`). A warning is
+            given if it moves one by more than the standard error. The estimate needs one more run, and one linear solve
+            per step.
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
     start, values_of, natural_of, names = unknowns
@@ -97,7 +99,7 @@ def fit(
     seconds = time.perf_counter() - begin
     estimate = estimated(names, natural_of, found, problem.components)
     estimate = _of_alike_noise(problem, natural_of, found, estimate)
-    known = np.all(np.isfinite(estimate.standard_errors))  # else the numbers ran away
+    known = np.all(np.isfinite(estimate.standard_errors))  # else a parameter ran to a limit
     left_out = missing_or_none(problem, values_of(found.u)) if mesh_error and known else None
     if left_out is not None:
         size = float(np.sqrt(np.sum(left_out**2) / problem.components))
@@ -108,13 +110,14 @@ def fit(
 
 
 def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, estimate: Estimate) -> Estimate:
-    """The estimate with the errors of noise that neighbouring points share, if residuals show any; and a warning."""
+    """The estimate with standard errors for noise that neighbouring points share, and a warning, if the residuals show
+    such noise."""
     if not np.all(np.isfinite(estimate.standard_errors)):
         return estimate
     r, J = np.asarray(found.residuals), np.asarray(found.jacobian)
     seen = np.concatenate([np.isfinite(d.sd).ravel() for d in problem.data])
     slope = np.asarray(jax.jacfwd(natural_of)(jnp.asarray(found.u)))
-    # Components may have noise of other sizes than stated: along the depth, say, or where the motion is large.
+    # The noise of some components may be larger than stated, for example along the depth or where the motion is large.
     uneven = np.linalg.norm(uneven_root(J[seen], r[seen], slope), axis=1)
     if _many(J, seen):
         larger = np.maximum(uneven / estimate.standard_errors, 1.0)
@@ -138,17 +141,18 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
 
 
-#: Components for each number from which their own residuals say what noise they have.
+#: With at least this many components for each parameter, the residuals tell the noise of each component.
 _MANY = 20
 
 
 def _many(J: np.ndarray, seen: np.ndarray) -> bool:
-    """Whether there are so many residuals that they say something of the noise of each."""
+    """Whether there are enough residuals to tell the noise of each component."""
     return bool(np.count_nonzero(seen) >= _MANY * J.shape[1])
 
 
 def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place (n, 3) [m] of each measured component, and a number (n,) for its scene, step and direction."""
+    """Place (n, 3) [m] of each measured component, and the index (n,) of its group: components of one scene, step and
+    direction."""
     places, groups = [], []
     for k, (scene, data) in enumerate(zip(problem.scenes, problem.data, strict=True)):
         points = np.asarray(scene.mesh.points)[np.asarray(data.nodes)]
@@ -160,7 +164,7 @@ def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, 
 
 
 def missing(problem: Problem, values: Content) -> np.ndarray:
-    """Errors of the residuals (n,) by the meshes, with the scenes' numbers replaced by `values`."""
+    """Errors of the residuals (n,) that the meshes cause, for scenes with the parameters `values`."""
     rows = []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         scene = lj.with_parameters(scene, values)
@@ -176,19 +180,21 @@ def missing(problem: Problem, values: Content) -> np.ndarray:
 
 
 def missing_or_none(problem: Problem, values: Content) -> np.ndarray | None:
-    """`missing`, or None with a warning if there is no estimate of the mesh's error for a scene."""
+    """The result of `missing`; or None, with a warning, if the mesh error of a scene cannot be estimated."""
     try:
         return missing(problem, values)
     except InputError as e:
-        warnings.warn(f"the effect of the mesh on the fit is not known: {e}", stacklevel=3)
+        warnings.warn(f"the effect of the mesh error on the fit is not known: {e}", stacklevel=3)
         return None
 
 
 def with_mesh_as_noise(problem: Problem) -> tuple[Problem, list[float]]:
-    """The problem with the error of the meshes as further noise, and its size in each scene, over the stated noise [1].
+    """The problem with the mesh error added to the noise, and the size of this error in each scene, divided by the
+    stated noise [1].
 
-    The error is that of the scenes' own numbers: its root mean square over the measured components. A map would explain
-    it by stiffness otherwise. Without an estimate the problem stays as it is, with a warning, and the sizes are NaN.
+    The size is a root mean square over the measured components, for the parameters in the scenes. Otherwise a map would
+    explain the mesh error by stiffness. If the mesh error cannot be estimated, the problem stays unchanged, with a
+    warning, and the sizes are NaN.
     """
     left_out = missing_or_none(problem, {})
     if left_out is None or not np.all(np.isfinite(left_out)):
@@ -203,10 +209,10 @@ def with_mesh_as_noise(problem: Problem) -> tuple[Problem, list[float]]:
 
 
 def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estimate:
-    """Fit the numbers of the scenes with these dotted names; positive numbers stay positive.
+    """Fit the parameters of the scenes with these dotted names. Positive parameters stay positive.
 
     Raises:
-        InputError: a scene does not have a name, or the name is not that of a floating-point number.
+        InputError: a scene has no parameter of this name, or the parameter is not a floating-point number.
     """
     starts = [numbers_at(problem.scenes[0], name) for name in names]
     sizes = [np.size(v) for v in starts]

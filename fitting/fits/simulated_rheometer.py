@@ -45,17 +45,19 @@ class Simulation(NamedTuple):
 
     @property
     def is_linear(self) -> bool:
-        """Whether the response without a mesh is known: small strain, and no inertia of a compressed sample."""
+        """Whether the response without a mesh is known. It is known for a small strain, except for a compressed sample
+        with inertia."""
         return self.strain <= LINEAR_STRAIN and not (self.density is not None and self.precompression)
 
 
-#: Up to this strain at the rim the linear rig gives the derivatives. Their relative error is below the strain; with
-#: inertia it is that of the mesh in the inertial part.
+#: Up to this strain at the rim, the linear rig gives the derivatives. Their relative error is below the strain. With
+#: inertia, it is the error of the mesh in the inertial part.
 LINEAR_STRAIN = 1e-2
 
 
 def law_and_prony(model: Maxwell, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
-    """The material of the sample from Prony modes: the law scaled to their G0, and its relaxation."""
+    """The material of the sample from Prony modes: the law scaled to the G0 of the modes, and the viscosity from the
+    modes."""
     viscosity = Prony(
         ratios=model.ratios,
         relaxation_times=model.relaxation_times,
@@ -72,14 +74,15 @@ def _and_prior(r: jax.Array, u: jax.Array, kind: Kind) -> jax.Array:
 def simulated_residuals(
     u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
 ) -> tuple[jax.Array, torsion.Moduli]:
-    """Simulated minus measured moduli, divided by their deviations (2n,), then rows of a prior; and the moduli.
+    """Simulated minus measured moduli, divided by their standard deviations (2n,), then the rows of a prior; and the
+    simulated moduli.
 
     Args:
-        u: numbers of `kind`.
+        u: variables of `kind`.
         data: rig, law, angular frequencies (n,) [rad/s], torque amplitudes (n,) [N m], measured moduli G' then G''
-            (2n,) [Pa] and their deviations.
+            (2n,) [Pa] and their standard deviations.
         simulation: law, recursion and resolution.
-        kind: what u means; its Prony modes are simulated.
+        kind: the meaning of u. The Prony modes at u are simulated.
     """
     rig, law, omega, torque, measured, scales = data
     drive = torsion.Drive(steps=simulation.steps)
@@ -92,8 +95,8 @@ def with_jacobian(
 ) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
     """Residuals, their derivative by u (rows, P), and the simulated moduli. See `simulated_residuals`.
 
-    The derivative is that of the linear rig without a mesh, or that of the simulation if strain is large, or if a
-    compressed sample has inertia. With the derivative of the linear rig Gauss-Newton finds the same minimum in a small
+    The linear rig without a mesh gives the derivative. The simulation gives it if the strain is large, or if a
+    compressed sample has inertia. With the derivative of the linear rig, Gauss-Newton finds the same minimum in a small
     part of the time (experiments/benchmarks/torsion_speed.py).
     """
     if not simulation.is_linear:
@@ -117,7 +120,7 @@ def with_jacobian(
 def small_strain_moduli(
     rig: torsion.Rig, model: Maxwell, law: laws.Law, omega: jax.Array, simulation: Simulation
 ) -> jax.Array:
-    """Complex moduli [Pa] (n,) that the simulation approaches as the strain goes to zero."""
+    """Complex moduli (n,) [Pa]: the limit of the simulated moduli for small strain, without the error of the mesh."""
     scaled, prony = law_and_prony(model, law, simulation)
     if simulation.precompression:
         scale = model.shear_modulus / law.shear_modulus()
@@ -130,7 +133,7 @@ def small_strain_moduli(
 
 
 def rig_of(simulation: Simulation) -> torsion.Rig:
-    """The sample of a simulation; its mesh is coarse if the bias of the mesh is known exactly."""
+    """The rig of a simulation. Its mesh is coarse if the bias of the mesh is known exactly."""
     cell, height = simulation.cell_size, simulation.height
     if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
         cell = torsion.linear_cell_for(simulation.radius, height)
@@ -138,7 +141,7 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
         return torsion.make_rig(simulation.radius, height, cell, density=simulation.density)
     if simulation.part != "all":
         raise InputError(
-            f"a precompression of {simulation.precompression:g} is for a sample whose whole stress relaxes: leave out "
+            f"a precompression of {simulation.precompression:g} needs a sample whose whole stress relaxes: leave out "
             f"part {simulation.part!r}"
         )
     tall = height / (1 - simulation.precompression)
@@ -150,19 +153,21 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
 
 @cache
 def _without_mesh(radius: float, gap: float, law: str, strain: float) -> tuple[Glued, Glued]:
-    """`glued_compression.glued` by the name of the law: a fit needs it twice."""
+    """`glued_compression.glued` for the name of a law. A fit needs the result twice, so it is cached."""
     return glued(radius, gap, laws.typical(law), strain)
 
 
 def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
-    """Rig, law, angular frequencies, torques, measured moduli and deviations: the data of `simulated_residuals`."""
+    """Rig, law, angular frequencies, torques, measured moduli and their standard deviations: the data of
+    `simulated_residuals`."""
     rig = rig_of(simulation)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
     return rig, laws.typical(simulation.law), jnp.asarray(sweep.angular_frequency), torque, measured, scales
 
 
-#: Results of the closed form that the simulation keeps: words by which its warnings are found, and names of details.
+#: Results of the closed-form fit that stay valid for the fit through the simulation. OF_THE_DATA: words by which its
+#: warnings are found. KEPT: keys of its details.
 OF_THE_DATA = (
     "modes would follow",
     "about as well as",
@@ -203,7 +208,7 @@ def through_torsion(
 
     Args:
         sweep: data.
-        start: fit in closed form with the number of modes wanted, and with the errors of gap and instrument.
+        start: closed-form fit with the wanted number of modes, and with the errors of gap and instrument.
         simulation: geometry, law and resolution.
         optimizer: one of `OPTIMIZERS`.
         progress: called after every evaluation.
@@ -236,7 +241,7 @@ def through_torsion(
             return found, simulated_residuals(found.u, data, simulation, kind)[1]
 
         (found, m), compiling, running = timed(minimised, u0, *data)
-    if isinstance(start.solution.u, np.ndarray):  # what follows runs on the host, as the closed form did
+    if isinstance(start.solution.u, np.ndarray):  # all later steps run on the host, like the closed form
         found = Solution(*(np.asarray(field) for field in found))
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
     worst = int(np.asarray(m.statistics.status).max())
@@ -254,7 +259,8 @@ def through_torsion(
 
 
 def _as_told_before(fit: Fit, start: Fit) -> Fit:
-    """The fit through the simulation with what the closed form `start` says of the data, and with its shared errors."""
+    """The fit through the simulation, with the warnings and details of the closed form `start` that concern the data,
+    and with its shared errors."""
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
     fit = _with_shared_errors(fit._replace(details=fit.details | of_the_model), start)
@@ -271,10 +277,11 @@ def _with_shared_errors(fit: Fit, start: Fit) -> Fit:
 
 
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
-    """Change of the parameters by the simulation's mesh and time steps, to first order (`mesh_bias`).
+    """The estimate with the changes of the parameters that mesh and time steps of the simulation cause, to first order.
 
-    At small strain both follow from moduli without a mesh: by the recursion, and in continuous time. Those of a
-    compressed sample come from quadratic elements, whose own error is the share of the mesh (`glued_compression`).
+    At small strain, both changes follow from moduli without a mesh: moduli by the recursion, and moduli in continuous
+    time. For a compressed sample, quadratic elements give these moduli, and an estimate of their remaining error is
+    added (`glued_compression`).
     """
     rig, law, omega, scales = data
     scaled, prony = law_and_prony(fit.kind.maxwell(fit.solution.u), law, simulation)
@@ -298,15 +305,15 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
 
 
 def _of_no_mesh(law: laws.Law, prony: Prony, omega: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
-    """Complex moduli (n,) without a mesh: by the recursion, and in continuous time."""
+    """Complex moduli (n,) [Pa] without a mesh, by the recursion and in continuous time."""
     return torsion.linear_moduli(law, prony, omega, steps), torsion.linear_moduli(law, prony, omega, None)
 
 
 def _of_held(
     rig: torsion.Rig, material: tuple[laws.Law, Prony], omega: jax.Array, simulation: Simulation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Complex moduli (n,) of a compressed sample, with what the meshes of `_without_mesh` may still miss: by the
-    recursion, and in continuous time.
+    """Complex moduli (n,) [Pa] of a compressed sample, by the recursion and in continuous time. They contain an
+    estimate of the error that the meshes of `_without_mesh` leave.
     """
     law, prony = material
     of, moduli = jax.jit(torsion.held)(rig, law), jax.jit(torsion.held_moduli, static_argnums=4)
@@ -322,7 +329,7 @@ def _simulation_details(
     simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli
 ) -> dict[str, object]:
     """Settings and statistics of the simulation, for the report."""
-    # At rest, if the whole stress relaxes, the bias of the run is the same at every frequency.
+    # For a sample without compression whose whole stress relaxes, the bias of the run is the same at every frequency.
     known = simulation.part == "all" and rig.held is None
     rest = rig if rig.held is None else replace(rig, held=None, height=torsion.rest_height(rig))
     return {
@@ -346,7 +353,8 @@ def _simulation_details(
 
 
 def largest_shift(closed: Fit, simulated: Fit) -> float:
-    """Largest change of a parameter or of the equilibrium modulus by the simulation, over its standard error."""
+    """Largest change of a parameter or of the equilibrium modulus from the closed form to the simulation, divided by
+    its standard error."""
     (before, _), (after, errors) = (_with_equilibrium(fit) for fit in (closed, simulated))
     shift = np.abs(after - before)
     known = np.isfinite(errors) & (shift > 1e-6 * np.abs(before))
@@ -361,7 +369,8 @@ def _with_equilibrium(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _bias(closed: Fit, simulated: Fit) -> list[str]:
-    """A warning, with the cause, if the simulation moves a parameter by more than its standard error."""
+    """A warning with the cause if a parameter differs between simulation and closed form by more than its standard
+    error."""
     shift = simulated.uncertainty.values - closed.uncertainty.values
     errors = simulated.uncertainty.standard_errors
     cause, remedy = "the simulation's discretisation moves", "raise --steps or trust the closed form"

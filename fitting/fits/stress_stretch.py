@@ -1,4 +1,5 @@
-"""Hyperelastic laws from stress-stretch curves: least squares from many starts, kept stable over the fitted range."""
+"""Hyperelastic laws from stress-stretch curves: least squares from many starts. The fitted laws are kept stable over
+the range of the data."""
 
 import itertools
 import time
@@ -27,7 +28,7 @@ from liverjax.laws import Law, homogeneous
 from liverjax.laws.gradient_check import ellipticity
 
 STARTS = 128
-#: Weight of a falling stress in the residuals: a fall by 1 % of a curve's stress counts like a misfit of 100 %.
+#: Weight of a falling stress in the residuals: a fall by 1 % of the curve's stress scale counts like a misfit of 100 %.
 STIFFNESS = 100.0
 
 
@@ -56,22 +57,24 @@ class LawFit(NamedTuple):
     limits: dict[str, str]  # parameters that ran away to 0 or infinity
 
 
-#: Factors of the tests that the residuals do not show are told if they move a number by so many standard errors, and by
-#: this part of it.
+#: Each test may have a factor that the residuals do not show. Such factors are reported if they move a parameter by
+#: more than _HIDDEN standard errors and by more than a part _MOVED of its value.
 _HIDDEN, _MOVED = 2.0, 0.05
-#: A parameter that ends by more than this factor above or below its typical size ran into a limit of its law, if its
-#: error is so many times itself or more. Typical sizes are those of large strains: at small ones coefficients of higher
-#: terms are far above them, and are determined.
+#: A parameter ran into a limit of its law if two conditions hold. It ended above or below its typical size by more than
+#: RUNAWAY, and its error is at least FREE times its value. The second condition is needed because typical sizes hold
+#: for large strains. At small strains, coefficients of higher terms may be far larger and still determined.
 RUNAWAY, FREE = 1e6, 30.0
-#: Least relative noise that is taken there: no test is better.
+#: Minimum relative noise for this check: no test is better.
 _LEAST_NOISE = 1e-3
-#: Ratio of an error of uneven noise and that of equal noise from which the correlation is that of uneven noise.
+#: If an error for uneven noise exceeds the error for equal noise by this factor, the correlation for uneven noise is
+#: used.
 _UNEVEN = 1.2
 _tangents = jax.jit(lambda law, F: law.tangent(F))
 
 
 def initial_modulus(curves: list[Curve]) -> float:
-    """Scale of the shear modulus [Pa] for starts: median of measured stress / stress of a law with mu = 1 Pa."""
+    """Scale of the shear modulus [Pa] for the starts: the median of (measured stress) / (stress of a neo-Hookean law
+    with mu = 1 Pa)."""
     unit = laws.NeoHookean(mu=1.0, bulk=None)  # type: ignore[arg-type]  # the sample is incompressible
     ratios = []
     for c in curves:
@@ -86,7 +89,8 @@ def initial_modulus(curves: list[Curve]) -> float:
 
 
 def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawFit:
-    """Least squares of the relative misfit (P - P_measured) / rms of the curve, the best of many starts."""
+    """Minimise the squares of the relative misfit (P - P_measured) / (root mean square of the curve); the best of many
+    starts."""
     scale = initial_modulus(curves)
     F, at = jnp.asarray(np.concatenate([c.F for c in curves])), np.cumsum([0] + [len(c.stress) for c in curves])
     i, j = (jnp.asarray(np.repeat([c.component[k] for c in curves], np.diff(at))) for k in (0, 1))
@@ -120,11 +124,11 @@ def assessed(
 ) -> LawFit:
     """The best start, its quality, and warnings for the user.
 
-    `of_tests`: each curve is a test of its own, and residuals are differences of its stress over its scale.
+    `of_tests`: each curve is one test, and the residuals are differences of its stress divided by its scale.
     """
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))
-    lowest = costs[best] * (1 + 1e-6) + 1e-20  # of all starts that reached the minimum
+    lowest = costs[best] * (1 + 1e-6) + 1e-20  # a start with a cost up to this value reached the minimum
     u, J, r = (np.asarray(v)[best] for v in (found.u, found.jacobian, found.residuals))
     n, p = sum(len(c.stress) for c in curves), len(u)
     misfit, k = r[:n], p + 1
@@ -133,7 +137,7 @@ def assessed(
     slope = np.asarray(jax.jit(jax.jacfwd(candidate.values))(u, scale))
     every, _ = errors_and_correlation(spread(J[:n], max(noise, _LEAST_NOISE), slope)[0])
     limits = _run_away(candidate, values, every, scale)
-    # A parameter at its limit has no error; the errors of the others are those of the law at that limit.
+    # A parameter at its limit has no error. The errors of the other parameters hold for the law at that limit.
     known = np.array([name not in limits for name in candidate.names])
     own_slope = slope[np.ix_(known, known)]
     half, s = spread(J[:n, known], noise, own_slope)
@@ -185,12 +189,12 @@ def _of_other_minima(
     return of_other_minima(candidate.names, candidate.law, values, every, np.concatenate([c.F for c in curves]))
 
 
-#: Start of the sentence on factors of the tests.
+#: First words of the sentence on factors of the tests.
 OWN_FACTORS = "each test seems to have a factor of its own"
 
 
 def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: int) -> list[str]:
-    """Sentences on noise that n points of some tests share."""
+    """Sentences on noise that the n points of the tests share."""
     told = []
     if alike is not None:
         told.append(
@@ -200,8 +204,8 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
         )
     if factors is not None and factors.shown:
         told.append(
-            f"{OWN_FACTORS}, of {100 * factors.deviation:.2g} %, as by another sample or "
-            f"a wrong size of it; the standard errors contain such factors of {tests} tests"
+            f"{OWN_FACTORS}, of {100 * factors.deviation:.2g} %, for example from another sample or a wrong size of "
+            f"the sample; the standard errors contain such factors of {tests} tests"
         )
     return told
 
@@ -209,7 +213,7 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
 def _of_hidden_factors(
     factors: FactorNoise | None, names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
-    """A sentence on factors of the tests that the residuals do not show: the parameters can take them up."""
+    """A sentence on factors of the tests that the residuals do not show, because the parameters compensate them."""
     if factors is None or factors.shown:
         return []
     much = (factors.moves > _HIDDEN * errors) & (factors.moves > _MOVED * np.abs(values))
@@ -231,15 +235,16 @@ def _errors_of_law(
     half: np.ndarray,
     of_tests: bool,
 ) -> tuple[np.ndarray, np.ndarray, Alike | None, FactorNoise | None]:
-    """Errors and correlation, whatever noise is in the residuals; the noise that neighbouring points share; factors of
-    the tests.
+    """Errors and correlation of the parameters, each error the largest for several kinds of noise; the noise that
+    neighbouring points share; and the factors of the tests.
 
     Args:
-        curves: that were fitted.
+        curves: the fitted curves.
         residuals: derivatives J (n, p), misfit (n,) and its standard deviation.
         slope: derivatives of the parameters by the unknowns (P, p).
-        half: square root of the covariance for equal, independent noise.
-        of_tests: as in `assessed`; else there are no factors of tests, and no noise that grows with the stress.
+        half: square root of the covariance, for equal and independent noise.
+        of_tests: see `assessed`. If False, neither factors of tests nor noise that grows with the stress are
+            considered.
     """
     J, misfit, noise = residuals
     errors, correlation = errors_and_correlation(half)
@@ -267,25 +272,28 @@ def _errors_of_law(
 def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool) -> list[str]:
     told = []
     if sum(len(c.stress) for c in curves) <= len(fit.values):
-        told.append(f"as many parameters as points ({len(fit.values)}): nothing can be said of their errors")
+        told.append(f"as many parameters as points ({len(fit.values)}): the errors of the parameters are not known")
     if not fit.converged:
         told.append("the fit did not converge from its best start")
     quantile = scipy.stats.t.ppf(0.975, max(1, sum(len(c.stress) for c in curves) - len(fit.values)))
     if fit.limits:
         ran = ", ".join(f"{name} to {end}" for name, end in fit.limits.items())
         told.append(
-            f"the law runs into its limit ({ran}): the limit fits best, with the error and G0 given here, and the "
-            "number reached means nothing; take a law without that parameter"
+            f"the law runs into its limit ({ran}): the limit fits best, with the misfit and G0 given here. The value "
+            "of this parameter has no meaning: use a law without this parameter"
         )
     for name, value, error in zip(fit.names, fit.values, fit.standard_errors, strict=True):
         if name not in fit.limits and not error * quantile < abs(value):
-            told.append(f"the data leave {name} free: {value:.3g} with a standard error of {error:.2g}")
+            told.append(f"the data do not determine {name}: {value:.3g} with a standard error of {error:.2g}")
     if not fit.limits and singular[-1] < 1e-7 * singular[0]:
-        told.append("some combination of the parameters is not determined at all")
+        told.append("the data do not determine some combination of the parameters")
     if fit.starts_at_minimum == 1:
-        told.append("only one start reached the minimum: there may be a better one")
+        told.append("only one start reached the minimum: there may be a better minimum")
     if held:
-        told.append("the stress would fall within the fitted range: the fit is kept at the edge of stability")
+        told.append(
+            "without a constraint, the stress would decrease as the stretch grows: the fit is kept at the "
+            "edge of stability"
+        )
     solid = fit.law + laws.Volumetric(bulk=jnp.asarray(1e3 * abs(fit.shear_modulus)))
     firm = ellipticity(np.asarray(_tangents(solid, jnp.asarray(np.concatenate([c.F for c in curves]))))) > 0
     parts = np.split(firm, np.cumsum([len(c.stress) for c in curves])[:-1])
@@ -296,8 +304,8 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
 
 
 def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scale: float) -> dict[str, str]:
-    """Parameters that ended far from every start, and that the data leave free: `errors` (p,) are those of all of them
-    together. The starts spread over a few times the typical size.
+    """Parameters that ended far from every start and that the data do not determine, with the limit of each. `errors`
+    (p,) are the standard errors if all parameters are free. The starts lie within a few times the typical size.
     """
     starts = jnp.asarray(candidate.random(np.random.default_rng(0), STARTS))
     typical = np.median(np.abs(jax.vmap(lambda u: candidate.values(u, scale))(starts)), axis=0)
@@ -309,24 +317,24 @@ def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scal
     return ends
 
 
-#: Stress at rest above which there is a warning, divided by the root mean square of a curve.
+#: A warning is given if the stress at rest exceeds this part of the root mean square of the curve.
 _PRELOAD = 0.05
 
 
 def loaded_at_rest(curves: list[Curve]) -> list[str]:
-    """A warning for each curve whose stress is not 0 where its sample is not deformed."""
+    """A warning for each curve whose stress is not 0 when its sample is not deformed."""
     told = []
     for curve in curves:
         driven = curve.driven - (0.0 if np.ptp(curve.F[:, 0, 1]) > 0 else 1.0)
         near = np.argsort(np.abs(driven), kind="stable")[:3]
         if curve.test == "general" or np.abs(driven[near]).max() > 0.2 * np.ptp(driven):
             continue
-        # The value at rest of the straight line through the three points nearest to rest.
+        # A straight line through the three points nearest to rest gives the stress at rest.
         offset = np.polyfit(driven[near], curve.stress[near], 1)[1] if np.ptp(driven[near]) > 0 else 0.0
         if abs(offset) > _PRELOAD * curve.scale and np.abs(driven[near]).min() < 0.02 * np.ptp(driven):
             told.append(
-                f"{curve.label}: the stress is {offset:.3g} Pa where the sample is not deformed, and every law has 0 "
-                "there: subtract the preload, or count the stretch from the unloaded length"
+                f"{curve.label}: the stress is {offset:.3g} Pa where the sample is not deformed, but every law has a "
+                "stress of 0 there: subtract the preload, or compute the stretch with the unloaded length"
             )
     return told
 
@@ -339,18 +347,19 @@ def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
         error = best.curve_errors[curve.label]
         if not error < HOPELESS:
             told.append(
-                f"{curve.label}: no law follows this curve, the nearest ({best.label}) misses it by "
-                f"{100 * error:.0f} % of its stress; check its unit, signs and axes, or fit it on its own"
+                f"{curve.label}: no law follows this curve, the nearest ({best.label}) misses it by {100 * error:.0f} "
+                "% of its stress: check unit, signs and axes, or fit this curve alone"
             )
     return told
 
 
-#: Difference of AICc up to which two laws describe data as well as each other.
+#: Two laws describe the data equally well if their AICc differs by less than this.
 TIE = 4.0
 
 
 def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
-    """A sentence if laws other than the best one follow the `data` ("sweep", "curves") as well; the best is first."""
+    """A sentence if other laws follow the `data` ("sweep", "curves") as well as the best law. The best law comes first
+    in `fits`."""
     best = fits[0]
     others = [f for f in fits[1:] if f.aicc - best.aicc < TIE]
     if not others:
@@ -359,6 +368,6 @@ def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
     moduli = [f.shear_modulus for f in (best, *others)]
     return [
         f"{which} follow the {data} as well as {best.label} does (AICc within {TIE:g}), with G0 from {min(moduli):.4g} "
-        f"to {max(moduli):.4g} Pa: the {data} cannot decide between these laws, and beyond the strains measured they "
-        "differ"
+        f"to {max(moduli):.4g} Pa: the {data} cannot decide between these laws, and the laws differ beyond the "
+        "measured strains"
     ]

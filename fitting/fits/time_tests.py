@@ -21,11 +21,14 @@ from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Part of the largest load by which it changes from row to row if it moves; the most loads that are told apart.
+#: The load moves if it changes from row to row by more than this part of its maximum; and maximum number of loads that
+#: are treated separately.
 STILL, MOST_LOADS = 0.01, 10
-#: Most answers (measured responses) that are fitted; of a longer record, some at equal steps of log time.
+#: Maximum number of readings (measured responses) that are fitted. From a longer record, readings at about equal steps
+#: of log time are used.
 MOST = 300
-#: Key in `TimeFit.details`: answers of independent noise that measure as much, if neighbours share their noise.
+#: Key in `TimeFit.details`, if neighbours share their noise: so many readings with independent noise would tell as
+#: much.
 INDEPENDENT = "independent_answers"
 #: Starting points of a fit.
 STARTS = 12
@@ -39,7 +42,7 @@ class TimeFit(NamedTuple):
     solution: Solution
     uncertainty: Estimate
     converged: bool
-    time: np.ndarray  # (m,) [s] of the answers that were fitted
+    time: np.ndarray  # (m,) [s] of the fitted readings
     measured: np.ndarray  # (m,) stress [Pa]; in creep strain [1]
     fitted: np.ndarray
     scales: np.ndarray  # (m,) divisors of relative errors
@@ -47,7 +50,7 @@ class TimeFit(NamedTuple):
     run_time: float
     compile_time: float
     details: Content
-    parameters: Estimate | None = None  # of the model's own numbers; None: these are the modes
+    parameters: Estimate | None = None  # parameters of another model; None: the modes are the parameters
 
     @property
     def modes(self) -> int:
@@ -56,13 +59,14 @@ class TimeFit(NamedTuple):
 
     @property
     def relative_errors(self) -> np.ndarray:
-        """|fit - data| (m,) divided by the scales: by the data, with a lower bound for small ones."""
+        """|fit - data| (m,) divided by the scales. A scale is the size of the reading, with a lower bound for small
+        readings."""
         return np.abs(self.fitted - self.measured) / self.scales
 
 
 @lru_cache(maxsize=8)
 def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
-    """A function (u, time, driven, rows, answer, scales) -> residuals (m,), for relaxation or creep."""
+    """A function from (u, time, driven, rows, answer, scales) to residuals (m,), for relaxation or creep."""
     natural = generalised_maxwell.natural_fluid if name == FLUID.name else generalised_maxwell.natural
 
     def residuals(u, time, driven, rows, answer, scales):
@@ -72,16 +76,16 @@ def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
 
 
 def thinned(test: TimeTest) -> np.ndarray:
-    """Rows (m,) to fit: all, or about `MOST` of them, spread over the log of the time since a load began to move."""
+    """Rows (m,) to fit: all rows, or about `MOST` rows spread over the log of the time since a load began to move."""
     rows = np.flatnonzero(test.used)
     if len(rows) <= MOST:
         return rows
     begins = _begins_of_loads(test)
-    # A row at the time of a beginning belongs to what was before.
+    # A row at the time at which a load begins belongs to the load before.
     of_load = np.searchsorted(begins, test.time[rows]) - 1
     picked: list[np.ndarray] = []
     left = MOST
-    # What loads of few rows do not need is left to the others.
+    # If a load has few rows, the other loads may use more rows.
     for done, k in enumerate(np.argsort(np.bincount(of_load, minlength=len(begins)), kind="stable")):
         own = rows[of_load == k]
         picked.append(own[_spread_places(test.time[own] - begins[k], left // (len(begins) - done))])
@@ -91,7 +95,7 @@ def thinned(test: TimeTest) -> np.ndarray:
 
 def _begins_of_loads(test: TimeTest) -> np.ndarray:
     """Times [s] at which the driven quantity begins to move, from `TimeTest.begun` on. If there are more than
-    `MOST_LOADS`, as in cycles, only the first.
+    `MOST_LOADS` (for example in cycles), only the first time.
     """
     driven = np.abs(test.driven)
     still = max(STILL * float(driven.max()), 8 * noise_of_series(test.driven))
@@ -102,8 +106,8 @@ def _begins_of_loads(test: TimeTest) -> np.ndarray:
 
 
 def _spread_places(time: np.ndarray, number: int) -> np.ndarray:
-    """About so many places of rising times (n,) [s] above 0: those that are far apart in log time, and of the others
-    some at equal distances.
+    """About `number` indices of rising times (n,) [s] above 0. Times that are far apart in log time are all kept; from
+    the others, some at equal distances are kept.
     """
     if len(time) <= number:
         return np.arange(len(time))
@@ -117,7 +121,8 @@ def _spread_places(time: np.ndarray, number: int) -> np.ndarray:
 
 
 def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
-    """Choose the number of modes, and solid or fluid, by the lowest criterion among fits that the test determines.
+    """Choose the number of modes, and between solid and fluid, by the lowest criterion. Only fits that the test
+    determines can be chosen.
 
     Args:
         test: data.
@@ -132,14 +137,14 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
     tried = _raised(test, rows, numbers, Kind())
     solid = min(tried, key=criterion)
     stays = solid.model.shear_modulus * (1 - solid.model.ratios.sum())
-    if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # the material may be a fluid
+    if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # then the material may be a fluid
         begin = max(numbers.start, solid.modes - 1)
         tried += _raised(test, rows, range(begin, numbers.stop), FLUID)
     return _told(_chosen_model(tried, test), test, tried)
 
 
 def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> list[TimeFit]:
-    """Fits with more and more modes; the search ends after two that do not lower the criterion."""
+    """Fits with more and more modes. The search ends after two fits in a row that do not lower the criterion."""
     tried: list[TimeFit] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -179,12 +184,14 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
 
 
 def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
-    """Residuals (m,) at u and the data, for Prony modes of a solid or a fluid."""
+    """A function of u and the data that returns the residuals (m,), and these data; for Prony modes of a solid or a
+    fluid."""
     return _residuals(test.kind, kind.name), data_in_time(test)
 
 
 def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
-    """Times (n,), driven quantity (n,), rows (m,) of the answers in both, answers (m,) and their scales (m,)."""
+    """Times (n,), driven quantity (n,), the rows (m,) of the readings among these times, readings (m,) and their scales
+    (m,)."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
     kept[rows] = True
@@ -193,7 +200,8 @@ def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
 
 
 def _corners_in_time(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
-    """Which points (n,) are corners of the driven quantity. Points with the same slope on both sides are not."""
+    """For each point (n,): whether the driven quantity has a corner there. It has none if the slope is the same on both
+    sides."""
     kept = np.ones(len(time), bool)
     middle = driven[:-2] + (driven[2:] - driven[:-2]) * (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
     kept[1:-1] = np.abs(driven[1:-1] - middle) > 1e-12 * np.max(np.abs(driven))
@@ -207,16 +215,17 @@ def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
 
 
 def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Array:
-    """Predicted measurements: G' then G'' [Pa] at angular frequencies, or the answers at the rows of a driven test.
+    """Predicted measurements: G' then G'' [Pa] at angular frequencies; velocities and attenuations of shear waves; or
+    the readings of a test in time.
 
-    It works with JAX arrays; for a sweep and for dispersion with NumPy arrays as well (`fitting.methods.host`).
+    It works with JAX arrays. For a sweep and for dispersion it also works with NumPy arrays (`fitting.methods.host`).
 
     Args:
         kind: "sweep", "dispersion", "relaxation" or "creep".
         model: Prony modes.
         at: angular frequencies (n,) [rad/s], or times (n,) [s].
-        drive: for a test in time the driven quantity (n,) and the rows (m,) of the answers; for dispersion the density,
-            and the indices (m,) of the measured numbers among velocities [m/s] followed by attenuations [1/m].
+        drive: for a test in time, the driven quantity (n,) and the rows (m,) of the readings. For dispersion, the
+            density and the indices (m,) of the measured values among velocities [m/s] followed by attenuations [1/m].
     """
     xp = arrays_of(model.ratios)
     if kind == "sweep":
@@ -232,7 +241,7 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
 
 
 def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
-    """Stress divided by strain (m,) [Pa] at the fitted answers, which is roughly G(t), and their times."""
+    """Stress divided by strain (m,) [Pa] at the fitted readings (roughly G(t)), and the times of these readings."""
     rows = thinned(test)
     driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
     ratio = answer / np.maximum(driven, 1e-6 * driven.max())
@@ -240,21 +249,23 @@ def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
 
 
 def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and right-hand side of relative least squares for the equilibrium modulus and modes with these times."""
+    """Matrix and right-hand side of a linear least-squares problem: its unknowns are the equilibrium modulus and the
+    strengths of modes with these times, its residuals are relative."""
     modulus, at = apparent(test)
     A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
     return A / modulus[:, None], np.ones(len(at))
 
 
 def _starts(test: TimeTest, modes: int, kind: Kind) -> np.ndarray:
-    """Starts: times over the test's decades, strengths from the apparent modulus by non-negative least squares."""
+    """Starts with times spread over the decades of the test. Non-negative least squares on the apparent modulus gives
+    the strengths."""
     each = generalised_maxwell.times_over(test.resolved, modes, STARTS)
     found = [generalised_maxwell.start_at_times(times, *apparent_equations(test, times)) for times in each]
     return np.stack([generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u for u in found])
 
 
 def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
-    """Add the table of the fits tried, and the warnings."""
+    """Add the table of all tried fits, and the warnings."""
     lowest = min(map(criterion, tried))
     table: list[Content] = [
         {
@@ -291,7 +302,7 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
 
 
 def _without_relaxation(test: TimeTest, chosen: TimeFit) -> str:
-    """A sentence if one modulus, without any mode, explains the test as well as the chosen fit does."""
+    """A sentence if one modulus without any mode explains the test as well as the chosen fit."""
     rows = thinned(test)
     x, y, s = test.driven[rows], test.answer[rows], _scales(test, rows)
     square = float(np.sum((x / s) ** 2))
@@ -305,12 +316,13 @@ def _without_relaxation(test: TimeTest, chosen: TimeFit) -> str:
     modulus = ratio if test.kind == "relaxation" else 1 / ratio
     return (
         f"the test shows no relaxation: an elastic material of {modulus:.4g} ± {modulus * error:.2g} Pa explains it as "
-        "well; ratios and relaxation times mean nothing here, and G0 and the equilibrium modulus are this modulus"
+        "well; ratios and relaxation times have no meaning here, and this is the value of G0 and of the equilibrium "
+        "modulus"
     )
 
 
 def structured_misfit(fit: TimeFit) -> list[str]:
-    """A sentence if the residuals keep their sign over many answers."""
+    """A sentence if the residuals keep their sign over many readings."""
     residuals = fit.fitted - fit.measured
     runs, chance = kramers_kronig.runs_probability(np.sign(residuals))
     if chance >= kramers_kronig.CHANCE or fit.relative_errors.max() <= viscoelastic.EXACT:

@@ -2,7 +2,7 @@
 
 Tests are sweeps, relaxation, creep, and phase velocities of shear waves.
 
-Every test has noise of its own. Its size is found with the fit, from the residuals of the test.
+Every test has its own noise. The size of this noise is estimated during the fit, from the residuals of the test.
 """
 
 import time
@@ -25,20 +25,22 @@ from fitting.waves.dispersion import Dispersion
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Rounds of fit and weights, smallest relative noise of a test, and number of starts.
+#: Number of rounds (fit, then new weights), minimum relative noise of a test, and number of starts.
 ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
-#: Ratio of a test's noise in the common fit to its noise in a fit to it alone, above which the tests do not agree.
+#: The tests do not agree if the noise of a test in the common fit, divided by its noise in a fit to this test alone,
+#: exceeds this ratio.
 APART = 1.5
-#: Misfit above which there is a warning.
+#: A warning is given if the misfit exceeds this value.
 MISSED = 0.05
-#: Further modes that a fit to one test may have, and the least fall of the criterion by each (Kass and Raftery 1995).
+#: Maximum number of additional modes in a fit to one test, and the minimum decrease of the criterion that an additional
+#: mode must bring (Kass and Raftery 1995).
 MORE, CLEARLY = 2, 10.0
 
 Measured = Sweep | TimeTest | Dispersion
 
 
 class ResolvedBand(NamedTuple):
-    """The relaxation times that one of the tests resolves."""
+    """The range of relaxation times [s] that the tests resolve together."""
 
     resolved: tuple[float, float]
 
@@ -48,9 +50,9 @@ class Share(NamedTuple):
 
     name: str  # sweep, dispersion, relaxation or creep
     source: str
-    points: int  # measured numbers
-    noise: float  # of the numbers over their scales, from the common fit; given deviations are not reduced
-    alone: float  # this noise from a fit of as many modes to this test alone
+    points: int  # number of measured values
+    noise: float  # relative to the scales, from the common fit; given standard deviations are not reduced
+    alone: float  # the same noise from a fit to this test alone
     misfit: float  # relative misfit of the common fit
     misfit_alone: float  # relative misfit of the fit to this test alone
     mean_relative_error: float
@@ -67,12 +69,12 @@ class Together(NamedTuple):
     uncertainty: Estimate
     converged: bool
     shares: list[Share]
-    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], velocities then attenuations, or the answers
+    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], velocities then attenuations, or the readings
     tried: list[Content]
     warnings: tuple[str, ...]
     run_time: float
     compile_time: float
-    parameters: Estimate | None = None  # of the model's own numbers; None: these are the modes
+    parameters: Estimate | None = None  # parameters of another model; None: the modes are the parameters
     details: Content | None = None  # of the model
 
     @property
@@ -82,7 +84,7 @@ class Together(NamedTuple):
 
 
 def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
-    """Arrays that predict a test, its measured numbers and their scales."""
+    """Arrays from which a test is predicted, its measured values, and the scales of these values."""
     if isinstance(test, Sweep):
         return (test.angular_frequency,), np.concatenate([test.storage, test.loss]), np.concatenate(test.deviations)
     if isinstance(test, Dispersion):
@@ -93,8 +95,8 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """Sizes for relative errors of the reported numbers: the numbers themselves; bounded below in tests in time; for a
-    loss that scatters with the phase |G*|."""
+    """Divisors for relative errors of the measured values. Mostly these are the values themselves. In tests in time
+    they have a lower bound. For a loss modulus that scatters with the phase angle, the divisor is |G*|."""
     _, measured, scales = reported_numbers(test)
     if isinstance(test, Sweep) and test.sd_estimated:
         return np.concatenate([test.storage, np.hypot(test.storage, test.loss)])
@@ -102,12 +104,13 @@ def sizes_of(test: Measured) -> np.ndarray:
 
 
 def least_noise(test: Measured) -> float:
-    """Lower bound of a test's noise divided by its scales: given standard deviations are not reduced."""
+    """Lower bound of the noise of a test, relative to its scales. It is 1 if standard deviations are given: they are
+    not reduced."""
     return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
 
 
 def tests_evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (…, m) of all tests, one after the other, and their Jacobian (…, m, P) at u (…, P), in NumPy."""
+    """Residuals (…, m) of all tests, in the order of the tests, and their Jacobian (…, m, P) at u (…, P), in NumPy."""
 
     def one(name: str, at: tuple, measured: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if name in ("relaxation", "creep"):
@@ -131,7 +134,7 @@ def name_of(test: Measured) -> str:
 def fit(
     tests: Sequence[Measured], modes: int | str = "auto", progress: Callable[[str], None] = lambda text: None
 ) -> Together:
-    """Choose the number of modes by the lowest criterion among fits that the tests together determine.
+    """Choose the number of modes by the lowest criterion. Only fits that the tests together determine can be chosen.
 
     Args:
         tests: two or more.
@@ -159,7 +162,7 @@ def fit(
 
 
 def resolved_by(tests: Sequence[Measured]) -> tuple[float, float]:
-    """Shortest and longest relaxation time [s] that one of the tests resolves."""
+    """Shortest and longest relaxation time [s] that at least one of the tests resolves."""
     ends = np.array([t.resolved for t in tests])
     return float(ends[:, 0].min()), float(ends[:, 1].max())
 
@@ -167,7 +170,7 @@ def resolved_by(tests: Sequence[Measured]) -> tuple[float, float]:
 def _raised_together(
     tests: list[Measured], band: ResolvedBand, numbers: range, kind: Kind, progress: Callable
 ) -> list[Together]:
-    """Fits with more and more modes; the search ends after two that do not lower the criterion."""
+    """Fits with more and more modes. The search ends after two fits in a row that do not lower the criterion."""
     tried: list[Together] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -185,14 +188,14 @@ def _able(fit: Together, band: ResolvedBand) -> bool:
 
 
 def criterion_of_all(fit: Together) -> float:
-    """Bayesian information criterion with the noise of each test estimated."""
+    """Bayesian information criterion; the noise of each test is estimated from the fit."""
     total = sum(s.points for s in fit.shares)
     free = len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
     return float(sum(s.points * 2 * np.log(s.noise) for s in fit.shares) + free * np.log(total))
 
 
 def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> Together:
-    """Fit one number of modes to all tests; the fit and the weights are found in turn."""
+    """Fit a given number of modes to all tests. Fits and new weights alternate."""
     parts = [reported_numbers(t) for t in tests]
     begin, evaluate = time.perf_counter(), partial(tests_evaluated, list(map(name_of, tests)), kind)
     starts, noise = starts_of_all(tests, band, modes, kind), np.full(len(tests), 0.03)
@@ -201,7 +204,7 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
         data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
         found = from_starts(evaluate, starts, data)
         noise = noises(tests, parts, np.asarray(found.residuals), noise, len(found.u))
-        starts = np.asarray(found.u)[None]  # near the minimum already
+        starts = np.asarray(found.u)[None]  # the next round begins near the minimum
     running = time.perf_counter() - begin
     modes_found = kind.maxwell(found.u)
     shares, fitted = misfits(tests, data, np.asarray(found.residuals), noise, len(found.u))
@@ -215,13 +218,14 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
 def misfits(
     tests: list[Measured], data: list, residuals: np.ndarray, noise: np.ndarray, free: float
 ) -> tuple[list[Share], list[np.ndarray]]:
-    """The misfit of each test, and the numbers that the fit predicts for it.
+    """The misfit of each test, and the values that the fit predicts for this test.
 
     Args:
         tests: K tests.
-        data: for each test the arrays that predict it, its measured numbers, and the divisors of its residuals.
-        residuals: of all tests; rows of a prior may follow.
-        noise: noise (K,) of the tests divided by their scales.
+        data: for each test, the arrays from which it is predicted, its measured values, and the divisors of its
+            residuals.
+        residuals: residuals of all tests; rows of a prior may follow.
+        noise: noise (K,) of the tests, relative to their scales.
         free: number of parameters that the data determine.
     """
     counts = [len(y) for _, y, _ in data]
@@ -237,7 +241,8 @@ def misfits(
 
 
 def over_own_noise(found: Solution, shares: list[Share], ratio: np.ndarray) -> Solution:
-    """The minimum with the residuals of each test divided by its noise; `ratio` (K,): used noise / found noise.
+    """The solution with the residuals of each test divided by the noise found for this test. `ratio` (K,): used noise /
+    found noise.
 
     Rows of a prior are multiplied by the mean ratio, because the weight of a prior refers to the mean noise.
     """
@@ -252,7 +257,7 @@ def _size_of_noise(residuals: np.ndarray, freedom: float) -> float:
 
 
 def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: float) -> np.ndarray:
-    """Relative noise of each test: root mean square of its residuals, by its degrees of freedom."""
+    """Relative noise of each test: the root of the sum of its squared residuals, divided by its degrees of freedom."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals, np.cumsum(counts)[:-1])
     out = []
@@ -262,7 +267,8 @@ def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.n
 
 
 def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
-    """Starts (S, P): times over the decades of the tests, strengths by non-negative least squares of their moduli."""
+    """Starts (S, P) with times spread over the decades of the tests. Non-negative least squares on the moduli of the
+    tests gives the strengths."""
     out = []
     for times in generalised_maxwell.times_over(band.resolved, modes, STARTS):
         A, b = (np.concatenate(rows) for rows in zip(*(_apparent(t, times) for t in tests), strict=True))
@@ -272,7 +278,8 @@ def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: K
 
 
 def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and right-hand side of relative least squares for the equilibrium modulus and the modes."""
+    """Matrix and right-hand side of a linear least-squares problem for the equilibrium modulus and the strengths of the
+    modes; its residuals are relative."""
     if isinstance(test, TimeTest):
         return time_tests.apparent_equations(test, times)
     b = np.concatenate(_moduli_of(test))
@@ -281,18 +288,18 @@ def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _moduli_of(test: Sweep | Dispersion) -> tuple[np.ndarray, ...]:
-    """G' and G'' [Pa]; from velocities alone only about |G|."""
+    """G' and G'' [Pa]. Velocities alone give only one modulus, about |G*|."""
     if isinstance(test, Sweep):
         return test.storage, test.loss
     if test.attenuation is None:
         return (test.density * test.velocity**2,)
     found = shear_waves.moduli_of(test.velocity, test.attenuation, test.angular_frequency, test.density)
-    # A fit cannot begin from moduli that noise makes negative: small positive ones replace them.
+    # Noise can make moduli negative, and a fit cannot begin from negative moduli. Small positive moduli replace them.
     return tuple(np.maximum(G, 1e-2 * np.abs(found[0]).max()) for G in found)
 
 
 def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) -> Together:
-    """Add the shares of the tests, the table of the fits tried, and the warnings."""
+    """Add the shares of the tests, the table of all tried fits, and the warnings."""
     begin = time.perf_counter()
     chosen = chosen._replace(shares=_shares(chosen))
     lowest = min(map(criterion_of_all, tried))
@@ -323,17 +330,18 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
 
 
 def disagreements(shares: list[Share]) -> list[str]:
-    """A sentence on each test that the common fit misses by more than a fit to this test alone."""
+    """A sentence on each test that the common fit misses by much more than a fit to this test alone."""
     return [
-        f"the tests do not agree: {s.source or s.name} is missed by {100 * s.misfit:.2g} % in the common fit and by "
-        f"{100 * s.misfit_alone:.2g} % by itself; look for another temperature, strain or sample"
+        f"the tests do not agree: {s.source or s.name} is missed by {100 * s.misfit:.2g} % in the common fit, but "
+        f"only by {100 * s.misfit_alone:.2g} % in a fit to this test alone: look for another temperature, strain or "
+        "sample"
         for s in shares
         if s.noise > APART * s.alone and s.misfit > 0.01
     ]
 
 
 def missed(shares: list[Share]) -> list[str]:
-    """A sentence on each test that the common fit misses, and that a fit to this test alone misses as well."""
+    """A sentence on each test that both the common fit and a fit to this test alone miss."""
     return [
         f"{viscoelastic.MISSES} of {s.source or s.name} by {100 * s.misfit:.2g} %: try another --model, or look at them"
         for s in shares
@@ -342,7 +350,7 @@ def missed(shares: list[Share]) -> list[str]:
 
 
 def structured(fit: Together) -> list[str]:
-    """A sentence on each test whose residuals keep their sign over many numbers."""
+    """A sentence on each test whose residuals keep their sign over many values."""
     out = []
     for test, fitted in zip(fit.tests, fit.fitted, strict=True):
         residuals = fitted - reported_numbers(test)[1]
@@ -361,7 +369,7 @@ def structured(fit: Together) -> list[str]:
 
 
 def _shares(fit: Together) -> list[Share]:
-    """The contribution of each test: errors without it, and the misfit of a fit to this test alone."""
+    """The contribution of each test: the errors without this test, and the misfit of a fit to this test alone."""
     u = np.asarray(fit.solution.u)
     vector = host.with_jacobian(partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)[1]
     rows = np.asarray(fit.solution.jacobian)
@@ -369,13 +377,14 @@ def _shares(fit: Together) -> list[Share]:
 
 
 def _residuals_alone(fit: Together, k: int) -> np.ndarray:
-    """Residuals of all tests, divided by their scales, of a fit to test k alone; 0 for the others.
+    """Residuals of all tests, divided by their scales, from a fit to test k alone. The residuals of the other tests are
+    0.
 
-    It has as many modes as the common fit, or more if they follow the test better: a common fit of tests that
-    contradict each other may have too few.
+    This fit has as many modes as the common fit, or more modes if they follow the test better. If tests contradict each
+    other, their common fit may have too few modes.
     """
     parts = [reported_numbers(t) for t in fit.tests]
-    # Infinite deviations exclude a test.
+    # Infinite standard deviations exclude a test.
     data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
     evaluate = partial(tests_evaluated, list(map(name_of, fit.tests)), fit.kind)
     count, u = len(parts[k][1]), np.asarray(fit.solution.u)[None]
@@ -388,7 +397,7 @@ def _residuals_alone(fit: Together, k: int) -> np.ndarray:
         return best
     lowest = _criterion_alone(best, count, free)
     for modes in range(fit.modes, fit.modes + MORE + 1):
-        # Moduli far from the others' are far from the starts of all tests.
+        # If the moduli of this test are far from the moduli of the others, the starts of all tests are no good starts.
         starts = starts_of_all([fit.tests[k]], own, modes, fit.kind)
         r, free = np.asarray(from_starts(evaluate, starts, data).residuals), starts.shape[1]
         criterion = _criterion_alone(r, count, free)
@@ -398,23 +407,23 @@ def _residuals_alone(fit: Together, k: int) -> np.ndarray:
 
 
 def _criterion_alone(r: np.ndarray, count: int, free: int) -> float:
-    """Bayesian information criterion of a fit with `free` numbers to the `count` numbers of one test."""
+    """Bayesian information criterion of a fit with `free` parameters to the `count` values of one test."""
     return float(2 * count * np.log(max(_size_of_noise(r, count), QUIETEST)) + free * np.log(count))
 
 
 def shares_by_rows(
     fit: Together, jacobian: np.ndarray, slope: np.ndarray, values: np.ndarray, alone: Callable[[int], np.ndarray]
 ) -> list[Share]:
-    """The shares of the tests: the errors with the rows of the other tests only, and the misfit of a fit to each test
+    """The shares of the tests: the errors from the rows of the other tests only, and the misfit of a fit to each test
     alone.
 
     Args:
         fit: the common fit.
-        jacobian: of the residuals of all tests by u; rows of a prior may follow.
-        slope: derivative of the reported numbers by u.
-        values: of the reported numbers.
-        alone: index of a test -> residuals, divided by their scales, of a fit to this test alone; its rows are where
-            they are in the common fit.
+        jacobian: derivatives of the residuals of all tests by u; rows of a prior may follow.
+        slope: derivatives of the reported parameters by u.
+        values: the reported parameters.
+        alone: function from the index of a test to the residuals, divided by their scales, of a fit to this test alone.
+            The rows are in the order of the common fit.
     """
     counts = [s.points for s in fit.shares]
     free = jacobian.shape[1] if fit.kind.effective is None else fit.kind.effective

@@ -25,16 +25,16 @@ OPTIMIZERS = ("levenberg-marquardt", "bfgs")
 
 
 class Kind(NamedTuple):
-    """The meaning of the numbers u of a fit; by default they are the Prony modes."""
+    """The meaning of the variables u of a fit. By default, u describes Prony modes."""
 
     name: str = "prony"
     maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
-    names: tuple[str, ...] = ()  # of its own parameters; empty: these are the modes
+    names: tuple[str, ...] = ()  # of the model's parameters; empty: the modes are the parameters
     units: tuple[str, ...] = ()
-    values: Callable[[Array], Array] | None = None  # u -> its own parameters (P,)
+    values: Callable[[Array], Array] | None = None  # u -> parameters of the model (P,)
     prior: Callable[[Array], Array] | None = None  # u -> rows that follow the residuals of the data
     effective: float | None = None  # number of parameters that the data determine; None: the length of u
-    moduli: Callable[[Array, Array], tuple[Array, Array]] | None = None  # (u, omega) -> its own G', G'' (n,) [Pa]
+    moduli: Callable[[Array, Array], tuple[Array, Array]] | None = None  # (u, omega) -> G', G'' (n,) [Pa]
 
 
 class Fit(NamedTuple):
@@ -52,8 +52,8 @@ class Fit(NamedTuple):
     compile_time: float
     details: Content
     kind: Kind = Kind()
-    parameters: Estimate | None = None  # of the model's own numbers; None: these are the modes
-    rivals: tuple["Fit", ...] = ()  # the other models of the choice
+    parameters: Estimate | None = None  # parameters of another model; None: the modes are the parameters
+    rivals: tuple["Fit", ...] = ()  # the other models that could be chosen
 
     @property
     def modes(self) -> int:
@@ -67,7 +67,7 @@ class Fit(NamedTuple):
 
 
 def timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
-    """Result, seconds of compilation, seconds of the run; a function seen with these shapes is not compiled again."""
+    """Result, seconds of compilation, seconds of the run. A function is not compiled again for the same shapes."""
     begin = time.perf_counter()
     arguments = jax.tree.map(jnp.asarray, arguments)
     leaves, tree = jax.tree.flatten(arguments)
@@ -113,7 +113,7 @@ def check_modes(sweep: Sweep, modes: int) -> None:
 
 
 def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimizer: str = "levenberg-marquardt") -> Fit:
-    """Fit the closed-form moduli from several starts; the best minimum is kept.
+    """Fit the closed-form moduli from several starts, and keep the best minimum.
 
     Args:
         sweep: data; residuals are divided by `sweep.deviations`.
@@ -129,7 +129,7 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
 
 
 def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer: str = OPTIMIZERS[0]) -> Fit:
-    """The best fit over `starts` (S, P) of Prony modes, of a solid or (by `kind`) of a fluid."""
+    """The best fit of Prony modes over `starts` (S, P). `kind` tells whether they are a solid or a fluid."""
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()
@@ -141,12 +141,13 @@ def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer:
 
 
 def residuals_of(kind: Kind) -> Callable[..., Array]:
-    """Residuals of Prony modes of a solid or a fluid, in NumPy or JAX."""
+    """The function for residuals of Prony modes of a solid or a fluid, in NumPy or JAX."""
     return generalised_maxwell.fluid_residuals if kind.name == FLUID.name else generalised_maxwell.residuals
 
 
 def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling: float, details: Content) -> Fit:
-    """The fit in closed form at a minimum over u of `kind`, whose first residuals are those of the data."""
+    """The closed-form fit at a minimum over the variables u of `kind`. The first residuals of `found` belong to the
+    data."""
     scales, measured = np.concatenate(sweep.deviations), np.concatenate([sweep.storage, sweep.loss])
     storage, loss = np.split(np.asarray(found.residuals)[: len(measured)] * scales + measured, 2)
     simulated = BestPoint("closed-form", found, storage, loss)
@@ -164,7 +165,7 @@ class BestPoint(NamedTuple):
 
 
 def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float], details: Content) -> Fit:
-    """The fit with its errors and warnings at a minimum; `seconds` are those of the run and of compilation."""
+    """The fit at a minimum, with its errors and warnings. `seconds`: time of the run, and time of compilation."""
     found, storage, loss = at.solution, at.storage, at.loss
     spread = uncertainty.estimate(found, sweep.noise_given, kind.maxwell, (2 * len(storage), kind.effective))
     own = None
@@ -191,8 +192,8 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
 def _of_noise_shown(
     estimate: Estimate, natural_of: Callable[[Array], Array], found: Solution, omega: np.ndarray
 ) -> Estimate:
-    """The estimate with the errors for noise that repeats of a frequency share, or of which G' and G'' each have their
-    own, if their residuals show it."""
+    """The estimate with standard errors for the noise that the residuals show: noise that repeated measurements at one
+    frequency share, or noise of different size in G' and G''."""
     J, r, slope = np.asarray(found.jacobian), np.asarray(found.residuals), with_slope(natural_of, found.u)[1]
     root = _of_repeats(J, r, slope, omega)
     if root is None:
@@ -205,8 +206,9 @@ def _of_noise_shown(
 
 
 def _of_repeats(J: np.ndarray, r: np.ndarray, slope: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
-    """Square root of the covariance for noise that the repeats of G', or of G'', at a frequency share; None if none."""
-    of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G'' is measured for itself
+    """Square root of the covariance for noise that repeated values of G', or of G'', at one frequency share. None if
+    there is no such noise."""
+    of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G' and G'' do not share a factor
     _, group, counts = np.unique(of_row, return_inverse=True, return_counts=True)
     if np.median(counts) < 2:
         return None
@@ -221,7 +223,8 @@ FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
 
 def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> tuple[str, ...]:
     """A sentence with the worst point, if the model does not follow the data."""
-    # A loss that scatters with the phase is as good, in percent of itself, as it is large: compare it with |G*|.
+    # If the loss modulus scatters with the phase angle, its relative error is large where it is small. So it is
+    # compared with |G*|.
     size = np.hypot(sweep.storage, sweep.loss) if sweep.sd_estimated else sweep.loss
     e = np.abs(np.concatenate([storage / sweep.storage - 1, (loss - sweep.loss) / size]))
     if e.mean() < 0.05 and e.max() < 0.3:
@@ -240,23 +243,25 @@ def identifiable(fit: Fit, sweep: Sweep) -> bool:
 
 
 def number_of_parameters(fit: Fit) -> float:
-    """Number of parameters; with a prior the effective number."""
+    """Number of parameters; for a model with a prior, the effective number."""
     return len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
 
 
 def mean_square(fit: Fit) -> float:
-    """Mean square of the residuals of the data; not below roundoff, where exact fits differ by chance."""
+    """Mean square of the residuals of the data, with a lower bound at roundoff: below it, exact fits differ only by
+    chance."""
     m = 2 * len(fit.storage)
     return max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, ZERO)
 
 
 def information_criterion(fit: Fit) -> float:
-    """Bayesian information criterion of k parameters with the noise level estimated: m ln(RSS/m) + k ln m."""
+    """Bayesian information criterion m ln(RSS/m) + k ln m, for k parameters and m residuals with an estimated noise
+    level."""
     m = 2 * len(fit.storage)
     return float(m * np.log(mean_square(fit)) + number_of_parameters(fit) * np.log(m))
 
 
-#: Mean relative residual at which a fit is exact to the digits of any data.
+#: Below this relative residual, a fit is exact to the digits of any data.
 EXACT = 1e-7
 
 
@@ -266,11 +271,11 @@ def choose_modes(
     optimizer: str = OPTIMIZERS[0],
     progress: Callable[[str], None] = lambda text: None,
 ) -> tuple[Fit, list[Fit]]:
-    """Raise N while the criterion falls and every mode is identifiable, or until the fit is exact. Return the chosen
-    fit and all tried. `progress` is called with the name of each fit.
+    """Raise the number of modes while the criterion falls and every mode is identifiable, or until the fit is exact.
+    Return the chosen fit and all tried fits. `progress` is called with the name of each fit.
 
-    One failure may be a local minimum: the search ends at the second in a row. A number of modes whose computation
-    breaks down is such a failure, and is named in the warnings; the other fits are kept.
+    One failure may be a local minimum, so the search ends at the second failure in a row. If the computation for a
+    number of modes breaks down, this also is a failure. A warning names it, and the other fits are kept.
     """
     cap = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
     tried: list[Fit] = []
@@ -319,16 +324,14 @@ def choose_modes(
 
 
 def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int, str]) -> list[str]:
-    """Warnings on other numbers of modes: a closer fit that was not chosen, and fits that broke down."""
+    """Warnings on fits with other numbers of modes: a closer fit that was not chosen, and fits that failed."""
     out = []
     closer = min(tried, key=information_criterion)
     if information_criterion(closer) < information_criterion(chosen) - 10:
         errors = [float(np.mean(f.relative_errors(sweep))) for f in (closer, chosen)]
         out.append(closer_but_not_chosen(closer.modes, errors, closer.converged))
     for modes, reason in broken.items():
-        out.append(
-            f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}) and took no part in the choice"
-        )
+        out.append(f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}) and could not be chosen")
     return out
 
 
@@ -338,17 +341,17 @@ def closer_but_not_chosen(modes: int, errors: list[float], converged: bool) -> s
     a, b = (100 * e for e in errors)
     return (
         f"{modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but {reason}; "
-        f"--modes {modes} fits them nevertheless"
+        f"--modes {modes} uses them anyway"
     )
 
 
-#: Words of the warnings that come first, the most important at the beginning.
+#: Words of the warnings that come first, in order of importance.
 MISSES, SHORT = "the fit misses the data", "the test ends before the material has relaxed"
 IMPORTANT = ("did not converge", MISSES, "Kramers-Kronig", "that relaxes", "structured misfit", SHORT, "half decade")
 
 
 def by_importance(sentences: Sequence[str]) -> tuple[str, ...]:
-    """Warnings in the order of `IMPORTANT`; the others follow in their own order."""
+    """Warnings in the order of `IMPORTANT`. The other warnings follow in their given order."""
 
     def place(sentence: str) -> int:
         return next((k for k, words in enumerate(IMPORTANT) if words in sentence), len(IMPORTANT))

@@ -1,1 +1,1 @@
-"""Sweeps at several temperatures, shifted to one: a master curve."""
+"""Master curves: sweeps at several temperatures are shifted to one temperature."""

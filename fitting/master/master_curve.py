@@ -14,14 +14,14 @@ from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Distance of a sweep from the common curve, the same over the scatter of the points, and error [decades] of a factor,
-#: above which there is a sentence.
+#: A sentence is given if the distance of a sweep from the common curve exceeds FAR_OFF and SCATTERS times the scatter
+#: of the points, or if the error of a factor exceeds LOOSE [decades].
 FAR_OFF, SCATTERS, LOOSE = 0.05, 2.0, 0.3
-#: Distance from the curve that its spline may cause by itself.
+#: The spline alone may cause distances from the curve up to this.
 SMOOTH = 1e-3
-#: Probability of a better match by chance below which factors of the moduli are named.
+#: Factors of the moduli are reported if the probability of such a better match by chance is below this.
 CHANCE = 1e-3
-#: Part of the distance from one curve that factors of the moduli must leave at most to be told.
+#: Factors of the moduli are reported only if they reduce the distance from one curve to less than this part.
 BETTER = 0.8
 
 
@@ -39,15 +39,15 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
 
     Args:
         data: two or more sweeps.
-        reference: temperature [K]; None: the middle one. The nearest measured temperature is used.
-        vertical: find factors of the moduli too; not possible if the shift factors are given.
+        reference: temperature [K]; None: the middle temperature. The nearest measured temperature is used.
+        vertical: also find factors of the moduli. This is not possible if the shift factors are given.
     """
     T = data.temperatures
     place = len(T) // 2 if reference is None else int(np.argmin(np.abs(T - reference)))
     if reference is not None and not T.min() - 10 <= reference <= T.max() + 10:
         raise InputError(
             f"--master {celsius(reference):.4g}: the sweeps are from {celsius(T[0]):.4g} to {celsius(T[-1]):.4g} °C; "
-            "give a temperature among them"
+            "give a temperature between these"
         )
     untold: list[str] = []
     if data.shift_factors is not None:
@@ -64,8 +64,8 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
     notes = [*whole.notes, *_sentences(found, _scatter_of_points(data.sweeps)), *untold]
     if vertical and found.given:
         notes.append(
-            "--vertical finds no factors of the moduli here, since the file has those of the frequencies: leave out "
-            "its column shift_factor to find both"
+            "--vertical finds no factors of the moduli here, because the file gives the factors of the frequencies: "
+            "remove its column shift_factor to find both kinds of factors"
         )
     return MasterCurve(whole._replace(notes=tuple(notes)), parts, found, laws)
 
@@ -78,16 +78,15 @@ def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
 
 
 def _scatter_of_points(sweeps: list[Sweep]) -> float:
-    """Relative scatter of the points of a sweep about a smooth curve, the median of all; 0 if it cannot be seen."""
+    """Relative scatter of the points about a smooth curve: the median over all sweeps; 0 if there are too few
+    points."""
     each = [scatter(*merged(s.angular_frequency, G)) for s in sweeps for G in (s.storage, s.loss)]
     known = [own for own in each if np.isfinite(own)]
     return float(np.median(known)) if known else 0.0
 
 
 def _sentences(found: Shifts, noise: float) -> list[str]:
-    """Notes on how the sweeps were shifted, and warnings if superposition is not valid; `noise` is the scatter of the
-    points.
-    """
+    """Notes on the shifts, and warnings if superposition is not valid. `noise`: scatter of the points."""
     T = celsius(found.temperatures)
     out = [
         f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; they lie "
@@ -104,15 +103,15 @@ def _sentences(found: Shifts, noise: float) -> list[str]:
     loose = [k for k in range(len(T)) if found.log_a_errors[k] > LOOSE]
     if loose:
         listed = ", ".join(f"{T[k]:.4g} °C (a factor of {10 ** found.log_a_errors[k]:.2g})" for k in loose[:4])
-        out.append(f"the data hardly determine the shift at {listed}: the curves are too flat to lie over each other")
+        out.append(f"the data hardly determine the shift at {listed}: the curves are too flat to be matched")
     return out
 
 
 def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
-    """A sentence if the sweeps lie over each other much better once their moduli have factors too (F-test)."""
+    """A sentence if the sweeps match much better when their moduli have factors too (F-test)."""
     try:
         other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
-        # One kind of curve for both, which is fine enough for each.
+        # Both fits use the same kind of curve, which is fine enough for each of them.
         knots = min(found.knots, other.knots)
         alone, both = (
             shifts.found(sweeps, found.temperatures, found.reference, vertical, (knots,)) for vertical in (False, True)
@@ -135,8 +134,8 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     return [
         f"the moduli have factors too ({b.min():.3g} to {b.max():.3g}): with --vertical the sweeps lie "
         f"{100 * other.apart:.2g} % from one curve instead of {100 * found.apart:.2g} %, and log10 a at {T[k]:.4g} °C "
-        f"is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}, an error that does "
-        "not contain this: give --vertical"
+        f"is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}, and this error does "
+        "not contain the difference: give --vertical"
     ]
 
 

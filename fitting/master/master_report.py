@@ -26,7 +26,7 @@ def write_master_curve(out: Path, found: MasterCurve) -> None:
 
 
 def shift_table(found: MasterCurve) -> str:
-    """Table of the factors by temperature, and lines with the laws."""
+    """A table of the factors for each temperature, and lines with the laws."""
     s, moved = found.shifts, bool(np.any(found.shifts.log_b))
     lines = [
         f"{'temperature':>12s} {'log10 a_T':>18s}{'log10 b_T':>18s}" if moved else f"{'temperature':>12s} log10 a_T"
@@ -43,7 +43,7 @@ def shift_table(found: MasterCurve) -> str:
 
 
 def shift_figure(found: MasterCurve) -> Any:
-    """The master curve by temperature on the left, factors and laws on the right."""
+    """The master curve, coloured by temperature, on the left; factors and laws on the right."""
     plt, s = pyplot(), found.shifts
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained", width_ratios=(6, 4))
     colours = plt.get_cmap("coolwarm")(np.linspace(0, 1, len(found.parts)))

@@ -1,10 +1,11 @@
 """Time-temperature superposition: shift factors that bring sweeps at several temperatures onto one smooth curve.
 
 The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
-a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency, found together with all factors by
-least squares: no model of the material is needed, and every factor has a standard error. The data decide how far apart
-the knots of the spline are: a curve that follows the noise is steeper than the true one, and the errors of factors that
-rest on its slope would be too small. Source: Ferry (1980), Viscoelastic properties of polymers, chapter 11.
+a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency. Least squares give the curve
+together with all factors. So no model of the material is needed, and every factor has a standard error. The data decide
+the distance between the knots of the spline. A curve that follows the noise would be steeper than the true curve. The
+errors of the factors depend on its slope and would be too small. Source: Ferry (1980), Viscoelastic properties of
+polymers, chapter 11.
 """
 
 from collections.abc import Sequence
@@ -17,13 +18,14 @@ from fitting.readers.frequency_sweep import Sweep, merged, scatter
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
-#: Decades between two knots of the spline that are tried, and weight of its third differences, for knots without data.
+#: Distances between two knots [decades] that are tried; and weight of the third differences of the spline, which is
+#: needed for knots without data.
 KNOTS, SMOOTH = (0.4, 0.6, 0.9, 1.35, 2.0, 3.0), 1e-3
-#: Longest step of a factor in one iteration [decades], and the step below which the iteration ends.
+#: Maximum step of a factor in one iteration [decades]; the iteration ends if all steps are below the second value.
 LONGEST, CONVERGED = 0.3, 1e-6
-#: Part of a sweep that must overlap its neighbour at its first shift, and the shifts that are tried [decades].
+#: For the first shift: the part of a sweep that must overlap its neighbour, and the shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
-#: Mean square distance of two sweeps over the variance of their noise, up to which they lie over each other.
+#: Two sweeps match if their mean square distance, divided by the variance of their noise, is at most this.
 WITHIN = 2.0
 
 
@@ -33,11 +35,11 @@ class Shifts(NamedTuple):
     temperatures: np.ndarray  # (K,) [K], ascending
     reference: int  # index of the sweep that is not shifted
     log_a: np.ndarray  # (K,) log10 of a_T
-    log_a_errors: np.ndarray  # (K,) standard errors, 0 at the reference and for factors that were given
+    log_a_errors: np.ndarray  # (K,) standard errors; 0 at the reference and for given factors
     log_b: np.ndarray  # (K,) log10 of b_T; 0 without vertical shifts
     log_b_errors: np.ndarray
     misfit: np.ndarray  # (K,) root mean square distance from the curve, relative
-    covariance: np.ndarray  # (K, K) of `log_a`: neighbours are matched to each other, so their errors are correlated
+    covariance: np.ndarray  # (K, K) of `log_a`; neighbours are matched to each other, so their errors are correlated
     knots: float  # decades between two knots of the curve
     given: bool = False
 
@@ -54,14 +56,15 @@ def found(
     vertical: bool = False,
     tried: Sequence[float] = KNOTS,
 ) -> Shifts:
-    """Shift factors by least squares, with the curve of the best corrected information criterion (Akaike's).
+    """Find shift factors by least squares. The distance of the knots is chosen by Akaike's corrected information
+    criterion.
 
     Args:
         sweeps: K sweeps.
         temperatures: (K,) [K], ascending.
         reference: index of the sweep that is not shifted.
-        vertical: moduli have factors b_T too.
-        tried: decades between two knots of the curve.
+        vertical: whether the moduli have factors b_T too.
+        tried: distances between two knots of the curve [decades] to try.
 
     Raises:
         InputError: a sweep does not match its neighbour at any shift.
@@ -79,7 +82,7 @@ def found(
 
 
 def _in_decades(sweeps: Sequence[Sweep]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """log10 of the frequencies, of G' and of G'' of every sweep."""
+    """log10 of the frequencies, of G' and of G'', for every sweep."""
     return [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
 
 
@@ -89,8 +92,8 @@ def sum_of_squares(sweeps: Sequence[Sweep], shifts: Shifts) -> float:
 
 
 def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
-    """The curve with the least corrected information criterion, when so many factors were found; the coarsest of
-    curves that the data do not determine.
+    """The result with the lowest corrected information criterion. `factors`: number of fitted factors. If the data
+    determine none of the curves, the coarsest curve.
     """
     data = 2 * sum(len(s.storage) for s in sweeps)
 
@@ -111,14 +114,14 @@ def _at_knots(
     free: np.ndarray,
     knots: float,
 ) -> Shifts:
-    """The factors with a curve whose knots are so many decades apart.
+    """The factors for a curve with a given distance of its knots.
 
     Args:
         sweeps: K sweeps.
         at: temperatures (K,) [K], and the index of the sweep that is not shifted.
         first: log a (K,) and log b (K,) to begin with.
-        free: (2, K) which of them are found.
-        knots: decades between two knots.
+        free: (2, K) whether each log a and log b is fitted.
+        knots: distance between two knots [decades].
     """
     columns, (log_a, log_b) = _in_decades(sweeps), first
     for _ in range(60):
@@ -140,7 +143,8 @@ def _at_knots(
 
 
 def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, log_a: np.ndarray) -> Shifts:
-    """Factors that are known, log10 of a_T (K,), without errors; the other arguments are those of `found`."""
+    """The result for known factors without errors, given as log10 of a_T (K,). The other arguments are the same as for
+    `found`."""
     none, exact = np.zeros(len(sweeps)), np.zeros((len(sweeps),) * 2)
     every = [
         Shifts(temperatures, reference, log_a, none, none, none, misfit, exact, knots, given=True)
@@ -151,7 +155,8 @@ def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: i
 
 
 def _gap(columns: list, log_a: np.ndarray) -> list[int] | None:
-    """The two sweeps on both sides of a gap that the shifts leave: only the curve's smoothness would place them."""
+    """The two sweeps on both sides of a gap that the shifts leave; None if there is no gap. Only the smoothness of the
+    curve would determine their distance."""
     ends = [(c[0][0] + a, c[0][-1] + a) for c, a in zip(columns, log_a, strict=True)]
     order = sorted(range(len(ends)), key=lambda k: ends[k][0])
     last = order[0]
@@ -172,7 +177,7 @@ def _refuse_gap(columns: list, shifts: Shifts) -> None:
 
 
 def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray, knots: float) -> np.ndarray:
-    """Root mean square distance (K,) of the shifted sweeps from their common curve, relative."""
+    """Relative root mean square distance (K,) of the shifted sweeps from their common curve."""
     columns = _in_decades(sweeps)
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     place = np.repeat(np.arange(len(columns)), [len(c[0]) for c in columns])
@@ -185,13 +190,13 @@ def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.n
 
 
 def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, knots: float) -> int:
-    """Number of coefficients of the curve of G' (and of that of G'') for shifted sweeps."""
+    """Number of coefficients of the curve of G' for shifted sweeps; the curve of G'' has as many."""
     x = np.concatenate([np.log10(s.angular_frequency) + a for s, a in zip(sweeps, log_a, strict=True)])
     return _basis(x, knots)[0].shape[1]
 
 
 def _basis(x: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values and slopes (n, C) of the cubic splines at x; their knots are at most `apart` from each other."""
+    """Values and slopes (n, C) of the cubic splines at x. Their knots are at most `apart` from each other."""
     low, high = x.min() - 1e-6, x.max() + 1e-6
     count = max(2, int(np.ceil((high - low) / apart)) + 1)
     inner = np.linspace(low, high, count)
@@ -212,7 +217,8 @@ def _smoothness(size: int) -> np.ndarray:
 
 
 def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and right-hand side of a Gauss-Newton step for log a (K), log b (K) and the coefficients of both curves."""
+    """Matrix and right-hand side of a Gauss-Newton step for log a (K), log b (K) and the coefficients of both
+    curves."""
     K, counts = len(columns), [len(c[0]) for c in columns]
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     own = np.repeat(np.eye(K), counts, axis=0)
@@ -231,13 +237,13 @@ def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: 
 
 
 def _covariance(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
-    """Covariance of all unknowns; the first `data` rows are of the data, the others keep the curve smooth."""
+    """Covariance of all unknowns. The first `data` rows belong to the data; the other rows keep the curve smooth."""
     inverse = np.linalg.pinv(A)[:, :data]
     return inverse @ inverse.T * np.sum(b[:data] ** 2) / max(1, data - A.shape[1])
 
 
 def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:
-    """First shifts: each sweep is matched to its neighbour, beginning at the reference."""
+    """First values of the shifts: each sweep is matched to its neighbour, beginning at the reference."""
     log_a = np.zeros(len(columns))
     for way in (range(reference + 1, len(columns)), range(reference - 1, -1, -1)):
         before = reference
@@ -254,10 +260,10 @@ def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np
 
 
 def _over(fixed: tuple, moving: tuple) -> float | None:
-    """The shift [decades] that brings one sweep nearest to its neighbour; None if no shift matches.
+    """The shift [decades] at which one sweep is nearest to its neighbour; None if no shift matches.
 
-    Of shifts within the noise of the points, that with the longest overlap is taken: few points lie near each other by
-    chance at a wrong one.
+    Among all shifts that match within the noise, the shift with the longest overlap is used: at a wrong shift, a few
+    points may match by chance.
     """
     best, where = (np.inf, 0), None
     noise = WITHIN * sum(_variance(c) for c in (fixed, moving))
@@ -274,6 +280,6 @@ def _over(fixed: tuple, moving: tuple) -> float | None:
 
 
 def _variance(columns: tuple) -> float:
-    """Variance of the noise of log10 G' and log10 G'', in the mean; 0 if there are too few points to see it."""
+    """Mean variance of the noise of log10 G' and log10 G''; 0 if there are too few points."""
     each = [scatter(*merged(10.0 ** columns[0], 10.0 ** columns[j])) / np.log(10) for j in (1, 2)]
     return float(np.mean(np.square(each))) if np.all(np.isfinite(each)) else 0.0

@@ -12,7 +12,7 @@ from fitting.readers.rheometer import REPEATED, SORTED, read_all_sweeps
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
-#: Temperatures closer than this [K] count as one: an instrument keeps its set point to some tenths.
+#: Temperatures closer than this [K] count as one temperature: an instrument holds its set point within some tenths.
 SAME = 1.0
 
 
@@ -25,13 +25,13 @@ class AtTemperatures(NamedTuple):
 
 
 def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
-    """Read every sweep of the files; sweeps at one temperature are joined.
+    """Read every sweep of the files. Sweeps at one temperature are joined.
 
-    The temperature is a column (`temperature_C`, `Temperature` with its unit), or a part of the name of the table. A
-    column `shift_factor` contains factors that are already known.
+    The temperature is in a column (`temperature_C`, or `Temperature` with its unit), or in the name of the table. A
+    column `shift_factor` may contain factors that are already known.
 
     Raises:
-        InputError: a table without temperature, or fewer than two temperatures.
+        InputError: a table has no temperature, or there are fewer than two temperatures.
     """
     parts: list[tuple[float, float, Sweep]] = []
     for path in paths:

@@ -1,8 +1,8 @@
-"""Convert any linear viscoelastic model to Prony modes for the simulation, with the largest error over the band.
+"""Convert any linear viscoelastic model to Prony modes for the simulation; the largest error over the band is known.
 
 The relaxation times are fixed, equally spaced on a log axis. The strengths come from non-negative least squares of the
-relative errors of G' and G''. While the set of non-zero strengths stays the same, the strengths are linear in the
-moduli of the model. So the conversion can be differentiated.
+relative errors of G' and G''. As long as the set of non-zero strengths stays the same, the strengths are linear in the
+moduli of the model. So the conversion has derivatives.
 """
 
 from collections.abc import Callable
@@ -13,9 +13,9 @@ import numpy as np
 from fitting.methods.generalised_maxwell import Maxwell, non_negative
 from fitting.methods.host import Array, arrays_of
 
-#: Largest relative error of G' and of G'' over the band that a conversion may have.
+#: Maximum relative error of G' and of G'' over the band in a conversion.
 ALLOWED = 0.01
-#: Frequencies per decade for the match and its check, margins of the times [decades], and most modes.
+#: Frequencies per decade for the conversion and its check, margins of the times [decades], and maximum number of modes.
 PER_DECADE, MARGINS, MOST = 20, (0.0, 0.25, 0.5, 1.0, 2.0), 60
 
 
@@ -24,9 +24,9 @@ class Conversion(NamedTuple):
 
     omega: np.ndarray  # (n,) [rad/s], over the band
     times: np.ndarray  # (N,) [s], descending
-    solid: bool  # an equilibrium modulus comes first among the strengths
+    solid: bool  # whether the first strength is an equilibrium modulus
     strengths_of: np.ndarray  # (N + solid, 2n): strengths [Pa] from G' then G''
-    error: float  # largest relative error of G' and G'', for the model it was made from
+    error: float  # largest relative error of G' and G'', for the converted model
 
 
 def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.ndarray:
@@ -39,12 +39,13 @@ def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.n
 def convert(
     moduli: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], low: float, high: float, solid: bool
 ) -> Conversion:
-    """Find the fewest modes with an error below `ALLOWED`, or the best fit of at most `MOST` modes.
+    """Find the smallest number of modes with an error below `ALLOWED`, or else the best fit with at most `MOST` modes.
 
     Args:
-        moduli: G' and G'' (n,) [Pa] at angular frequencies (n,).
+        moduli: function from angular frequencies (n,) [rad/s] to G' and G'' (n,) [Pa].
         low, high: ends of the band [rad/s].
-        solid: whether the model has an equilibrium modulus. The modes have one in any case if they need it.
+        solid: whether the model has an equilibrium modulus. If the modes need an equilibrium modulus, they get one in
+            any case.
     """
     decades = np.log10(high / low)
     omega = np.geomspace(low, high, max(12, int(decades * PER_DECADE) + 1))
@@ -65,7 +66,7 @@ def convert(
         if best[0] < ALLOWED:
             break
     assert best is not None
-    if not solid and best[0] > ALLOWED:  # a small exponent: within the band it is a spring, and hardly relaxes
+    if not solid and best[0] > ALLOWED:  # a small exponent: nearly a spring
         with_rest = convert(moduli, low, high, solid=True)
         if with_rest.error < best[0]:
             return with_rest

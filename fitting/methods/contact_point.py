@@ -1,8 +1,8 @@
 """Modulus and contact point of a force-depth curve whose force is linear in the modulus.
 
-F = E f(d - d0), 0 before contact; a straight base line may be added. For a given contact point d0 the force is linear
-in all other numbers, so the search is for d0 alone: on a grid, then between grid points (variable projection; Golub and
-Pereyra 1973).
+F = E f(d - d0), and F = 0 before contact. A straight base line may be added. For a given contact point d0, the force is
+linear in all other unknowns. So only d0 is searched, on a grid and then between grid points (variable projection; Golub
+and Pereyra 1973).
 """
 
 from collections.abc import Callable
@@ -22,8 +22,8 @@ _NOISELESS = 1e-7
 
 
 class ContactFit(NamedTuple):
-    """Modulus and contact point. Their standard errors come from the residuals, whatever noise is in them: the same at
-    all points, larger with the force, or shared by neighbours."""
+    """Modulus and contact point. Their standard errors are right for several kinds of noise: equal at all points,
+    growing with the force, or shared by neighbours."""
 
     modulus: float  # E [Pa]
     contact_point: float  # d0 [m]
@@ -32,11 +32,11 @@ class ContactFit(NamedTuple):
     noise: float  # standard deviation of the force [N]
     residuals: np.ndarray  # (n,) [N]
     before: int  # points before contact
-    offset: float = 0.0  # force of the sensor without contact [N]
+    offset: float = 0.0  # force reading without contact [N]
     offset_error: float = 0.0
     tilt: float = 0.0  # rise of the base line over all depths [N]
     tilt_error: float = 0.0
-    independent: float | None = None  # points of independent noise that measure as much; None: all
+    independent: float | None = None  # number of points with independent noise that tell as much; None: all points
 
     @property
     def quantile(self) -> float:
@@ -46,7 +46,7 @@ class ContactFit(NamedTuple):
         return float(scipy.special.stdtrit(max(1.0, points - unknowns), 0.975))
 
 
-#: Force without contact, with 0, 1 and 2 unknowns.
+#: Kinds of base line (force without contact), with 0, 1 and 2 unknowns.
 BASES = ("zero", "constant", "line")
 
 
@@ -58,7 +58,8 @@ def fit_contact(
     Args:
         depth: (n,) [m].
         force: (n,) [N].
-        unit_force: depths after contact (n,) [m], negative before -> force per unit modulus (n,) [N/Pa].
+        unit_force: function from depths after contact (n,) [m], negative before contact, to force per unit modulus (n,)
+            [N/Pa].
         base: force without contact: "zero", "constant" (the sensor's offset is unknown) or "line" (it drifts).
     """
     span = float(np.ptp(depth))
@@ -87,13 +88,13 @@ def fit_contact(
     E = float(numbers[0])
     h = 1e-5 * span
     slope = (unit_force(depth - start - h) - unit_force(depth - start + h)) / (2 * h)
-    # By ln E, by d0 over the span, and by the line in units of the largest force.
+    # Derivatives by ln E, by d0 / span, and by the base line in units of the largest force.
     J = np.column_stack([A[:, 0] * E, E * slope * span, line * np.abs(force).max()])
     residuals = force - A @ numbers
     noise = float(np.sqrt(residuals @ residuals / (len(force) - J.shape[1])))
     sizes, correlation, alike = _errors_of_any_noise(J, residuals, noise)
     independent = None if alike is None else alike.independent
-    # Offset and tilt, then their errors; 0 where the base has none.
+    # Offset and tilt, then their errors. They are 0 if the base line does not have them.
     (offset, tilt), (offset_error, tilt_error) = (
         np.append(v, np.zeros(2))[:2] for v in (numbers[1:], sizes[2:] * np.abs(force).max())
     )
@@ -104,11 +105,12 @@ def fit_contact(
 
 
 def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> tuple[np.ndarray, float, Alike | None]:
-    """Errors of all unknowns, the correlation of the first two, and the noise that neighbours share."""
+    """Errors of all unknowns (the largest over several kinds of noise), the correlation of the first two unknowns, and
+    the noise that neighbours share."""
     equal = noise * np.linalg.pinv(J)
     roots = [equal, uneven_root(J, residuals, np.eye(J.shape[1]))]
     alike = None
-    if noise > _NOISELESS * np.abs(J[:, 0]).max():  # of the fitted force
+    if noise > _NOISELESS * np.abs(J[:, 0]).max():  # relative to the fitted force
         alike = along_rows([len(J)], residuals, J, noise, np.linalg.pinv(J))
     if alike is not None:
         roots.append(alike.root)
@@ -117,23 +119,23 @@ def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> 
     return np.max(errors, axis=0), float(correlations[largest][0, 1]), alike
 
 
-#: Part of the approach in which contact has not begun in spite of a tilt, and fewest points there.
+#: Even with a tilt, contact has not begun in this part of the approach; and minimum number of points there.
 _FREE, _FEWEST = 0.7, 8
-#: Size over its error above which a tilt counts: that of the approach alone, and that of the whole fit.
+#: A tilt counts if its size divided by its error exceeds _SEEN for the approach alone, and _CLEAR for the whole fit.
 _SEEN, _CLEAR = 2.0, 4.0
 
 
 def fit_with_offset(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray]) -> ContactFit:
-    """The fit of `fit_contact`; where enough points are before contact, with the offset of the sensor as an unknown.
+    """The result of `fit_contact`. If enough points are before contact, the offset of the sensor is an unknown too.
 
-    No sensor's zero is exact, and an error of it moves the contact point by more than the noise does. Without these
-    points offset and contact point cannot be told apart, and the zero is taken as it is.
+    The zero of a sensor is never exact, and its error moves the contact point by more than the noise. Without points
+    before contact, offset and contact point cannot be distinguished. Then the zero of the sensor is used.
     """
     plain, free = (fit_contact(depth, force, unit_force, base) for base in BASES[:2])
     if free.before < _FEWEST or not free.modulus > 0:
         return plain
-    # A large offset passes for force in contact, and the plain fit has no points before contact. Then the offset must
-    # explain more than another shape would, and the force must not rise before contact.
+    # With a large offset, the plain fit takes the offset for a contact force and has no points before contact. Then the
+    # offset is used only if the fit becomes clearly better and if the force does not rise before contact.
     better = np.sum(plain.residuals**2) - np.sum(free.residuals**2) > _CLEAR**2 * free.noise**2
     slope, error = _slope_and_error(depth[depth <= free.contact_point], force[depth <= free.contact_point])
     flat = abs(slope) < _SEEN * error
@@ -151,11 +153,12 @@ def _slope_and_error(depth: np.ndarray, force: np.ndarray) -> tuple[float, float
 def fit_without_tilt(
     depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], plain: ContactFit
 ) -> ContactFit | None:
-    """The fit with a straight base line, if the approach rises or falls and the whole curve confirms it; else None.
+    """The fit with a straight base line, if the force rises or falls during the approach and the whole curve confirms
+    this; else None.
 
     Args:
-        depth, force, unit_force: as in `fit_contact`.
-        plain: fit without this line.
+        depth, force, unit_force: see `fit_contact`.
+        plain: fit without this base line.
     """
     free = depth < depth.min() + _FREE * (plain.contact_point - depth.min())
     if free.sum() < _FEWEST or not np.ptp(depth[free]) > 0:

@@ -1,4 +1,4 @@
-"""The result of every fit: numbers, their standard errors and correlation, from the Jacobian at the minimum."""
+"""The result of every fit: parameters, their standard errors and correlation, from the Jacobian at the minimum."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -10,34 +10,34 @@ import scipy.special
 from fitting.methods import host
 from fitting.methods.least_squares import Solution
 
-#: Replaces an unbounded error in a covariance; its square is still a finite number.
+#: This value replaces an infinite error in a covariance. Its square is still finite.
 LOST = 1e140
 
 
 class Estimate(NamedTuple):
-    """Numbers in the order of `names`, and how well the data determine them."""
+    """Parameters in the order of `names`, with standard errors and correlation."""
 
     names: tuple[str, ...]
     values: np.ndarray  # (P,)
-    root: np.ndarray  # (P, k) square root of the covariance; huge in directions that the data leave free
+    root: np.ndarray  # (P, k) square root of the covariance; huge in directions that the data do not determine
     standard_errors: np.ndarray
     correlation: np.ndarray
-    chi2: float  # sum of squared residuals over the noise
-    components: int  # measured numbers
+    chi2: float  # sum of the squares of residual / given scale
+    components: int  # number of measured values
     noise: float  # factor on the given scales: 1, or estimated from the residuals
-    freedom: float  # components minus the numbers that the data determine, not always those of `names`
+    freedom: float  # components minus the (effective) number of unknowns
     iterations: int
     converged: bool
     codes: tuple[int, ...] = ()  # worst code of each simulation
     seconds: float = 0.0
-    mesh_bias: np.ndarray | None = None  # (P,) part of the values that the simulation's mesh causes; None: not known
-    time_step_bias: np.ndarray | None = None  # (P,) part of the values that its time steps cause
-    shared: np.ndarray | None = None  # (P, s) columns of `root` from errors common to all points: gap, instrument
-    mesh_over_noise: float | None = None  # root mean square of the mesh's error in the data, over their noise
+    mesh_bias: np.ndarray | None = None  # (P,) error of the values by the simulation's mesh; None: not known
+    time_step_bias: np.ndarray | None = None  # (P,) error of the values by the time steps
+    shared: np.ndarray | None = None  # (P, s) columns of `root` for errors that all points share: gap, instrument
+    mesh_over_noise: float | None = None  # root mean square of the mesh error in the data / noise
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the numbers (P, P)."""
+        """Covariance of the parameters (P, P)."""
         return self.root @ self.root.T
 
     @property
@@ -54,14 +54,14 @@ def estimated(
     deviations_given: bool = True,
     effective: float | None = None,
 ) -> Estimate:
-    """The estimate at a minimum: covariance of u, transformed to the reported numbers by the delta method.
+    """The estimate at a minimum. The delta method transforms the covariance of u to the reported parameters.
 
     Args:
-        names: of the numbers to report.
-        natural_of: u -> these numbers (P,).
-        found: minimum over u; if its arrays are NumPy's, `natural_of` must work in `host.with_jacobian`.
-        components: number of residuals that are measured; the others are 0 and have no effect.
-        deviations_given: as in `noise_factor`.
+        names: names of the parameters to report.
+        natural_of: function from u to these parameters (P,).
+        found: minimum over u. If its arrays are NumPy arrays, `natural_of` must work in `host.with_jacobian`.
+        components: number of measured residuals. The other residuals are 0 and have no effect.
+        deviations_given: see `noise_factor`.
         effective: number of parameters that the data determine, if u has a prior. The rows of the prior then follow the
             `components` rows of the data.
     """
@@ -73,7 +73,8 @@ def estimated(
     values, to_natural = with_slope(natural_of, found.u)
     root, _ = spread(jacobian, noise, to_natural)
     errors, correlation = errors_and_correlation(root)
-    # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.
+    # At a bound (a ratio of 0 or 1, a time of 0), the derivative of the parametrisation is 0. The error is then
+    # unknown, not zero.
     stuck = np.abs(to_natural).max(axis=1) <= 1e-10 * np.maximum(np.abs(values), 1e-300)
     return Estimate(
         names=tuple(names),
@@ -91,19 +92,19 @@ def estimated(
 
 
 def with_slope(natural_of: Callable[[jax.Array], jax.Array], u: host.Array) -> tuple[np.ndarray, np.ndarray]:
-    """The reported numbers (P,) and their derivative by u. If u is a NumPy array, nothing is compiled."""
+    """The reported parameters (P,) and their derivatives by u. If u is a NumPy array, nothing is compiled."""
     if isinstance(u, np.ndarray):
-        with np.errstate(over="ignore", invalid="ignore"):  # the errors show that a fit diverged
+        with np.errstate(over="ignore", invalid="ignore"):  # a fit that diverged is reported by its errors
             return host.with_jacobian(natural_of, u)
     return np.asarray(natural_of(u)), np.asarray(jax.jacfwd(natural_of)(u))
 
 
 def noise_factor(residuals: np.ndarray, freedom: float, deviations_given: bool) -> float:
-    """Noise divided by the scales of the residuals.
+    """The noise, divided by the scales of the residuals.
 
-    Without given deviations it is estimated from the residuals. Given deviations are used as they are, unless the
-    residuals are larger: then the errors are enlarged by the misfit. They are never reduced (the rule of the Particle
-    Data Group).
+    If no standard deviations are given, the noise is estimated from the residuals. Given standard deviations are used
+    unchanged, unless the residuals are larger. Then the misfit enlarges the errors. Errors are never reduced (the rule
+    of the Particle Data Group).
     """
     estimate = float(np.sqrt(np.sum(residuals**2) / max(1, freedom)))
     return max(1.0, estimate) if deviations_given else estimate
@@ -113,30 +114,31 @@ def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[
     """Square root A of the covariance A A^T of natural parameters (delta method), and scaled singular values.
 
     Args:
-        jacobian: of the residuals by unconstrained parameters u.
+        jacobian: derivatives of the residuals by unconstrained parameters u.
         noise: standard deviation of a residual.
-        to_natural: derivative of the natural parameters by u.
+        to_natural: derivatives of the natural parameters by u.
     """
-    if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # nothing is known: a fit that could not begin
+    if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # the fit could not begin, so nothing is known
         return np.full((len(to_natural), jacobian.shape[1]), np.inf), np.zeros(min(jacobian.shape))
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
-    # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
-    with np.errstate(over="ignore", invalid="ignore"):  # a number that diverged has no finite error
+    # A direction that the data do not determine gets 1e14 times the error of the best known direction, and not infinity
+    # times zero.
+    with np.errstate(over="ignore", invalid="ignore"):  # a parameter that diverged has no finite error
         root = noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0])
     return np.clip(np.where(np.isfinite(root), root, LOST), -LOST, LOST), s
 
 
 def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Standard errors (P,) and correlation (P, P) from the square root of a covariance."""
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite where nothing is known
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite if nothing is known
         covariance = root @ root.T
         errors = np.sqrt(np.diag(covariance))
         return errors, covariance / np.maximum(np.outer(errors, errors), 1e-300)
 
 
 def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
-    """The estimate with one more error (P,) that all points share, independent of the others."""
+    """The estimate with one more error (P,) that all points share. It is independent of the other errors."""
     root = np.column_stack([estimate.root, direction])
     errors, correlation = errors_and_correlation(root)
     lost = ~np.isfinite(estimate.standard_errors)
@@ -147,7 +149,8 @@ def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
 
 
 def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
-    """The estimate with the shared errors of `other`; each keeps its size relative to the value of its number."""
+    """The estimate with the shared errors of `other`. Each error keeps its size relative to the value of its
+    parameter."""
     if other.shared is None:
         return estimate
     known = other.values != 0
@@ -157,17 +160,18 @@ def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
     return estimate
 
 
-#: Largest relative change of a number by the mesh at which the first-order estimate `mesh_bias` is used.
+#: The first-order estimate `mesh_bias` is used up to this relative change of a parameter by the mesh.
 LARGEST_BIAS = 0.3
-#: Standard error over the value from which the data do not determine a number.
+#: If the standard error exceeds this many times the value, the data do not determine the parameter.
 UNKNOWN = 100.0
 
 
 def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], missing: np.ndarray) -> np.ndarray:
-    """Change of the numbers (P,) by meshes: J^+ times `missing` (n,), their errors of the data over the noise.
+    """Change of the parameters (P,) by the meshes: J^+ times `missing` (n,), the errors of the meshes in the data over
+    the noise.
 
-    It is of first order. It is accurate if the meshes' errors are below a quarter and the numbers are not nearly
-    dependent. Subtract it once to correct.
+    It is of first order. It is accurate if the mesh errors are below a quarter and the parameters are not nearly
+    dependent. Subtract it once to correct the parameters.
     """
     J, (_, to_natural) = np.asarray(found.jacobian), with_slope(natural_of, found.u)
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(missing))):
@@ -176,23 +180,27 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
 
 
 def bias_sentences(estimate: Estimate) -> list[str]:
-    """Warnings if the mesh moves a number by more than its standard error, or by too much for an estimate."""
+    """Warnings if the mesh moves a parameter by more than its standard error, or by too much for a first-order
+    estimate."""
     bias, values = estimate.mesh_bias, np.asarray(estimate.values)
     if bias is None:
         return []
     errors = estimate.standard_errors
     unknown = np.flatnonzero(np.isfinite(errors) & (errors > UNKNOWN * np.abs(values)))
-    if len(unknown):  # their bias is roundoff, as much enlarged
+    if len(unknown):  # their bias is only enlarged roundoff
         names = ", ".join(estimate.names[k] for k in unknown)
         return [
             f"the data do not determine {names}: the standard errors are more than {UNKNOWN:g} times the values, and "
-            "another mesh does not help; motions without a force determine ratios of moduli alone: give a traction or "
-            "a measured force, or fit fewer numbers"
+            "another mesh does not help; displacements without a force determine only ratios of moduli: give a "
+            "traction or a measured force, or fit fewer parameters"
         ]
     lost = np.flatnonzero(~(np.abs(bias) <= LARGEST_BIAS * np.abs(values)) & ~(np.abs(bias) <= errors))
     if len(lost):
         names = ", ".join(estimate.names[k] for k in lost)
-        return [f"the mesh moves {names} by a third or more: the data do not determine them on this mesh; refine it"]
+        return [
+            f"the mesh moves {names} by a third or more: with this mesh, the data do not determine these parameters; "
+            "refine the mesh"
+        ]
     more = np.flatnonzero(np.abs(bias) > estimate.standard_errors)
     if not len(more):
         return []

@@ -1,7 +1,7 @@
-"""The generalised Maxwell model: closed-form moduli, an unconstrained parametrisation, starting points.
+"""The generalised Maxwell model: its closed-form moduli, an unconstrained parametrisation, and starting points.
 
-G(t) = G0 (1 - sum_i g_i (1 - exp(-t/tau_i))), chapter section 5.2; g_i are ratios of G0 (Table 2 prints Pa). The
-formulas work with NumPy and JAX arrays, also with more axes in front of the named ones (see `fitting.methods.host`).
+G(t) = G0 (1 - sum_i g_i (1 - exp(-t/tau_i))), see section 5.2 of the chapter. g_i are ratios of G0 (Table 2 prints Pa).
+The formulas work with NumPy and JAX arrays, also with additional leading axes (see `fitting.methods.host`).
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from liverjax.core.errors import InputError
 
 
 class Maxwell(NamedTuple):
-    """Parameters of a generalised Maxwell solid; relaxation times descend."""
+    """Parameters of a generalised Maxwell solid. Relaxation times are in descending order."""
 
     shear_modulus: Array  # G0, instantaneous [Pa]
     ratios: Array  # g_i (N,)
@@ -40,7 +40,7 @@ def moduli(model: Maxwell, omega: Array) -> tuple[Array, Array]:
 
 
 def weighed(model: Maxwell, relaxing: float, equilibrium: float) -> Maxwell:
-    """The model with the moduli of its modes, and its equilibrium modulus, each multiplied by a number."""
+    """The model with the moduli of its modes multiplied by `relaxing`, and its equilibrium modulus by `equilibrium`."""
     xp = arrays_of(*model)
     G0 = xp.asarray(model.shear_modulus)
     each = relaxing * G0[..., None] * model.ratios
@@ -49,10 +49,11 @@ def weighed(model: Maxwell, relaxing: float, equilibrium: float) -> Maxwell:
 
 
 def natural(u: Array) -> Maxwell:
-    """Model of unconstrained parameters u (2N + 1,).
+    """The model from unconstrained parameters u (2N + 1,).
 
-    u = log G0; logits of the ratios against the equilibrium part (softmax, so every ratio is positive and their sum
-    below one); log of the longest time, then log of the gaps between log times (so they descend).
+    u contains log G0, then the logits of the ratios against the equilibrium part, then the log of the longest time,
+    then the logs of the gaps between log times. By the softmax, every ratio is positive and the sum of the ratios is
+    below 1. By the gaps, the times descend.
     """
     n = (u.shape[-1] - 1) // 2
     return Maxwell(
@@ -68,7 +69,8 @@ def _softmax_shares(logits: Array) -> Array:
     return share / xp.sum(share, axis=-1, keepdims=True)
 
 
-#: Logarithm of a gap beyond which its time is 0 in any case; the exponential must not overflow.
+#: Upper bound of the logarithm of a gap. At larger gaps the time is 0 in any case, and the exponential must not
+#: overflow.
 _FARTHEST = 30.0
 
 
@@ -81,7 +83,7 @@ def _times_of_gaps(u: Array) -> Array:
 
 
 def unconstrained(model: Maxwell) -> Array:
-    """Inverse of `natural`; relaxation times are sorted, ratios must be positive with a sum below one."""
+    """Inverse of `natural`. Relaxation times are sorted. Ratios must be positive, with a sum below 1."""
     xp = arrays_of(*model)
     order = xp.argsort(-xp.asarray(model.relaxation_times))
     g, log_tau = xp.asarray(model.ratios)[order], xp.log(xp.asarray(model.relaxation_times)[order])
@@ -97,13 +99,14 @@ def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array
 
 
 def natural_fluid(u: Array) -> Maxwell:
-    """Model without an equilibrium modulus from u (2N,): like `natural`, with the last mode as the last share."""
+    """The model without an equilibrium modulus, from u (2N,). It is like `natural`, but the last mode takes the place
+    of the equilibrium part."""
     n = u.shape[-1] // 2
     return Maxwell(arrays_of(u).exp(u[..., 0]), _softmax_shares(u[..., 1:n]), _times_of_gaps(u[..., n:]))
 
 
 def fluid_residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array) -> Array:
-    """`residuals` of a model without an equilibrium modulus."""
+    """The function `residuals` for a model without an equilibrium modulus."""
     xp = arrays_of(u)
     return (xp.concatenate(moduli(natural_fluid(u), omega), axis=-1) - xp.concatenate([storage, loss])) / scales
 
@@ -116,19 +119,19 @@ def fluid_of(u: np.ndarray) -> np.ndarray:
 
 
 def largest_number_of_modes(sweep: Sweep) -> int:
-    """The largest N for which 2N + 1 parameters are fewer than the 2n moduli at n different frequencies."""
+    """The largest N for which the 2N + 1 parameters are fewer than the 2n moduli at n different frequencies."""
     return len(np.unique(sweep.angular_frequency)) - 1
 
 
 def mode_columns(omega: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Moduli G' then G'' (2n, 1 + K) of an equilibrium modulus and of modes of 1 Pa."""
+    """Moduli G' then G'' (2n, 1 + K) of an equilibrium modulus of 1 Pa, and of modes of 1 Pa."""
     x = omega[:, None] * times
     bottom = np.column_stack([np.zeros(len(omega)), x / (1 + x**2)])
     return np.vstack([np.column_stack([np.ones(len(omega)), x**2 / (1 + x**2)]), bottom])
 
 
 class Spectrum(NamedTuple):
-    """The best fit of any number of Maxwell modes."""
+    """The best fit with any number of Maxwell modes."""
 
     times: np.ndarray
     strengths: np.ndarray  # [Pa], >= 0
@@ -137,7 +140,8 @@ class Spectrum(NamedTuple):
 
 
 def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
-    """Non-negative least squares over a dense grid of relaxation times two decades wider than the band."""
+    """Fit the strengths by non-negative least squares on a dense grid of relaxation times. The grid is two decades
+    wider than the band on each side."""
     omega = sweep.angular_frequency
     low, high = np.log10(1 / omega[-1]) - 2, np.log10(1 / omega[0]) + 2
     times = np.logspace(low, high, int((high - low) * per_decade) + 1)
@@ -148,12 +152,12 @@ def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
 
 
 def non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
-    """The x >= 0 with the smallest distance of A x from b, and this distance.
+    """The x >= 0 for which A x is nearest to b, and the distance.
 
-    With close relaxation times columns are nearly equal, and the active set may cycle. Then SciPy's bounded least
-    squares takes over; it always returns its best point.
+    If relaxation times are close, columns are nearly equal, and the active-set method may cycle. Then SciPy's bounded
+    least squares is used, which always returns its best point.
     """
-    norm = np.linalg.norm(A, axis=0)  # columns of equal length keep the active-set iteration short
+    norm = np.linalg.norm(A, axis=0)  # with columns of equal length, the active-set method needs few iterations
     norm = np.where(norm > 0, norm, 1.0)
     try:
         x, rest = scipy.optimize.nnls(A / norm, b, maxiter=50 * A.shape[1])
@@ -163,12 +167,12 @@ def non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
     return x / norm, float(rest)
 
 
-#: Above this misfit no number of modes describes the data even roughly: columns or units are wrong.
+#: Above this misfit, no number of modes describes the data even roughly. Then columns or units are wrong.
 HOPELESS = 0.3
 
 
 def refuse_impossible(sweep: Sweep) -> Spectrum:
-    """The dense spectrum; raises `InputError` if no generalised Maxwell solid is near the data."""
+    """The dense spectrum. An `InputError` is raised if no generalised Maxwell solid is near the data."""
     check_sweep(sweep)
     dense = spectrum(sweep)
     if dense.misfit > HOPELESS:
@@ -180,16 +184,17 @@ def refuse_impossible(sweep: Sweep) -> Spectrum:
             else "check columns and units"
         )
         raise InputError(
-            f"{sweep.source or 'sweep'}: no Maxwell model of any number of modes comes closer than "
+            f"{sweep.source or 'sweep'}: no Maxwell model, with any number of modes, comes closer than "
             f"{100 * dense.misfit:.0f} % to these moduli; {hint}"
         )
     return dense
 
 
 def starts(sweep: Sweep, modes: int, dense: Spectrum, count: int = 24, seed: int = 0) -> np.ndarray:
-    """Starting points (count, 2N + 1): the dense spectrum cut into N groups, then log-uniform times.
+    """Starting points (count, 2N + 1). The first has evenly spread times, the second cuts the dense spectrum into N
+    groups, the others have random log-uniform times.
 
-    For given times the problem is linear in the strengths, so non-negative least squares gives them.
+    For given times, the problem is linear in the strengths, so non-negative least squares gives the strengths.
     """
     omega = sweep.angular_frequency
     low, high = -np.log(omega[-1]) - 0.5, -np.log(omega[0]) + 0.5
@@ -216,7 +221,8 @@ def _start(sweep: Sweep, times: np.ndarray) -> np.ndarray:
 
 
 def start_at_times(times: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Starting point (2N + 1,) at times (N,) [s]; A x = b for equilibrium modulus and strengths, by least squares."""
+    """Starting point (2N + 1,) with the given times (N,) [s]. Equilibrium modulus and strengths x solve A x = b by
+    least squares."""
     strengths, _ = non_negative(A, b)
     total = strengths.sum()
     share = np.maximum(strengths / total, 0.01)  # a softmax cannot start at zero
@@ -225,7 +231,8 @@ def start_at_times(times: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarra
 
 
 def times_over(resolved: tuple[float, float], modes: int, count: int) -> list[np.ndarray]:
-    """Relaxation times (N,) [s], descending, for `count` starts: evenly over the decades, then at random."""
+    """Relaxation times (N,) [s], descending, for `count` starts. The first start has times evenly over the decades, the
+    others random times."""
     low, high = np.log(resolved)
     rng = np.random.default_rng(0)
     grids = [np.linspace(low, high, modes + 2)[1:-1]]

@@ -1,13 +1,14 @@
-"""Checks of the data without a model: causality, the instrument's mark, order in the residuals.
+"""Checks of the data without a model: causality and effects of the instrument; and a test for structure in residuals.
 
-Every material that relaxes has a spectrum of non-negative strengths. With x = omega tau, the moduli of each term obey
+Every material that relaxes has a spectrum of non-negative strengths. With x = omega tau, the moduli of each term fulfil
 
     0 <= dG'/d ln(omega) <= G''      and      |dG''/d ln(omega)| <= G''
 
-because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). Data that break these bounds by more than their scatter do not show the
-material alone. At the high end the inertia of the instrument breaks them: it adds a term that grows as omega^2 to G'.
-This is the instrument's mark. At the low end the start of the test breaks them. The distance of the data from the best
-spectrum of any shape tests the whole band: this is the Kramers-Kronig relation together with non-negative dissipation.
+because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). If data violate these bounds by more than their scatter, they contain more
+than the material. At high frequencies, the inertia of the instrument violates the bounds: it adds a term to G' that
+grows as omega^2. This is called the mark of the instrument. At low frequencies, the start of the test may violate them.
+The distance between the data and the best spectrum of any shape tests the whole band. It tests the Kramers-Kronig
+relation together with non-negative dissipation.
 """
 
 import math
@@ -19,11 +20,12 @@ import scipy.special
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.readers.frequency_sweep import FEWEST, Sweep, merged, scatter, some
 
-#: A breach must exceed this number of standard deviations of the scatter, and this part of the modulus.
+#: A violation of the bounds counts if it exceeds SIGNIFICANT standard deviations of the scatter and the part NEGLIGIBLE
+#: of the modulus.
 SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
-#: Distance of the best spectrum [1], and its ratio to the scatter, above which there is a sentence.
+#: A sentence is given if the relative distance of the best spectrum exceeds FAR [1] and FAR_RATIO times the scatter.
 FAR, FAR_RATIO = 0.01, 5.0
-#: Chance below which signs of residuals are called structured.
+#: Below this probability, the signs of the residuals are called structured.
 CHANCE = 0.005
 
 
@@ -31,18 +33,18 @@ class Consistency(NamedTuple):
     """Checks of a sweep without any model."""
 
     misfit: float  # root mean square distance of the best non-negative spectrum, relative
-    scatter: float  # of neighbouring points about a smooth curve, relative
-    breaches: tuple[tuple[float, float, str], ...]  # intervals [rad/s] and the bound that they break
+    scatter: float  # relative scatter of neighbouring points about a smooth curve
+    breaches: tuple[tuple[float, float, str], ...]  # intervals [rad/s] and the bound that is violated
     onset: float | None  # last frequency [rad/s] before the instrument's mark, within half a decade of the end
 
     @property
     def far(self) -> bool:
-        """Whether no linear material comes near the data."""
+        """Whether the data are far from every linear material."""
         return self.misfit > max(FAR, FAR_RATIO * self.scatter)
 
 
 def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
-    """Check the bounds and the spectrum; `dense` comes from `generalised_maxwell.spectrum`."""
+    """Check the bounds and the spectrum. `dense` is the result of `generalised_maxwell.spectrum`."""
     omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
     noises = scatter(omega, storage), scatter(omega, loss)
     each, breaches = _noise_of_loss(sweep, noises[1]), []
@@ -55,10 +57,10 @@ def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
 
 
 def without_instrument(sweep: Sweep) -> Sweep:
-    """The points before the instrument's mark; the points after it become `grey`, and a note names them.
+    """The points before the instrument's mark. The points after it become `grey`, and a note tells which they are.
 
-    The search is repeated with the remaining points until it finds no mark. It looks only at the last half decade of
-    the sweep.
+    The search is repeated with the remaining points until no mark is found. Only the last half decade of the sweep is
+    searched.
     """
     here, end = sweep, sweep.angular_frequency[-1] / math.sqrt(10)
     told = ""
@@ -83,7 +85,8 @@ def without_instrument(sweep: Sweep) -> Sweep:
 
 
 def onset_of(sweep: Sweep) -> tuple[float, str] | None:
-    """Last frequency [rad/s] before the instrument's mark within half a decade of the end, and the bound it breaks."""
+    """Last frequency [rad/s] before the instrument's mark, within half a decade of the end; and the bound that is
+    violated."""
     omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
     noise, each = scatter(omega, storage), _noise_of_loss(sweep, scatter(omega, loss))
     for k in range(len(omega) - 1):
@@ -95,16 +98,16 @@ def onset_of(sweep: Sweep) -> tuple[float, str] | None:
 
 
 def _noise_of_loss(sweep: Sweep, same: float) -> np.ndarray:
-    """Relative noise of G'' at every frequency: `same`, or larger where the phase scatters and G'' is small."""
+    """Relative noise of G'' at every frequency: `same`, or more if the phase scatters and G'' is small."""
     if sweep.sd_estimated and sweep.loss_sd is not None:
         return np.maximum(same, sweep.loss_sd / sweep.loss)
     return np.full(len(np.unique(sweep.angular_frequency)), same)
 
 
 def _breach(omega, storage, loss, noise) -> str:
-    """The name of the bound that two neighbouring points break, or an empty text."""
+    """A text on the bound that two neighbouring points violate, or an empty text."""
     step = math.log(omega[1] / omega[0])
-    # The mean of G'' between two points is largest if G'' changes as fast as the bound allows.
+    # This is the largest possible rise: G'' between the points is largest if it changes as fast as the bound allows.
     most = step * min(max(loss) * math.exp(step / 2), math.inf)
     rise, sd = storage[1] - storage[0], noise[0] * math.hypot(*storage)
     margin = max(SIGNIFICANT * sd, NEGLIGIBLE * max(storage))
@@ -135,32 +138,33 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
         more = f" (and {len(inner) - 1} more places)" if len(inner) > 1 else ""
         out.append(
             f"between {low / (2 * np.pi):.3g} and {high / (2 * np.pi):.3g} Hz{more} {why}, by more than the scatter of "
-            f"the points: no material that relaxes does so; look for {cause}"
+            f"the points: no material that relaxes can do this; look for {cause}"
         )
     if found.far:
         out.append(
-            f"the data do not agree with themselves (Kramers-Kronig): the best spectrum of any shape stays "
-            f"{100 * found.misfit:.2g} % away on average up to {last:.3g} Hz, the points scatter by "
-            f"{100 * found.scatter:.2g} %; look for drift, or strain beyond the linear range: no model comes closer"
+            "the data do not agree with themselves (Kramers-Kronig): the best spectrum of any shape is "
+            f"{100 * found.misfit:.2g} % away on average up to {last:.3g} Hz, but the points scatter only by "
+            f"{100 * found.scatter:.2g} %. Look for drift, or strain beyond the linear range: no model can come closer"
         )
     return out
 
 
 def _rounded_up(hertz: float) -> float:
-    """The value rounded up to four digits, so that the limit does not exclude the point itself."""
+    """The value rounded up to four digits, so that a limit of this value does not exclude the point."""
     unit = 10.0 ** (math.floor(math.log10(hertz)) - 3)
     return math.ceil(hertz / unit) * unit
 
 
 def runs_probability(signs: np.ndarray) -> tuple[int, float]:
-    """Number of runs of equal sign, and the chance of at most as many in random order (Wald and Wolfowitz 1940)."""
+    """Number of runs of equal sign, and the probability of at most so many runs in random order (Wald and Wolfowitz
+    1940)."""
     up = np.asarray(signs)[np.asarray(signs) != 0] > 0
     n, a = len(up), int(up.sum())
     b = n - a
     runs = int(1 + np.sum(up[1:] != up[:-1])) if n else 0
-    if min(a, b) == 0:  # one sign only: as likely as 2^(1 - n)
+    if min(a, b) == 0:  # only one sign: the probability is 2^(1 - n)
         return runs, 2.0 ** (1 - n) if n else 1.0
-    # If there are r runs, one sign has r // 2 of them, the other as many or one more.
+    # Of r runs, one sign has r // 2 runs, and the other sign has as many or one more.
     r = np.arange(2, runs + 1)
     k, more = r // 2, r // 2 + r % 2
     ways = np.logaddexp(_log_splits(a, k) + _log_splits(b, more), _log_splits(a, more) + _log_splits(b, k))
@@ -168,19 +172,20 @@ def runs_probability(signs: np.ndarray) -> tuple[int, float]:
 
 
 def _log_splits(n: int, parts: np.ndarray | int) -> np.ndarray:
-    """Logarithm of the number of ways to divide n points in order into runs, C(n - 1, parts - 1); -inf for none."""
+    """Logarithm of the number of ways to divide n ordered points into runs, C(n - 1, parts - 1); -inf if there is no
+    way."""
     top, low = n - 1, np.asarray(parts) - 1
     log = scipy.special.gammaln
     return np.where(low <= top, log(n) - log(low + 1) - log(np.maximum(top - low, 0) + 1), -np.inf)
 
 
-#: What a sentence on structured residuals says of the errors.
+#: Words about the standard errors in a sentence on structured residuals.
 NOT_CONTAINED = "the standard errors do not contain it"
 
 
 def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple[dict, list[str]]:
-    """Runs test of the residuals of G' and of G'' in the order of the frequency: numbers, and a sentence. Repeats of a
-    frequency may share their noise, and count once.
+    """Runs test of the residuals of G' and of G'', ordered by frequency: its results, and a sentence. Repeated
+    measurements at one frequency may share their noise, so they count once.
     """
     numbers, told = {}, []
     omega, storage, loss = merged(omega, storage, loss)

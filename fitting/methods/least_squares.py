@@ -1,5 +1,5 @@
-"""Nonlinear least squares: Levenberg-Marquardt, compiled or in NumPy, and BFGS of jax.scipy. The code is the same for
-all: its arrays may be JAX's or NumPy's, and axes in front may be for many fits at once.
+"""Nonlinear least squares: Levenberg-Marquardt, compiled or in NumPy, and BFGS of jax.scipy. The same code serves JAX
+and NumPy arrays. Leading axes of the arrays may be for many fits at once.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class Solution(NamedTuple):
 
 
 class State(NamedTuple):
-    """Levenberg-Marquardt between two evaluations: the best point, and the trial to evaluate next."""
+    """State of Levenberg-Marquardt between two evaluations: the best point, and the trial point to evaluate next."""
 
     u: Array
     r: Array
@@ -42,14 +42,16 @@ class State(NamedTuple):
     stuck: Array
 
 
-#: Convergence: relative decrease of the cost by the undamped step, and mean squared residual that counts as zero.
+#: A fit has converged if the undamped step would decrease the cost by less than GAIN (relative). A mean squared
+#: residual below ZERO counts as zero. MAX_DAMPING is the upper bound of the damping.
 GAIN, ZERO, MAX_DAMPING = 1e-10, 1e-26, 1e12
-#: The best of many fits may use this many times as many iterations.
+#: The best of many fits may use this many times the maximum number of iterations.
 LONGER = 8
 
 
 def _damped_steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Array]:
-    """The damped step, and the decrease of the cost expected from it and from the undamped step; by one SVD."""
+    """The damped step, the decrease of the cost expected from this step, and that from the undamped step. All come from
+    one SVD."""
     xp = host.arrays_of(J)
     scale = xp.maximum(xp.linalg.norm(J, axis=-2), 1e-300)
     U, s, Vt = xp.linalg.svd(J / scale[..., None, :], full_matrices=False)
@@ -61,7 +63,7 @@ def _damped_steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Arr
 
 
 def begin(u: Array, n_residuals: int, damping: float = 1e-3) -> State:
-    """State whose first trial is u (…, P) itself."""
+    """The first state: its trial point is u (…, P)."""
     xp, dtype, fits = host.arrays_of(u), u.dtype, u.shape[:-1]
     no = xp.full(fits, False)
     return State(
@@ -83,11 +85,12 @@ def _cost(r: Array) -> Array:
 
 
 def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
-    """Go to the trial if it is better, else raise the damping (Nielsen 1999); propose the next trial."""
+    """Go to the trial point if it is better, else raise the damping (Nielsen 1999). Then propose the next trial
+    point."""
     xp = host.arrays_of(s.u)
     first = s.iterations < 0
     cost, cost_new = _cost(s.r), _cost(r)
-    # False for NaN. A point without finite derivatives is refused: no step could follow.
+    # This is False for NaN. A point without finite derivatives is refused, because no step could follow.
     better = (cost_new < cost) & xp.all(xp.isfinite(J), axis=(-2, -1))
     rho = xp.where(first, 0.5, (cost - cost_new) / xp.where(s.predicted > 0, s.predicted, 1.0))
     easier = xp.where(first, s.damping, s.damping * xp.maximum(1 / 9, 1 - (2 * rho - 1) ** 3))
@@ -96,7 +99,8 @@ def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
     J = xp.where(better[..., None, None], J, s.J)
     cost = xp.minimum(cost, xp.where(better, cost_new, cost))
     step, predicted, left = _damped_steps(J, r, damping)
-    # No step, however short, lowers the cost: at roundoff that is as converged as the arithmetic allows.
+    # No step lowers the cost, however short it is. If the remaining gain is at roundoff, the fit has converged as far
+    # as the arithmetic allows.
     exhausted = damping > MAX_DAMPING
     at_roundoff = xp.isfinite(cost_new) & ((left <= 1e-4 * cost) | (cost <= 1e-14 * r.shape[-1]))
     converged = (left <= gain * cost) | (cost <= ZERO * r.shape[-1]) | (exhausted & at_roundoff)
@@ -115,7 +119,7 @@ def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
 
 
 def solution(s: State) -> Solution:
-    """Result of a state of one fit."""
+    """The result from the state of one fit."""
     xp = host.arrays_of(s.u)
     norms = xp.linalg.norm(s.J, axis=0) * xp.linalg.norm(s.r)
     cosine = xp.max(xp.abs(s.J.T @ s.r) / xp.where(norms > 0, norms, 1.0))
@@ -123,7 +127,7 @@ def solution(s: State) -> Solution:
 
 
 def with_jacobian(residuals: Callable[..., jax.Array]) -> Callable[..., tuple[jax.Array, jax.Array]]:
-    """A function that gives (r, dr/du) of a residual function of (u, …) in one forward-mode pass."""
+    """A function that returns (r, dr/du) for a residual function of (u, …), in one forward-mode pass."""
 
     def evaluate(u: jax.Array, *data: Any) -> tuple[jax.Array, jax.Array]:
         def twice(u):
@@ -139,7 +143,7 @@ def with_jacobian(residuals: Callable[..., jax.Array]) -> Callable[..., tuple[ja
 def levenberg_marquardt(
     residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, max_iterations: int = 200
 ) -> Solution:
-    """Minimise |residuals(u, *data)|^2 / 2 inside jit; vmap over `start` or `data` for many fits at once."""
+    """Minimise |residuals(u, *data)|^2 / 2 inside jit. Use vmap over `start` or `data` for many fits at once."""
     evaluate = with_jacobian(residuals)
 
     def go_on(s):
@@ -152,22 +156,24 @@ def levenberg_marquardt(
     return solution(jax.lax.while_loop(go_on, step, begin(start, n_residuals)))
 
 
-#: Residuals (…, m) and their Jacobian (…, m, P) at u (…, P) and data, in NumPy.
+#: A function of u (…, P) and data that returns residuals (…, m) and their Jacobian (…, m, P), in NumPy.
 Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 
 
 def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iterations: int = 200) -> Solution:
-    """The best of the minima that `levenberg_marquardt` finds from starts (S, P), in NumPy: nothing is compiled.
+    """The best of the minima that Levenberg-Marquardt finds from starts (S, P), in NumPy. Nothing is compiled.
 
-    If the best has not converged yet, only it is iterated further: too few modes for a wide curve converge slowly.
+    If the best point has not converged yet, only this point is iterated further. With too few modes for a wide curve,
+    convergence is slow.
 
     Args:
         evaluate: function of (u, *data), for example `host.with_jacobian` of a function of both.
-        starts: where to begin.
-        data: as in `evaluate`.
-        max_iterations: for each fit; for the best fit `LONGER` times as many.
+        starts: starting points (S, P).
+        data: further arguments of `evaluate`.
+        max_iterations: maximum number of iterations of each fit; `LONGER` times as many for the best fit.
     """
-    with one_blas_thread():  # the matrices are small: eigenvectors took fifty times as long beside other programs
+    # The matrices are small. With more threads, eigenvectors took 50 times as long while other programs ran.
+    with one_blas_thread():
         found = _best_minimum(evaluate, starts, data, max_iterations)
         if found.converged or found.iterations < max_iterations:
             return found
@@ -176,13 +182,13 @@ def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iteratio
 
 
 def _best_minimum(evaluate: Evaluate, starts: np.ndarray, data: tuple, max_iterations: int) -> Solution:
-    """The lowest point that is reached from starts (S, P), all iterated at once."""
+    """The lowest point reached from starts (S, P). All starts are iterated at once."""
     going: np.ndarray = np.arange(len(starts))
     s: Any = None
     with np.errstate(all="ignore"):  # a trial that overflows is a bad one
         while s is None or len(going):
             r, J = evaluate(starts if s is None else s.trial[going], *data)
-            if s is None:  # copies, for `begin` gives some fields the same array
+            if s is None:  # copies, because `begin` uses one array for several fields
                 s = State(*(field.copy() for field in begin(starts, r.shape[-1])))
             new = accept(State(*(field[going] for field in s)), r, J)
             for field, values in zip(s, new, strict=True):
@@ -199,10 +205,10 @@ def levenberg_marquardt_host(
     max_iterations: int = 20,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Solution:
-    """The same iteration in Python, for residuals that take seconds and a start that is nearly the minimum.
+    """The same iteration in Python, for residuals that take seconds and a start near the minimum.
 
-    `progress` is called after every evaluation. It stops if a step would lower the cost by less than 1e-8 of it: this
-    is 1e-3 standard errors.
+    `progress` is called after every evaluation. The iteration stops if a step would lower the cost by less than a part
+    1e-8. Such a step is about 1e-3 standard errors.
     """
     trial: jax.Array = start
     s: Any = None
@@ -217,10 +223,10 @@ def levenberg_marquardt_host(
 
 
 def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol: float = 1e-8) -> Solution:
-    """The same problem by BFGS of `jax.scipy.optimize`; `gtol` bounds the gradient of the cost.
+    """Solve the same problem by BFGS of `jax.scipy.optimize`. `gtol` is the tolerance for the gradient of the cost.
 
-    Its line search often ends at roundoff before gtol is met, so convergence is judged by the decrease of the cost that
-    a least-squares step would still give, as in Levenberg-Marquardt.
+    Its line search often ends at roundoff before gtol is reached. So convergence is judged as in Levenberg-Marquardt:
+    by the decrease of the cost that a least-squares step would still give.
     """
 
     def cost(u):
@@ -231,5 +237,5 @@ def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol
     r, J = with_jacobian(residuals)(found.x, *data)
     s = accept(begin(found.x, r.shape[0]), r, J)
     _, _, left = _damped_steps(J, r, s.damping)
-    near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the latter: more exact than any data
+    near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the second condition: more exact than any data
     return solution(s._replace(iterations=jnp.asarray(found.nit), converged=s.converged | near))

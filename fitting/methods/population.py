@@ -1,15 +1,15 @@
-"""One number of several samples: its mean, its spread between samples, and the interval of a new sample.
+"""One parameter of several samples: its mean, its spread between samples, and the interval for a new sample.
 
-The logarithm y_i of sample i has the mean mu, a spread s between samples and an error e_i: y_i ~ N(mu, s^2 + e_i^2).
-s is estimated by restricted maximum likelihood, the interval of mu after Hartung and Knapp (2001), Statistics in
-Medicine 20. The interval of a new sample is that of Student's t with n - 1 degrees of freedom, exact where the errors
-are small (Higgins, Thompson and Spiegelhalter (2009), J. R. Stat. Soc. A 172, take n - 2). Where the errors may hide s,
-the interval over all s is used, if it is wider.
+The logarithm y_i of sample i has the mean mu, a spread s between samples and an error e_i: y_i ~ N(mu, s^2 + e_i^2). s
+is estimated by restricted maximum likelihood. The interval of mu follows Hartung and Knapp (2001), Statistics in
+Medicine 20. The interval of a new sample uses Student's t with n - 1 degrees of freedom, which is exact if the errors
+are small (Higgins, Thompson and Spiegelhalter (2009), J. R. Stat. Soc. A 172, use n - 2). If the errors may hide s, the
+interval over all s is used if it is wider.
 
-Few samples say little about s. The values of the samples moved towards the mean are therefore means over all s, weighed
-by the restricted likelihood and by a half-Cauchy prior of scale 1 (Gelman 2006, Bayesian Analysis 1, 515), and their
-errors contain those of s and mu. Hartung and Knapp's interval is too narrow if few samples carry most of the weight;
-then the interval of the mean over all s is used, if it is wider.
+Few samples tell little about s. So the values of the samples moved towards the mean are means over all s. The weights
+are the restricted likelihood and a half-Cauchy prior of scale 1 (Gelman 2006, Bayesian Analysis 1, 515). The errors of
+these values contain the errors of s and mu. The interval of Hartung and Knapp is too narrow if a few samples have most
+of the weight. Then the interval of the mean over all s is used if it is wider.
 """
 
 from typing import NamedTuple
@@ -20,27 +20,30 @@ import scipy.stats
 
 from liverjax.core.errors import InputError
 
-#: Effective over real number of samples below which Hartung and Knapp's interval is too narrow.
+#: The interval of Hartung and Knapp is too narrow if the effective number of samples, divided by the real number, is
+#: below this.
 EVEN = 0.8
-#: Mean variance of the errors over that between samples above which the latter is not known from its best value.
+#: If the mean variance of the errors, divided by the variance between samples, exceeds this, the best value of the
+#: variance between samples is not reliable.
 UNSURE = 0.25
-#: A number below this part of the mean, with a larger error, is not that of a sample of the population.
+#: A value below this part of the mean that its sample does not determine is not a sample of this population.
 BELOW = 1e-3
 
 
 class Population(NamedTuple):
-    """The population of one positive number; intervals are of 95 %."""
+    """The population of one positive parameter, with 95 % intervals."""
 
-    mean: float  # geometric
+    mean: float  # geometric mean
     spread: float  # standard deviation of the logarithms between samples
     mean_interval: tuple[float, float]
-    new_interval: tuple[float, float]  # of a further sample
-    pooled: np.ndarray  # (n,) values of the samples, moved towards the mean according to their errors; NaN: below reach
+    new_interval: tuple[float, float]  # for a new sample
+    pooled: np.ndarray  # (n,) values of the samples, moved towards the mean by their errors; NaN: see `BELOW`
     pooled_errors: np.ndarray  # (n,) standard deviations of their logarithms
 
 
 def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
-    """Mean and spread of positive values (n,) with standard errors (n,); None if the data determine fewer than two."""
+    """Mean and spread of positive values (n,) with standard errors (n,). None if fewer than two values are
+    determined."""
     values, errors = np.asarray(values, float), np.asarray(errors, float)
     if values.ndim != 1 or values.shape != errors.shape or np.any(errors < 0):
         raise InputError(f"values {values.shape}, errors {errors.shape}: give one error of at least 0 per value (n,)")
@@ -61,7 +64,8 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     elif np.mean(v) > UNSURE * variance:
         intervals = intervals[0], _hull(intervals[1], over.interval(1.0))
     pooled, pooled_errors = np.full((2, len(values)), np.nan)
-    # Samples that determine nothing are like a new one; a value far below the others is another material.
+    # Samples that determine nothing are treated like a new sample. A value far below the others belongs to another
+    # material.
     silent = ~known & (values > BELOW * np.exp(mean))
     pooled[silent], pooled_errors[silent] = over.moved(np.zeros(silent.sum()), np.full(silent.sum(), 1e12))
     pooled[known], pooled_errors[known] = over.moved(y, v)
@@ -81,7 +85,7 @@ def _hull(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]
 
 
 class _Spreads(NamedTuple):
-    """Spreads s (K,) with their weights, and the mean at each of them with its variance."""
+    """Spreads s (K,) with their weights; and for each spread, the mean and the variance of the mean."""
 
     s: np.ndarray
     weight: np.ndarray
@@ -89,7 +93,8 @@ class _Spreads(NamedTuple):
     variance: np.ndarray
 
     def moved(self, y: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values (n,) of samples with the variances v of their errors, moved towards the mean; standard deviations."""
+        """Values y (n,) with error variances v, moved towards the mean; and the standard deviations of the moved
+        values."""
         trust = self.s[:, None] ** 2 / (self.s[:, None] ** 2 + v)
         at = self.mean[:, None] + trust * (y - self.mean[:, None])
         variances = trust * v + (1 - trust) ** 2 * self.variance[:, None]
@@ -97,7 +102,8 @@ class _Spreads(NamedTuple):
         return middle, np.sqrt(self.weight @ (variances + (at - middle) ** 2))
 
     def interval(self, share: float) -> tuple[float, float]:
-        """The 95 % interval of the mean, with this share of the variance between samples: 1 for a new sample."""
+        """The 95 % interval of the mean. `share` of the variance between samples is added: 1 gives the interval for a
+        new sample."""
         sd = np.sqrt(self.variance + share * self.s**2)
         ends = float(np.min(self.mean - 40 * sd)), float(np.max(self.mean + 40 * sd))
 
@@ -110,7 +116,7 @@ class _Spreads(NamedTuple):
 
 
 def _over_spreads(y: np.ndarray, v: np.ndarray) -> _Spreads:
-    """Weights of spreads by the restricted likelihood and the prior."""
+    """Spreads with their weights from the restricted likelihood and the prior."""
     size = float(np.sqrt(np.var(y) + np.mean(v)))
     s = np.concatenate([[0.0], np.geomspace(1e-4 * size, max(100 * size, 30.0), 400)])
     w = 1 / (v + s[:, None] ** 2)
@@ -122,7 +128,7 @@ def _over_spreads(y: np.ndarray, v: np.ndarray) -> _Spreads:
 
 
 def _variance_between(y: np.ndarray, v: np.ndarray) -> float:
-    """Variance between samples at the largest restricted likelihood."""
+    """The variance between samples with the highest restricted likelihood."""
     top = 10 * float(np.var(y, ddof=1)) + 1e-24
 
     def minus(variance):
@@ -139,7 +145,7 @@ def _variance_between(y: np.ndarray, v: np.ndarray) -> float:
 
 
 def _weighted_mean(y: np.ndarray, v: np.ndarray, variance: float) -> tuple[float, float]:
-    """Weighted mean and its standard error from the scatter, but not below that from the errors."""
+    """Weighted mean, and its standard error from the scatter. This is not below the standard error from the errors."""
     w = 1 / (v + variance)
     mean = float(np.sum(w * y) / np.sum(w))
     q = float(np.sum(w * (y - mean) ** 2) / (len(y) - 1))

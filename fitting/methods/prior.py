@@ -1,9 +1,9 @@
-"""Matern prior: a smooth random field on a mesh (Lindgren, Rue and Lindstroem 2011).
+"""The Matérn prior: a smooth random field on a mesh (Lindgren, Rue and Lindstroem 2011).
 
-(kappa^2 - Laplace) m = white noise, kappa = 1 / length: in three dimensions a covariance sd^2 exp(-distance / length).
-With lumped mass M and stiffness L of linear tetrahedra, m = A^-1 M^(1/2) z for independent standard normal z, A =
-(kappa^2 M + L) / (sd sqrt(8 pi kappa)). The normal derivative is 0 at the boundary, so sd is larger there. It is
-largest in corners.
+The field m solves (kappa^2 - Laplace) m = white noise, with kappa = 1 / length. In three dimensions, this gives the
+covariance sd^2 exp(-distance / length). With the lumped mass M and the stiffness L of linear tetrahedra, m = A^-1
+M^(1/2) z, where z is independent standard normal and A = (kappa^2 M + L) / (sd sqrt(8 pi kappa)). The normal derivative
+of m is 0 at the boundary, so sd is larger there. sd is largest in corners.
 """
 
 import math
@@ -17,11 +17,11 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 
 class Prior(NamedTuple):
-    """A prior, factorised on the host, for the functions below."""
+    """A prior in factorised form on the host, for the functions below."""
 
-    solver: Any  # of kappa^2 M + L
-    root_mass: np.ndarray  # (V,) of the vertices
-    scale: float  # sqrt(8 pi kappa), of a field of standard deviation 1
+    solver: Any  # factor of kappa^2 M + L
+    root_mass: np.ndarray  # (V,) square root of the lumped mass
+    scale: float  # sqrt(8 pi kappa), for a field of standard deviation 1
 
 
 def prior(mesh: TetMesh, length: float) -> Prior:
@@ -45,25 +45,25 @@ def field_at_nodes(p: Prior, z: np.ndarray) -> np.ndarray:
 
 
 def to_whitened(p: Prior, g: np.ndarray) -> np.ndarray:
-    """The transpose of `field_at_nodes`: derivatives by z of derivatives by m."""
+    """The transpose of `field_at_nodes`: derivatives by z, from derivatives by m."""
     root = p.root_mass if g.ndim == 1 else p.root_mass[:, None]
     return p.scale * root * p.solver.solve(g)
 
 
 def variances(p: Prior, modes: np.ndarray, kept: np.ndarray, chunk: int = 512) -> tuple[np.ndarray, np.ndarray]:
-    """Variances (V,) before and after the data. The data reduce the variance along the directions `modes` to the part
+    """Variances (V,) without and with the data. Along the directions `modes`, the data reduce the variance to the part
     `kept`.
 
     Args:
         modes: orthonormal directions of z (V, k).
-        kept: part of the variance that is left in each of them.
+        kept: part of the variance that is left in each direction.
     """
     n = len(p.root_mass)
     before = np.zeros(n)
     for first in range(0, n, chunk):
         unit = np.zeros((n, min(chunk, n - first)))
         unit[np.arange(first, first + unit.shape[1]), np.arange(unit.shape[1])] = 1
-        # Row v of T = scale A^-1 M^(1/2), by the symmetry of A.
+        # This is row v of T = scale A^-1 M^(1/2), because A is symmetric.
         before[first : first + unit.shape[1]] = np.sum(to_whitened(p, unit) ** 2, axis=0)
     after = before - field_at_nodes(p, modes) ** 2 @ (1 - kept)
     return before, np.maximum(after, 0.0)

@@ -1,11 +1,12 @@
-"""A spectrum on a fixed grid of relaxation times. Strengths are not negative, and they are smooth where the data do not
-determine them.
+"""A spectrum on a fixed grid of relaxation times. Strengths are not negative. Where the data do not determine them,
+they are smooth.
 
-For fixed times the moduli are linear in the strengths, so there is only one minimum. The unit of a strength is the size
-of the data at omega = 1 / tau, and a weight penalises the second differences of the strengths. Method: Honerkamp and
-Weese (1989), Macromolecules 22. Grid and weight are those of the highest restricted likelihood (Wahba 1985, Ann. Stat.
-13): the errors that follow from it contain the truth about as often as they should. The information criterion would
-choose a larger weight; its errors contain the truth less often (`experiments/identification/coverage.py`).
+For fixed times, the moduli are linear in the strengths, so there is only one minimum. The unit of a strength is the
+size of the data at omega = 1 / tau. A penalty with a weight acts on the second differences of the strengths. Method:
+Honerkamp and Weese (1989), Macromolecules 22. Grid and weight are chosen by the highest restricted likelihood (Wahba
+1985, Ann. Stat. 13). The errors from this choice contain the true values about as often as they should. The information
+criterion would choose a larger weight, and its errors would contain the true values less often
+(`experiments/identification/coverage.py`).
 """
 
 from collections.abc import Sequence
@@ -17,16 +18,17 @@ from fitting.methods.generalised_maxwell import mode_columns, non_negative
 from fitting.methods.host import Array, arrays_of, exponential
 from fitting.readers.rheometer import Sweep
 
-#: Grids that are tried [times per decade], decades beyond the band on either side, weights that are tried.
+#: Grids that are tried [times per decade], decades of the grid beyond the band on each side, and weights that are
+#: tried.
 GRIDS, MARGIN, WEIGHTS = (2, 3), 1.0, np.logspace(-6, 4, 31)
-#: Relative standard error below which a strength counts as determined by the data.
+#: A strength counts as determined by the data if its relative standard error is below this.
 CARRIED = 0.5
 
 
 class GridSpectrum(NamedTuple):
     """Strengths at fixed times, with the weight and the criterion."""
 
-    times: np.ndarray  # (K,) [s], descending; those with a strength above zero
+    times: np.ndarray  # (K,) [s], descending; only times with a strength above zero
     strengths: np.ndarray  # (K,) [Pa]
     equilibrium: float  # [Pa], 0 for a fluid
     per_decade: int
@@ -40,19 +42,20 @@ class GridSpectrum(NamedTuple):
 
 
 def fit(sweep: Sweep) -> GridSpectrum:
-    """The spectrum for the grid and the weight of the highest restricted likelihood."""
+    """The spectrum with the grid and the weight that have the highest restricted likelihood."""
     return min((at(sweep, grid, w) for grid in GRIDS for w in WEIGHTS), key=lambda found: found.evidence)
 
 
 def fit_all(sweeps: Sequence[Sweep]) -> list[GridSpectrum]:
-    """Spectra of several samples on one grid with one weight, of the highest restricted likelihood for all."""
+    """Spectra of several samples on one grid and with one weight. Both are chosen by the highest restricted likelihood
+    of all samples together."""
     band = min(s.resolved[0] for s in sweeps), max(s.resolved[1] for s in sweeps)
     every = ([at(s, grid, w, band) for s in sweeps] for grid in GRIDS for w in WEIGHTS)
     return min(every, key=lambda found: sum(f.evidence for f in found))
 
 
 def at(sweep: Sweep, per_decade: int, smoothing: float, band: tuple[float, float] | None = None) -> GridSpectrum:
-    """The spectrum of one grid and one weight; a convex problem, solved exactly. `band`: range of times [s]."""
+    """The spectrum for one grid and one weight. This convex problem is solved exactly. `band`: range of times [s]."""
     omega = sweep.angular_frequency
     times = grid_of_times(*(band or sweep.resolved), per_decade)
     size = np.exp(np.interp(-np.log(times), np.log(omega), np.log(np.hypot(sweep.storage, sweep.loss))))
@@ -66,10 +69,10 @@ def at(sweep: Sweep, per_decade: int, smoothing: float, band: tuple[float, float
 
 
 class GridOfTimes(NamedTuple):
-    """Grid of a spectrum: times and units of the strengths, and the weight of their smoothness."""
+    """Grid of a spectrum: the times, the units of the strengths, and the weight for smoothness."""
 
     times: np.ndarray  # (K,) [s], descending
-    unit: np.ndarray  # (1 + K,) [Pa]; the first is for the equilibrium modulus
+    unit: np.ndarray  # (1 + K,) [Pa]; the first unit is for the equilibrium modulus
     per_decade: int
     smoothing: float
 
@@ -81,7 +84,7 @@ def grid_of_times(low: float, high: float, per_decade: int) -> np.ndarray:
 
 
 def second_differences(count: int, smoothing: float) -> np.ndarray:
-    """Rows (K - 2, 1 + K) of the penalty on second differences of the strengths."""
+    """Rows (K - 2, 1 + K) of the penalty on the second differences of the strengths."""
     rows = np.column_stack([np.zeros(count - 2), np.diff(np.eye(count), 2, axis=0)])
     return np.sqrt(smoothing) * rows
 
@@ -91,8 +94,8 @@ def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) ->
 
     Args:
         x: equilibrium modulus and strengths (1 + K,) in `grid.unit`.
-        A: derivative (m, 1 + K) of the residuals of the data.
-        r: these residuals (m,).
+        A: derivatives (m, 1 + K) of the residuals of the data by x.
+        r: residuals of the data (m,).
         grid: grid of the strengths.
     """
     L = second_differences(len(grid.times), grid.smoothing)
@@ -120,10 +123,11 @@ def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) ->
 
 
 def moduli_of_logarithms(u: Array, omega: np.ndarray, times: np.ndarray, solid: bool) -> tuple[Array, Array]:
-    """G' and G'' (…, n) [Pa] of strengths whose logarithms are u (…, K), in NumPy or JAX.
+    """G' and G'' (…, n) [Pa] for strengths with the logarithms u (…, K), in NumPy or JAX.
 
     Args:
-        u: first that of the equilibrium modulus, if the material is `solid`.
+        u: logarithms of the strengths. If the material is `solid`, the first is the logarithm of the equilibrium
+            modulus.
         omega: angular frequencies (n,) [rad/s].
         times: relaxation times [s].
         solid: whether there is an equilibrium modulus.
@@ -133,7 +137,7 @@ def moduli_of_logarithms(u: Array, omega: np.ndarray, times: np.ndarray, solid: 
 
 
 def _restricted_likelihood(x: np.ndarray, A: np.ndarray, r: np.ndarray, L: np.ndarray) -> float:
-    """Compute `GridSpectrum.evidence`. The prior has no effect on (columns of L - rows of L) numbers."""
+    """Compute `GridSpectrum.evidence`. The prior leaves (columns of L - rows of L) parameters free."""
     square = max(float(r @ r + np.sum((L @ x) ** 2)), 1e-300)
     with np.errstate(divide="ignore"):
         both = 2 * np.sum(np.log(np.abs(np.diag(np.linalg.qr(np.vstack([A, L]), mode="r")))))

@@ -1,4 +1,4 @@
-"""Fractional models in closed form: springs and springpots, whose moduli are powers of the frequency.
+"""Fractional models in closed form, made of springs and springpots. Their moduli are powers of the frequency.
 
 A springpot has the complex modulus V (i omega)^alpha, between a spring (alpha = 0) and a dashpot (alpha = 1). Sources:
 Bagley and Torvik (1983), J. Rheol. 27; Schiessel et al. (1995), J. Phys. A 28. All models here are special cases of
@@ -6,9 +6,9 @@ one:
 
     G* = E (i omega)^gamma + 1 / (1 / (V (i omega)^alpha) + 1 / (W (i omega)^beta))     gamma, beta < alpha
 
-with some of its six numbers absent. The code divides frequencies by the middle of the band, x = omega / reference, so
-that starts and scales of all fits are alike. Real and imaginary parts are computed apart, in NumPy or JAX; u may have
-more axes in front (see `fitting.methods.host`).
+where some of the six parameters are absent. The code divides frequencies by the middle of the band, x = omega /
+reference, so that all fits have similar starts and scales. Real and imaginary parts are computed separately, in NumPy
+or JAX. u may have additional leading axes (see `fitting.methods.host`).
 """
 
 from collections.abc import Callable
@@ -23,19 +23,19 @@ from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, from_starts
 from fitting.readers.rheometer import Sweep
 
-#: Places in u: log E, logit gamma / alpha, log V, logit alpha, log W, logit beta / alpha.
+#: Number of entries of u: log E, logit gamma / alpha, log V, logit alpha, log W, logit beta / alpha.
 SIZE = 6
 
 
 class Fractional(NamedTuple):
-    """One case: its free numbers of the six, the reported numbers and their formulas."""
+    """One fractional model: which of the six entries of u are free, the reported parameters, and the formulas."""
 
     name: str
-    free: tuple[int, ...]  # places in u
+    free: tuple[int, ...]  # indices in u
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Callable[[Array, float], Array]  # full u, reference [rad/s] -> (P,)
-    formula: Callable[..., np.ndarray]  # i omega and the values -> G* [Pa], as the literature writes it
+    formula: Callable[..., np.ndarray]  # (i omega, values) -> G* [Pa], as in the literature
 
     @property
     def solid(self) -> bool:
@@ -56,15 +56,15 @@ def _orders(u: Array) -> tuple[Array, Array, Array]:
 
 
 def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> tuple[Array, Array]:
-    """Real and imaginary part (n,) [Pa] of G* of all six numbers u at s = x e^(i angle), x = |s| / reference (n,).
+    """Real and imaginary part (n,) [Pa] of G* at s = x e^(i angle), from all six entries u; x (n,) = |s| / reference.
 
-    By default at s = i omega: G' and G''.
+    The default angle means s = i omega: this gives G' and G''.
     """
     xp = arrays_of(u, x)
     alpha, beta, gamma = (exponent[..., None] for exponent in _orders(u))
     gamma, beta = switches[1] * gamma, switches[3] * beta
     E, V, W = (u[..., k, None] + n * xp.log(x) for k, n in ((0, gamma), (2, alpha), (4, beta)))  # logarithms of sizes
-    least = xp.where(switches[2] > 0, xp.minimum(V.real, W.real), V.real)  # unit of the row, so that nothing overflows
+    least = xp.where(switches[2] > 0, xp.minimum(V.real, W.real), V.real)  # unit of both pots: no overflow
     own, in_row = xp.exp(least - V), switches[2] * xp.exp(least - W)
     real = own * xp.cos(angle * alpha) + in_row * xp.cos(angle * beta)
     imaginary = own * xp.sin(angle * alpha) + in_row * xp.sin(angle * beta)
@@ -72,7 +72,7 @@ def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> t
     return beside * xp.cos(angle * gamma) + row * real, beside * xp.sin(angle * gamma) + row * imaginary
 
 
-#: Relaxation times per decade in `as_modes`, and decades by which they exceed the shortest and the longest time.
+#: Relaxation times per decade in `as_modes`, and decades of relaxation times beyond the shortest and the longest time.
 DENSE, BEYOND = 6, (3.0, 3.0)
 
 
@@ -83,21 +83,21 @@ def times_of_modes(low: float, high: float) -> np.ndarray:
 
 
 def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwell:
-    """Prony modes of the model's own relaxation spectrum, for responses in time.
+    """Many Prony modes that represent the relaxation spectrum of the model, for responses in time.
 
     The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converges
-    exponentially. Two more terms replace slower and faster times; they are chosen so that G* is exact at one slow and
-    one fast real s.
+    exponentially. Two more terms replace the slower and the faster times. They are chosen so that G* is exact at one
+    slow and one fast real s.
 
     Args:
-        u, switches: as in `moduli`.
-        times: (K,) [s], descending, with a constant ratio, as in `times_of_modes`.
-        reference: frequency [rad/s] that is the unit of frequency in u.
+        u, switches: see `moduli`.
+        times: (K,) [s], descending, with a constant ratio, see `times_of_modes`.
+        reference: the frequency [rad/s] that u uses as unit.
     """
     xp = arrays_of(u, times)
     step = xp.log(times[0] / times[1])
     H = step * moduli(u, switches, 1 / (times * reference), np.pi)[1] / np.pi
-    ends = xp.stack([1e3 / times[0], 1e-2 / times[-1]])  # well inside of the times: each term is whole there
+    ends = xp.stack([1e3 / times[0], 1e-2 / times[-1]])  # so that each of the two terms acts fully there
     fast = times[-1] / 3
 
     x = xp.outer(ends, times)
@@ -120,7 +120,7 @@ def springpot_residuals(
 
 
 def _strength(log_size: Array, exponent: Array, reference: float) -> Array:
-    """Strength [Pa s^exponent] of a springpot; `log_size`: of its modulus [Pa] at the reference."""
+    """Strength [Pa s^exponent] of a springpot. `log_size`: logarithm of its modulus [Pa] at the reference frequency."""
     return arrays_of(log_size).exp(log_size - exponent * np.log(reference))
 
 
@@ -173,7 +173,7 @@ FRACTIONAL = (
         _zener,
         lambda s, e, m, tau, a: e + m * (s * tau) ** a / (1 + (s * tau) ** a),
     ),
-    # Two springpots in series, a fluid: the springpot of larger exponent deforms most at low frequencies.
+    # Two springpots in series, a fluid. The springpot with the larger exponent deforms most at low frequencies.
     _case(
         "fractional_maxwell",
         (2, 3, 4, 5),
@@ -181,7 +181,7 @@ FRACTIONAL = (
         _maxwell,
         lambda s, v, a, w, b: 1 / (1 / (v * s**a) + 1 / (w * s**b)),
     ),
-    # Two springpots in parallel, a fluid: the springpot of larger exponent dominates at high frequencies.
+    # Two springpots in parallel, a fluid. The springpot with the larger exponent dominates at high frequencies.
     _case(
         "fractional_parallel",
         (0, 1, 2, 3),
@@ -193,20 +193,20 @@ FRACTIONAL = (
 
 
 def full(model: Fractional, u: Array) -> Array:
-    """All six numbers (…, 6) of the free ones (…, P); those that the model does not have are 0."""
+    """All six entries (…, 6) from the free entries (…, P). Entries that the model does not have are 0."""
     xp = arrays_of(u)
     nothing = xp.zeros_like(u[..., 0])
     return xp.stack([u[..., model.free.index(k)] if k in model.free else nothing for k in range(SIZE)], axis=-1)
 
 
 def best_minimum(model: Fractional, sweep: Sweep, starts: np.ndarray, scales: np.ndarray | None = None) -> Solution:
-    """The best minimum over the free numbers of a model from starts (S, P).
+    """The best minimum over the free entries of u, from starts (S, P).
 
     Args:
-        model: the case.
+        model: the fractional model.
         sweep: data.
-        starts: where to begin.
-        scales: of the residuals (2n,) [Pa]; by default the deviations of the sweep.
+        starts: starting points (S, P).
+        scales: scales of the residuals (2n,) [Pa]; by default the standard deviations of the sweep.
     """
     x = sweep.angular_frequency / reference_frequency(sweep)
     scales = np.concatenate(sweep.deviations) if scales is None else scales
@@ -223,7 +223,7 @@ def reference_frequency(sweep: Sweep) -> float:
 
 
 def starting_points(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
-    """Starting points (count, SIZE): two springpots that cross inside or near the band, then random ones."""
+    """Starting points (count, SIZE): first, two springpots that cross inside or near the band; then random points."""
     rng = np.random.default_rng(seed)
     size = np.log(np.hypot(sweep.storage, sweep.loss))
     half = 0.5 * np.log(sweep.angular_frequency[-1] / sweep.angular_frequency[0])
@@ -237,7 +237,7 @@ def starting_points(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
     return np.concatenate([np.array(ordered), spread])[:count]
 
 
-#: Frequencies at which the two springpots are equally stiff, in half bands from the middle.
+#: Frequencies at which the two springpots are equally stiff: distance from the middle, in half bands.
 _CROSSINGS = (-1.5, -0.75, 0.0, 0.75, 1.5)
 
 
@@ -246,6 +246,6 @@ def _logit(p: np.ndarray | float) -> np.ndarray:
 
 
 def _softer_pot(level: float, smaller: float, alpha: float, log_x: float) -> list[float]:
-    """Start u of two springpots with exponents `alpha` and `smaller` that are equally stiff at log_x."""
+    """Start u for two springpots with the exponents `alpha` and `smaller` that are equally stiff at log_x."""
     ratio = float(_logit(min(smaller / alpha, 0.95)))
     return [level, ratio, level - (alpha - smaller) * log_x, float(_logit(alpha)), level, ratio]

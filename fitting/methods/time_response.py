@@ -1,17 +1,17 @@
-"""Stress of a driven strain and strain of a driven stress: the generalised Maxwell model in time, in closed form.
+"""The generalised Maxwell model in time, in closed form: stress for a given strain, and strain for a given stress.
 
-The input is linear between its points, and for such an input the convolution is exact. Relaxation is a sum over the
-modes. Creep is the same model solved for the strain: with b_i = sqrt(g_i / tau_i) the eigenvalues -r_k and eigenvectors
-q_k of
+The input is linear between its points. For such an input, the convolution is exact. Relaxation is a sum over the modes.
+Creep is the same model solved for the strain. With b_i = sqrt(g_i / tau_i), the eigenvalues -r_k and eigenvectors q_k
+of
 
     S = b b^T - diag(1 / tau)
 
-give its retardation modes: rates r_k >= 0 and weights (q_k . b)^2 (Gross 1953, Mathematical structure of the theories
-of viscoelasticity). A fluid has one rate 0: it flows.
+give the retardation modes, with rates r_k >= 0 and weights (q_k . b)^2 (Gross 1953, Mathematical structure of the
+theories of viscoelasticity). A fluid has one rate of 0, because it flows.
 
-Fits compute the same in NumPy with derivatives by hand (`residuals_with_jacobian`): nothing is compiled. The
+Fits compute the same in NumPy, with derivatives by hand (`residuals_with_jacobian`), so that nothing is compiled. The
 derivatives follow the recursions. The derivatives of the retardation modes are the first-order changes of eigenvalues
-and eigenvectors of S. The eigenvalues of S differ from each other if the relaxation times do.
+and eigenvectors of S. If all relaxation times are different, all eigenvalues of S are different.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,8 @@ def _phi(x: Array) -> tuple[Array, Array]:
 
 
 def stress_response(model: Maxwell, time: jax.Array, strain: jax.Array) -> jax.Array:
-    """Shear stress (n,) [Pa] of a strain (n,) that is linear between `time` (n,) [s]; strain[0] is reached at once."""
+    """Shear stress (n,) [Pa] for a strain (n,) that is linear between the times (n,) [s]. strain[0] is reached at
+    once."""
     rates = 1 / model.relaxation_times
 
     def step(h, change):
@@ -56,7 +57,7 @@ def stress_response(model: Maxwell, time: jax.Array, strain: jax.Array) -> jax.A
 
 
 def retardation(model: Maxwell) -> tuple[Array, Array]:
-    """Rates (N,) [1/s] and weights (N,) [1/s] of J(t) G0 = 1 + sum w_k (1 - exp(-r_k t)) / r_k."""
+    """Rates r (N,) [1/s] and weights w (N,) [1/s] in J(t) G0 = 1 + sum w_k (1 - exp(-r_k t)) / r_k."""
     xp = arrays_of(*model)
     b = xp.sqrt(model.ratios / model.relaxation_times)
     minus, q = xp.linalg.eigh(xp.outer(b, b) - xp.diag(1 / model.relaxation_times))
@@ -64,7 +65,8 @@ def retardation(model: Maxwell) -> tuple[Array, Array]:
 
 
 def strain_response(model: Maxwell, time: jax.Array, stress: jax.Array) -> jax.Array:
-    """Shear strain (n,) of a stress (n,) [Pa] that is linear between `time` (n,) [s]; stress[0] is reached at once."""
+    """Shear strain (n,) for a stress (n,) [Pa] that is linear between the times (n,) [s]. stress[0] is reached at
+    once."""
     rates, weights = retardation(model)
 
     def step(y, change):
@@ -98,13 +100,14 @@ def creep_compliance(model: Maxwell, time: np.ndarray) -> np.ndarray:
 def residuals_with_jacobian(
     kind: str, maxwell: Callable[[np.ndarray], Maxwell], u: np.ndarray, *data: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (…, m) of a test in time and their derivative (…, m, P).
+    """Residuals (…, m) of a test in time and their derivatives (…, m, P) by u.
 
     Args:
         kind: "relaxation" or "creep".
         maxwell: u -> Prony modes.
         u: (…, P).
-        data: times (n,) [s]; driven quantity (n,); rows (m,) of the answers; answers (m,); their scales (m,).
+        data: times (n,) [s]; driven quantity (n,); rows (m,) of the readings; readings (m,); scales of the readings
+            (m,).
     """
     time, driven, rows, answer, scales = data
     modes, slope = host.with_jacobian(partial(parameter_vector, maxwell=maxwell), u)
@@ -117,14 +120,14 @@ def residuals_with_jacobian(
 
 
 class Slopes(NamedTuple):
-    """Prony modes, and the derivative of G0, ratios and times by u (…, 2N + 1, P)."""
+    """Prony modes, and the derivatives (…, 2N + 1, P) of G0, ratios and times by u."""
 
     model: Maxwell
     by_u: np.ndarray
 
 
 def _driven_stress(at: Slopes, time: np.ndarray, strain: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Stress (m, …) [Pa] of a driven strain, and its derivative by u (m, …, P)."""
+    """Stress (m, …) [Pa] for a given strain, and its derivatives by u (m, …, P)."""
     model = at.model
     G0, g, tau = model.shear_modulus[..., None], model.ratios, model.relaxation_times
     rise = np.diff(strain)
@@ -137,7 +140,7 @@ def _driven_stress(at: Slopes, time: np.ndarray, strain: np.ndarray, rows: np.nd
 
 
 def _driven_strain(at: Slopes, time: np.ndarray, stress: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Strain (m, …) of a driven stress [Pa], and its derivative by u (m, …, P)."""
+    """Strain (m, …) for a given stress [Pa], and its derivatives by u (m, …, P)."""
     G0 = at.model.shear_modulus[..., None]
     rates, weights, of_rates, of_weights = _retardation(at)
     dt = np.diff(time)
@@ -175,7 +178,7 @@ def _slopes_of_phi(x: np.ndarray, one: np.ndarray, two: np.ndarray) -> tuple[np.
     return np.where(small, near[0], of_one), np.where(small, near[1], of_two)
 
 
-#: Coefficients of the Taylor series of these slopes: for x below 1e-2 the first term left out is below 1e-16.
+#: Coefficients of the Taylor series of these derivatives. For x below 1e-2, the first omitted term is below 1e-16.
 _SLOPES = (
     [-1 / 2, 1 / 3, -1 / 8, 1 / 30, -1 / 144, 1 / 840, -1 / 5760],
     [-1 / 6, 1 / 12, -1 / 40, 1 / 180, -1 / 1008, 1 / 6720, -1 / 51840],
@@ -183,18 +186,18 @@ _SLOPES = (
 
 
 def _retardation(at: Slopes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rates and weights (…, N) [1/s], and the derivative of both by u (…, N, P)."""
+    """Rates and weights (…, N) [1/s], and the derivatives of both by u (…, N, P)."""
     g, tau = at.model.ratios, at.model.relaxation_times
     of_g, of_tau = np.split(at.by_u[..., 1:, :], 2, axis=-2)
     b = np.sqrt(g / tau)
     n = np.arange(g.shape[-1])
     S = b[..., :, None] * b[..., None, :]
     S[..., n, n] -= 1 / tau
-    known = np.all(np.isfinite(S), axis=(-2, -1), keepdims=True)  # a trial that overflows is a bad one, not an error
+    known = np.all(np.isfinite(S), axis=(-2, -1), keepdims=True)  # an overflow is only a bad trial
     eigenvalues, Q = np.linalg.eigh(np.where(known, S, 0.0))
     Q = np.where(known, Q, np.nan)
     c = np.einsum("...ik,...i->...k", Q, b)
-    # By every u_p: b, its components along the eigenvectors, and the diagonal of -1/tau.
+    # Derivatives by every u_p: of b, of its components along the eigenvectors, and of the diagonal -1/tau.
     of_b = b[..., None] * (of_g / (2 * g[..., None]) - of_tau / (2 * tau[..., None]))
     along, of_diagonal = np.swapaxes(Q, -1, -2) @ of_b, np.swapaxes(of_tau / tau[..., None] ** 2, -1, -2)
     # q_l . (dS/du_p) q_k, (…, p, l, k).

@@ -19,7 +19,7 @@ from liverjax.core.struct import Content
 
 
 def parameter_vector(u: Array, maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural) -> Array:
-    """G0, ratios, relaxation times (2N + 1,) of the Prony modes that `maxwell` makes of u."""
+    """G0, ratios and relaxation times (2N + 1,) of the Prony modes that `maxwell` computes from u."""
     model = maxwell(u)
     xp = arrays_of(*model)
     return xp.concatenate([model.shear_modulus[..., None], model.ratios, model.relaxation_times], axis=-1)
@@ -41,9 +41,9 @@ def estimate(
 
     Args:
         found: minimum over u.
-        deviations_given: as in `noise_factor`.
+        deviations_given: see `noise_factor`.
         maxwell: u -> Prony modes; by default the parametrisation `natural`.
-        components: number of measured residuals (default all), and effective number of parameters (default length of
+        components: number of measured residuals (default: all), and effective number of parameters (default: length of
             u).
     """
     count, effective = components or (len(found.residuals), None)
@@ -51,12 +51,12 @@ def estimate(
     modes = jax.eval_shape(maxwell, found.u).ratios.shape[0]
     vector = partial(parameter_vector, maxwell=maxwell)
     own = estimated(parameter_names(modes), vector, found, count, deviations_given, effective)
-    if modes == 1 and maxwell is generalised_maxwell.natural_fluid:  # the only ratio of a fluid is 1
+    if modes == 1 and maxwell is generalised_maxwell.natural_fluid:  # a fluid with one mode has the ratio 1
         own = own._replace(standard_errors=np.where(np.arange(len(own.values)) == 1, 0.0, own.standard_errors))
     return own
 
 
-#: Ratios that leave less than this to the equilibrium modulus are those of a fluid.
+#: If 1 minus the sum of the ratios is below this, the material is a fluid.
 NO_REST = 1e-10
 
 
@@ -64,26 +64,27 @@ def equilibrium_error(u: Estimate) -> float:
     """Standard error of the equilibrium modulus G0 (1 - sum g) [Pa]; infinite for a fluid."""
     modes = (len(u.values) - 1) // 2
     rest = 1 - u.values[1 : modes + 1].sum()
-    # By the square root of the covariance, so that the variance is never negative.
+    # This uses the square root of the covariance, so that the variance is never negative.
     slope = np.concatenate([[rest], np.full(modes, -u.values[0]), np.zeros(modes)])
     return float(np.linalg.norm(slope @ u.root)) if rest > NO_REST else np.inf
 
 
 def equilibrium_change(values: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Change [Pa] of G0 (1 - sum g) by changes (1 + 2N, ...) of G0, ratios and times, to first order."""
+    """Change [Pa] of G0 (1 - sum g), to first order, for changes `moved` (1 + 2N, ...) of G0, ratios and times."""
     ratios = slice(1, 1 + (len(values) - 1) // 2)
     return moved[0] * (1 - values[ratios].sum()) - values[0] * moved[ratios].sum(axis=0)
 
 
 def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, points: int = 21) -> Content:
-    """95 % intervals by profile likelihood, closed form: all other parameters refitted along each one.
+    """95 % intervals by profile likelihood, for a closed-form fit. Along each parameter, all other parameters are
+    fitted again.
 
-    The likelihood contains the noise only. If `uncertainty` has errors of the gap or the instrument too, they widen the
-    interval: each half width becomes the root of the sum of the squares, which is right to the first order of these
-    errors.
+    The likelihood contains only the noise. If `uncertainty` has errors of the gap or the instrument too, these errors
+    widen the interval: each half width becomes the root of the sum of the squares. This is right to first order in
+    these errors.
 
     Returns:
-        name -> [low, high]; `None` for an end that four standard errors do not reach.
+        For each name, [low, high]. An end is `None` if it is not reached within about four standard errors.
     """
     data = (jnp.asarray(sweep.angular_frequency), sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     best = 2 * float(found.cost)
@@ -108,7 +109,8 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
             intervals[name] = [None, None]
             continue
         grid = center + error * np.linspace(-4, 4, points) * uncertainty.quantile / 2
-        # The penalty need not reach its value exactly: the point reached is the constrained optimum for its own value.
+        # The penalty need not hold the parameter exactly at its value. The reached point is the constrained optimum for
+        # the reached value.
         reached, chi2 = (
             np.asarray(v) for v in along(j, jnp.maximum(grid, 1e-3 * center), 1e3 * uncertainty.noise / error)
         )
@@ -120,14 +122,14 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
 
 
 def _farther(end: float | None, center: float, half: float) -> float | None:
-    """The end of an interval with a further error of half width `half`, independent of the others."""
+    """The end of an interval, moved outwards by one more independent error with the half width `half`."""
     if end is None or half == 0:
         return end
     return float(center + np.copysign(np.hypot(end - center, half), end - center))
 
 
 def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
-    """First place along x at which `rise` passes 0, by linear interpolation."""
+    """First position along x at which `rise` passes 0, by linear interpolation."""
     above = np.flatnonzero(rise > 0)
     if not len(above) or above[0] == 0:
         return None
@@ -135,12 +137,12 @@ def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
     return float(x[k - 1] + (x[k] - x[k - 1]) * rise[k - 1] / (rise[k - 1] - rise[k]))
 
 
-#: Neighbouring relaxation times closer than this factor act as one mode.
+#: Two neighbouring relaxation times whose ratio is below this act as one mode.
 MERGED = 1.5
 
 
 class Band(Protocol):
-    """Data that resolve relaxation times, of a sweep or of a test in time."""
+    """Data that resolve relaxation times: a sweep or a test in time."""
 
     @property
     def resolved(self) -> tuple[float, float]:
@@ -153,12 +155,12 @@ def _decades(data: Band) -> float:
 
 
 def supported_modes(data: Band) -> int:
-    """Number of modes that the band supports: about one for each decade and one more."""
-    return max(1, int(_decades(data) + 1 + 1e-9))  # a decade is a decade in spite of rounding
+    """Number of modes that the band supports: about one for each decade, plus one."""
+    return max(1, int(_decades(data) + 1 + 1e-9))  # rounding must not lose a decade
 
 
 def superfluous(data: Band, u: Estimate) -> list[str]:
-    """Sentences that advise against some of the modes; empty if this number of modes may be chosen."""
+    """Sentences that advise against some of the modes. There are none if this number of modes may be chosen."""
     modes = (len(u.values) - 1) // 2
     kind, measured = ("sweep", "measured frequencies") if isinstance(data, Sweep) else ("test", "measured times")
     fewer = f"use fewer modes or a wider {kind}" if modes > 1 else f"use a wider {kind}"
@@ -177,12 +179,16 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
         if not g_err[k] < 0.5 * g[k]:
             out.append(
                 f"ratios[{k}] = {g[k]:.3g} has a standard error of {_percent(g_err[k], g[k])}: "
-                + ("the data do not need this mode; use fewer modes" if modes > 1 else f"it is not determined; {fewer}")
+                + (
+                    "the data do not need this mode; use fewer modes"
+                    if modes > 1
+                    else f"the data do not determine it; {fewer}"
+                )
             )
         elif not tau_err[k] < 0.5 * tau[k]:
             out.append(
                 f"relaxation_times[{k}] = {tau[k]:.3g} s has a standard error of {_percent(tau_err[k], tau[k])}: "
-                f"the data leave it nearly free; {fewer}"
+                f"the data hardly determine it; {fewer}"
             )
     for k in range(modes - 1):
         if tau[k] < MERGED * tau[k + 1]:
@@ -198,12 +204,13 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
     return out
 
 
-#: Scatter below which points were computed, not measured.
+#: Points with a scatter below this were computed, not measured.
 _SMALL = 1e-4
 
 
 def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
-    """Warnings about numbers that the data do not determine, each with a remedy."""
+    """Warnings about parameters that the data do not determine, and about the standard deviations in the file; each
+    with a remedy."""
     modes = (len(u.values) - 1) // 2
     tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
     low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
@@ -213,7 +220,7 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
             out.append(
                 f"relaxation_times[{k}] = {tau[k]:.3g} s lies outside the {low:.3g}-{high:.3g} s that the measured "
                 f"frequencies resolve: it is extrapolated (standard error {_percent(tau_err[k], tau[k])}); measure at "
-                f"{'higher' if tau[k] < low else 'lower'} frequencies to pin it down"
+                f"{'higher' if tau[k] < low else 'lower'} frequencies to determine it"
             )
     ratios = u.values[1 : modes + 1].sum()
     equilibrium = u.values[0] * (1 - ratios)

@@ -1,1 +1,1 @@
-"""Files of laboratories: sweeps, stress-stretch curves, displacements."""
+"""Readers of measured files: sweeps, stress-stretch curves, displacements, and others."""

@@ -12,7 +12,7 @@ from fitting.readers.units import STRESS_UNITS
 from liverjax.core.errors import InputError
 from liverjax.laws import homogeneous
 
-#: Ends of headings of standard deviations.
+#: Last words of headings that name standard deviations or errors.
 _SPREAD = re.compile(r"(?i)(^|[ _])(sd|std|stdev|se|sem|error|deviation)([ _]?[\[(].*|[ _][km]?Pa)?$")
 _INDICES = [f"{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 
@@ -22,21 +22,23 @@ class Curve(NamedTuple):
 
     label: str
     test: str  # uniaxial, equibiaxial, pure_shear, simple_shear or general
-    F: np.ndarray  # (n, 3, 3), det F = 1, face 3 free
-    component: tuple[int, int]  # of the nominal stress that was measured
+    F: np.ndarray  # (n, 3, 3), det F = 1; no stress on face 3
+    component: tuple[int, int]  # which component of the nominal stress was measured
     stress: np.ndarray  # (n,) [Pa]
-    returns: int = 0  # how often the rows of the file turn and repeat a range
-    sample: str = ""  # the same for components of one test, which follow each other; empty: `label`
+    returns: int = 0  # how often the rows turn back and pass a range again
+    sample: str = ""  # equal for the components of one test, which follow each other; empty: `label`
 
     @property
     def driven(self) -> np.ndarray:
-        """The component of F that the stress does work on; if it is constant, the shear or stretch that varies."""
+        """The component of F on which the measured stress does work. If this component is constant: the shear or the
+        stretch that varies."""
         own, shear = self.F[:, *self.component], self.F[:, 0, 1]
         return own if np.ptp(own) > 0 else shear if np.ptp(shear) > 0 else self.F[:, 0, 0]
 
     @property
     def rises(self) -> bool:
-        """Whether the stress of a stable material must rise with `driven`. It must if only this component does work."""
+        """Whether the stress of a stable material must rise with `driven`. This holds if the stress does work only on
+        this component."""
         return self.test != "general" and np.ptp(self.F[:, *self.component]) > 0
 
     @property
@@ -48,12 +50,14 @@ class Curve(NamedTuple):
 def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[str]]:
     """Curves of CSV files, and notes for the user.
 
-    The file has one of two forms, both with `#` comments: columns F11 … F33 and P11 … P33 (a stress that is zero in all
-    rows counts as not measured), or `test`, `stretch`, `shear`, `nominal_stress_kPa` with `test` one of uniaxial,
-    equibiaxial, pure_shear, simple_shear. A stress column may end in _Pa, _kPa or _MPa; without, it is in `unit`.
+    A file has one of two forms; `#` begins a comment in both. In the first form, the columns are F11 … F33 and P11 …
+    P33. Here a stress that is zero in all rows counts as not measured. In the second form, the columns are `test`,
+    `stretch`, `shear` and `nominal_stress_kPa`, and `test` is one of uniaxial, equibiaxial, pure_shear, simple_shear.
+    The name of a stress column may end in _Pa, _kPa or _MPa. Otherwise the stress is in `unit`.
 
     Raises:
-        InputError: no such file, no such columns, values that are no numbers, volume that changes, too few points.
+        InputError: the file or a column does not exist, a value is not a number, the volume changes, or there are too
+            few points.
     """
     curves, notes = [], []
     for file in files:
@@ -64,7 +68,7 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
         if spreads:
             notes.append(
                 f"{file.name}: {', '.join(spreads)} {'is' if len(spreads) == 1 else 'are'} not used: the noise is "
-                "found from the residuals"
+                "estimated from the residuals"
             )
         found, named = _components(file, rows, unit) if "F11" in rows[0] else _named_tests(file, rows, unit)
         curves += found
@@ -74,7 +78,8 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
         times = "once" if curve.returns == 1 else f"{curve.returns} times"
         notes.append(
             f"{curve.label}: its rows turn back {times}: loading and unloading, cycles or several samples are fitted "
-            "as one curve, and errors do not contain how these differ; keep one, or give each a file"
+            "as one curve, and the errors do not contain the differences between them: keep one of them, or give "
+            "each a separate file"
         )
     seen: dict[str, int] = {}
     for k, curve in enumerate(curves):
@@ -89,12 +94,12 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     cells = [[c.strip('" ') for c in split_cells(line, _delimiter_of_curves(line))] for line in lines]
     first = next((k for k, names in enumerate(cells) if _names_curves(names)), 0)
-    end = next((k for k in range(first, len(cells)) if cells[k][:1] == ["[step]"]), len(cells))  # the next sheet
+    end = next((k for k in range(first, len(cells)) if cells[k][:1] == ["[step]"]), len(cells))  # the next sheet begins
     if end < first + 2:
         raise InputError(f"{file} holds no rows: give a CSV file of curves")
     names, between = _documented(cells[first]), _delimiter_of_curves(lines[first])
     rows = [_row_under(names, own, file) for own in cells[first + 1 : end]]
-    if between != ",":  # decimals may have commas then
+    if between != ",":  # then numbers may have a decimal comma
         sign = decimal_sign(cell for row in rows for cell in row.values())
         rows = [{k: _with_point(v, between, sign) for k, v in row.items()} for row in rows]
     rows = [dict.fromkeys(names, "") | row | {"row": str(k)} for k, row in enumerate(rows, 1) if any(row.values())]
@@ -109,7 +114,7 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
 
 
 def _measured_rows(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
-    """The rows whose nominal stress is measured, and how many are not; all rows if none is."""
+    """The rows with a measured nominal stress, and the number of rows without one. If no row has one, all rows."""
     name = next((key for key in rows[0] if key.startswith("nominal_stress")), None)
     kept = rows if name is None else [row for row in rows if row[name].lower() not in EMPTY]
     return (kept, len(rows) - len(kept)) if kept else (rows, 0)
@@ -119,7 +124,7 @@ def _row_under(names: list[str], cells: list[str], file: Path) -> dict[str, str]
     if any(re.match(r"[-+]?\.?\d", cell) for cell in cells[len(names) :]):
         raise InputError(
             f"{file}: {len(cells)} cells under {len(names)} headings in {','.join(cells)[:60]!r}; write decimals with "
-            "a point, and name every column"
+            "a point, and give every column a heading"
         )
     return dict(zip(names, cells, strict=False))  # cells at the end may be missing; remarks may follow
 
@@ -130,13 +135,13 @@ def _delimiter_of_curves(line: str) -> str:
 
 
 def _documented(headings: list[str]) -> list[str]:
-    """Headings as they are documented, if no other heading is that already."""
+    """The headings in their documented spelling, unless this would make two headings equal."""
     plain = [_folded(name) for name in headings]
     return [own if own == name or plain.count(own) == 1 else name for name, own in zip(headings, plain, strict=True)]
 
 
 def _folded(name: str) -> str:
-    """Capital letters and the unit [-] do not matter."""
+    """The heading in its documented spelling: capital letters are lowered, and the unit [-] is removed."""
     plain = re.sub(r"\s*[\[(][-1][\])]$", "", name)
     if plain.lower() in ("test", "stretch", "shear"):
         return plain.lower()
@@ -149,7 +154,7 @@ def _names_curves(headings: list[str]) -> bool:
 
 
 def _with_point(cell: str, between: str, sign: str | None) -> str:
-    """A number as Python writes it; any other text as it is."""
+    """A number in Python's notation. Any other text is returned unchanged."""
     value = to_number(cell, between, sign) if cell else None
     return cell if value is None else repr(value)
 
@@ -180,8 +185,8 @@ def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str,
     return None
 
 
-#: A component of stress below this part of the largest one was not measured: programs write roundoff in place of 0,
-#: some of them of single precision.
+#: A stress component below this part of the largest component was not measured. Programs write roundoff in place of 0,
+#: some in single precision.
 ROUNDOFF = 1e-5
 
 
@@ -211,7 +216,7 @@ def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], b
     if np.abs(F[:, [0, 1, 2, 2], [2, 2, 0, 1]]).max() > 1e-9:
         raise InputError(f"{file}: F13, F23, F31, F32 must be 0: turn the axes so that face 3 stays flat")
     if (1, 1) in measured and (0, 0) in measured and np.allclose(measured[0, 0], measured[1, 1], rtol=1e-6):
-        del measured[1, 1]  # one number, written twice
+        del measured[1, 1]  # one measurement, written twice
     kind = _kind(F)
     several = len(measured) > 1
     return [
@@ -234,11 +239,13 @@ def _kind(F: np.ndarray) -> str:
     return "general"
 
 
-#: A test whose smallest stretch is this large began far from rest: strains in % are more likely.
+#: If the smallest stretch of a test is this large, the test began far from rest. More likely the column contains
+#: strains in %.
 STRAINED = 1.9
-#: A shear beyond this one is more likely in %.
+#: If a shear is larger than this, it is more likely in %.
 SHEARED = 3.0
-#: The same for tests that reach `STRAINED` and have a stretch below this one with a stress of the same sign.
+#: The column more likely contains strains in % also in this case: a test exceeds `STRAINED`, and has a stretch below
+#: this value with a stress of the same sign.
 SHORTENED = 0.9
 
 
@@ -268,7 +275,7 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         if not shear and stretch.min() >= STRAINED:
             raise InputError(
                 f"{file}: stretches of {stretch.min():g} to {stretch.max():g} do not begin near 1: a stretch is the "
-                "length over the length at rest; write a strain of 2 % as 1.02"
+                "length divided by the length at rest; write a strain of 2 % as 1.02"
             )
         stress = factor * _column(file, group, column[0])
         ends = stress[[int(np.argmin(stretch)), int(np.argmax(stretch))]]
@@ -285,12 +292,13 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
     return curves, column[2]
 
 
-#: Stretches of sheared samples that differ by less are one, measured from row to row.
+#: Stretches of sheared samples that differ by less than this are the same stretch, measured again in each row.
 SAME_STRETCH = 0.01
 
 
 def _stretch_of_shear(row: dict[str, str]) -> float:
-    """The stretch at which a sample is sheared; NaN if it is no number, which is refused where it is read."""
+    """The stretch at which a sample is sheared; NaN if the cell is not a number. The reader of the column refuses such
+    a cell later."""
     try:
         return float(row.get("stretch") or 1.0)
     except ValueError:
@@ -298,7 +306,7 @@ def _stretch_of_shear(row: dict[str, str]) -> float:
 
 
 def _stretches_of_shear(rows: list[dict[str, str]]) -> dict[float, str]:
-    """The stretch of each sheared sample, as text, by the stretches of its rows."""
+    """For each stretch in the rows of sheared samples: the rounded stretch of its sample, as text."""
     own = {_stretch_of_shear(row) for row in rows if row["test"] == "simple_shear"}
     values = np.array(sorted(v for v in own if np.isfinite(v)))
     parts = np.split(values, np.flatnonzero(np.diff(values) >= SAME_STRETCH) + 1)
@@ -317,7 +325,7 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
         raise InputError(f"{file}: {label} has a mean stress of {rms:g} Pa: give measured stresses")
     if np.ptp(F, axis=0).max() == 0:
         raise InputError(f"{file}: {label} has the same deformation in every row: give a curve")
-    # F has rounded digits: the free side is scaled so that det F = 1.
+    # The digits of F are rounded: F33 is scaled so that det F = 1.
     F = F.copy()
     F[:, 2, 2] /= J
     driven = Curve(label, test, F, component, stress).driven
@@ -330,7 +338,7 @@ _TURN = 0.05
 
 
 def _returns(driven: np.ndarray) -> int:
-    """How often the rows (n,) turn and repeat a range that they have passed before."""
+    """How often the rows (n,) turn back and pass again through a range that they have passed before."""
     turns, low, high, least = [0], 0, 0, _TURN * np.ptp(driven)
     rises: bool | None = None
     for k, value in enumerate(driven):
@@ -343,7 +351,8 @@ def _returns(driven: np.ndarray) -> int:
             turns += [low] if rises is False else []
             rises, high = True, k
     parts = [driven[a + (a > 0) : b + 1] for a, b in zip(turns, [*turns[1:], len(driven) - 1], strict=True)]
-    # A jump back to the start is no part of its own, and one wrong value does not make a range.
+    # A jump back to the start is not a separate part. The extreme value of each part is left out, so that one wrong
+    # value does not make a range.
     parts = [np.sort(part)[1:-1] for part in parts if len(part) >= 3]
     return sum(
         1

@@ -1,4 +1,4 @@
-"""Measured displacements of points of a body: read from CSV, and a simulation's displacements at these points."""
+"""Measured displacements of points of a body, read from CSV; and the displacements of a simulation at these points."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -14,11 +14,12 @@ from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.scenes.scene import Scene
 
-#: A point farther from the mesh than this, in sizes of the nearest element, does not belong to the body.
+#: A point farther from the mesh than this does not belong to the body (in sizes of the nearest element).
 _FAR = 2.0
-#: Of points farther outside than this [elements], the surface of a coarse mesh explains at most this part.
+#: A coarse surface of the mesh may leave points outside by more than _OUTSIDE element sizes, but at most this part of
+#: all points.
 _OUTSIDE, _MOST_OUTSIDE = 0.25, 0.2
-#: Displacements above so many sizes of the body are no displacements.
+#: A value above this many sizes of the body cannot be a displacement.
 _LONGEST = 2.0
 _COLUMNS = ("node", "x", "y", "z", "ux", "uy", "uz", "time", "sd")
 
@@ -26,8 +27,8 @@ _COLUMNS = ("node", "x", "y", "z", "ux", "uy", "uz", "time", "sd")
 class Displacements(NamedTuple):
     """Displacements of n points, each measured at one step of the scene."""
 
-    step: np.ndarray  # (n,) which step, from 0
-    nodes: np.ndarray  # (n, 4) nodes of the element of the point; (n, 10) if quadratic
+    step: np.ndarray  # (n,) index of the step, from 0
+    nodes: np.ndarray  # (n, 4) nodes of the element at the point; (n, 10) if quadratic
     weights: np.ndarray  # shape functions of these nodes at the point
     measured: np.ndarray  # (n, 3) [m]; 0 where not measured
     sd: np.ndarray  # (n, 3) [m] standard deviation of the noise; infinite where not measured
@@ -41,19 +42,19 @@ class Displacements(NamedTuple):
 def read_displacements(path: str | Path, scene: Scene, noise: float | None = None, unit: str = "m") -> Displacements:
     """Displacements of a CSV file with a header.
 
-    Columns: ``node`` (its number), or ``x, y, z`` (place at rest); ``ux, uy, uz``, empty where not measured; ``time``
-    [s] if the scene has time steps (without it: the last step); ``sd``, standard deviation of the noise. `#` begins a
-    comment.
+    The columns are: ``node`` (index of the node), or ``x, y, z`` (position at rest); ``ux, uy, uz`` (empty if not
+    measured); ``time`` [s], if the scene has time steps (default: the last step); ``sd``, the standard deviation of the
+    noise. `#` begins a comment.
 
     Args:
         path: CSV file.
-        scene: the scene that is to explain them.
+        scene: the scene whose simulation is compared with the displacements.
         noise: standard deviation [m] if the file has no ``sd``.
         unit: of all lengths in the file, one of `liverjax.mesh.tetrahedra.UNITS`.
 
     Raises:
-        InputError: unreadable file, unknown or missing columns, values that are not finite, a node or point that is not
-            in the mesh, a time without a step, no noise level.
+        InputError: the file cannot be read, a column is unknown or missing, a value is not finite, a node or point is
+            not in the mesh, the scene has no step at a time, or the noise is not given.
     """
     path = Path(path)
     if unit not in UNITS:
@@ -99,7 +100,8 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     )
 
 
-#: So many points, within this part of the body's size, have places of another unit than the body.
+#: If at least this many points lie within this part of the body's size, their positions have another unit than the
+#: body.
 _SOME, _TOGETHER = 8, 0.01
 
 
@@ -108,12 +110,13 @@ def _refuse_other_places(path: Path, places: np.ndarray, size: float, unit: str)
     if len(np.unique(places, axis=0)) >= _SOME and across < _TOGETHER * size:
         raise InputError(
             f"{path}: all points lie within {across:.2g} m of each other, in a body of {size:.3g} m: --unit {unit} is "
-            "for x, y, z and ux, uy, uz alike; write both in one unit"
+            "for x, y, z and ux, uy, uz alike; write all of them in one unit"
         )
 
 
 def _no_copies(path: Path, table: dict[str, np.ndarray]) -> None:
-    """Refuse a table written twice: each row would count as a measurement. Single rows may be equal by rounding."""
+    """Refuse a table that is written twice: each row would count as a measurement. A few rows may be equal by
+    rounding."""
     rows = np.nan_to_num(np.column_stack(list(table.values())), nan=np.inf)
     _, first, of = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     again = np.flatnonzero(first[of.ravel()] != np.arange(len(rows)))
@@ -121,12 +124,12 @@ def _no_copies(path: Path, table: dict[str, np.ndarray]) -> None:
         k = int(again[0])
         raise InputError(
             f"{path}: row {k + 1} repeats row {first[of.ravel()[k]] + 1} ({len(again)} of {len(rows)} rows are "
-            "copies): leave them out, for each row counts as a measurement"
+            "copies): remove the copies, because each row counts as a measurement"
         )
 
 
 def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
-    """Columns by name; NaN for an empty cell. The header may be a comment, as `numpy.savetxt` writes it."""
+    """Columns by name; an empty cell is NaN. The header may be a comment, as in files of `numpy.savetxt`."""
     lines = [line for line in text_of(path, "displacements").splitlines() if line.strip(" \t#;,")]
     if not lines:
         raise InputError(f"{path} is empty: give a CSV with columns x,y,z,ux,uy,uz")
@@ -151,7 +154,8 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
 
 
 def _rows_of_numbers(path: Path, names: list[str], rows: list[list[str]], between: str) -> np.ndarray:
-    """(n, columns). A cell that is neither empty nor a number is refused: it would count as not measured."""
+    """The numbers (n, columns). A cell that is neither empty nor a number is refused: otherwise it would count as not
+    measured."""
     sign, values = decimal_sign(cell for row in rows[:1000] for cell in row), np.full((len(rows), len(names)), np.nan)
     for k, row in enumerate(rows):
         if len(row) > len(names):
@@ -195,11 +199,11 @@ def _measured_at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[
 
 
 def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The element that contains each point or is nearest to it: its nodes, the values of their functions, and the
-    distance.
+    """The element that contains each point, or is nearest to it: its nodes, the values of their shape functions at the
+    point, and the distance.
 
-    Returns nodes (n, 4) and barycentric coordinates (n, 4), or for quadratic elements nodes (n, 10) and their functions
-    (n, 10); and the distance (n,) of the point from the element, in sizes of the element; host side.
+    Returns nodes (n, 4) and barycentric coordinates (n, 4); for quadratic elements, nodes (n, 10) and their shape
+    functions (n, 10). The distance (n,) from point to element is in sizes of the element. It runs on the host.
     """
     X, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     candidates = min(candidates, len(tets))
@@ -237,11 +241,12 @@ def _steps(path: Path, scene: Scene, time: np.ndarray | None, n: int) -> np.ndar
 
 
 def predicted(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
-    """Displacements (n, 3) [m] of the points in a run's positions (T, V, 3)."""
+    """Displacements (n, 3) [m] of the points, from the node positions (T, V, 3) of a run."""
     corner = positions[data.step[:, None], data.nodes] - scene.mesh.points[data.nodes]
     return jnp.sum(data.weights[..., None] * corner, axis=1)
 
 
 def weighted_differences(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
-    """Predicted minus measured displacements over the noise, flat (3 n,); 0 where nothing was measured."""
+    """Predicted minus measured displacements, divided by the standard deviation of the noise, as a flat array (3 n,). A
+    component that was not measured is 0."""
     return ((predicted(data, scene, positions) - data.measured) / data.sd).ravel()

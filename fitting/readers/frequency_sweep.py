@@ -10,10 +10,10 @@ from fitting.readers import raw_torque
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Fewest frequencies that must remain if points are left out: a fit of one mode needs them.
+#: Minimum number of frequencies that must remain if points are left out: a fit of one mode needs them.
 FEWEST = 3
-#: Deviations above a tenth of the moduli, and above the scatter of the points by this factor, are the spread between
-#: samples, which is common to all frequencies: with noise of this size the points would scatter as much.
+#: Standard deviations show the spread between samples, not noise, if they exceed LARGE times the moduli and also SHARED
+#: times the scatter of the points. Noise of this size would make the points scatter as much.
 SHARED, LARGE = 3.0, 0.1
 
 
@@ -26,22 +26,23 @@ class Sweep(NamedTuple):
     storage_sd: np.ndarray | None = None  # (n,) standard deviations [Pa]
     loss_sd: np.ndarray | None = None
     source: str = ""
-    notes: tuple[str, ...] = ()  # sentences on what the reader changed or chose
+    notes: tuple[str, ...] = ()  # sentences about changes and choices of the reader
     raw: dict[str, np.ndarray] | None = None  # (n,) raw torque [N m], angle [rad], phase [rad], if in the file
     inertia: np.ndarray | None = (
         None  # (n,) [Pa] that the instrument subtracted for its inertia, if raw columns show it
     )
     friction: np.ndarray | None = None  # (n,) [Pa] change of G'' by one standard deviation of the bearing's friction
-    friction_error: float = 0.0  # this deviation [N m s]
-    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out that show the instrument
-    sd_estimated: bool = False  # the deviations are weights, from the scatter of the points themselves
-    sd_before: bool = False  # they are weights: the size of the moduli before a part of the instrument was taken off
+    friction_error: float = 0.0  # this standard deviation [N m s]
+    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out: the instrument dominates
+    sd_estimated: bool = False  # the deviations are only weights, from the scatter of the points
+    sd_before: bool = False  # they are only weights, from the moduli before a correction
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Scales of the residuals [Pa]: the given deviations, or smooth curves through the moduli (relative errors).
+        """Scales of the residuals [Pa]: the given standard deviations, or else smooth curves through the moduli
+        (relative errors).
 
-        Deviations that are themselves estimates from few repeats are smoothed.
+        Standard deviations that were estimated from few repeats are smoothed.
         """
         omega, pairs = self.angular_frequency, ((self.storage, self.storage_sd), (self.loss, self.loss_sd))
         first, second = (smooth_curve(omega, m) if sd is None else smooth_deviations(omega, m, sd) for m, sd in pairs)
@@ -49,14 +50,15 @@ class Sweep(NamedTuple):
 
     @property
     def noise_given(self) -> bool:
-        """Whether deviations are given and are the noise of each point, not the spread between samples."""
+        """Whether standard deviations are given, and describe the noise of each point and not the spread between
+        samples."""
         if self.storage_sd is None or self.sd_estimated or self.sd_before:
             return False
         return self.relative_deviation < LARGE or not self.point_scatter < self.relative_deviation / SHARED
 
     @property
     def relative_deviation(self) -> float:
-        """Median of the file's deviations over the moduli; NaN if the file has none."""
+        """Median of the standard deviations divided by the moduli; NaN if there are none."""
         if self.storage_sd is None or self.loss_sd is None:
             return np.nan
         return float(np.median(np.concatenate([self.storage_sd / self.storage, self.loss_sd / self.loss])))
@@ -74,10 +76,11 @@ class Sweep(NamedTuple):
 
 
 def check_sweep(sweep: Sweep) -> None:
-    """Refuse numbers that make no sweep, for sweeps made in Python; readers refuse them with line and column.
+    """Refuse a sweep with invalid values. This check is for sweeps made in Python: the readers of files refuse such
+    values themselves, with line and column.
 
     Raises:
-        InputError: one sentence naming the field, its value and the remedy.
+        InputError: one sentence with the field, its value and the remedy.
     """
     name, first = sweep.source or "sweep", np.shape(sweep.angular_frequency)
     fields = {key: getattr(sweep, key) for key in ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")}
@@ -98,15 +101,17 @@ def check_sweep(sweep: Sweep) -> None:
         raise InputError(f"{name}: angular_frequency must be in ascending order: sort the points")
 
 
-#: How many neighbours a polynomial is held against; more neighbours see less of the curve's shape.
+#: Numbers of neighbouring points that are compared with a polynomial. With more neighbours the degree is higher, and
+#: the shape of the curve adds less to the scatter.
 NEIGHBOURS = (4, 5, 6)
 
 
 def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
-    """Relative standard deviation of points about a smooth curve (robust): the smallest one of several polynomials.
+    """Robust relative standard deviation of the points about a smooth curve: the smallest value over several
+    polynomials.
 
-    Four neighbours are compared with a parabola, five with a cubic, six with a quartic. Few points per decade show the
-    curvature of the material in the first of them: 1 % at six points per decade.
+    Four neighbours are compared with a parabola, five with a cubic, six with a quartic. If there are few points per
+    decade, the curvature of the material adds to the distance from the parabola: 1 % at six points per decade.
 
     Args:
         omega: different frequencies (n,), ascending.
@@ -134,20 +139,21 @@ def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarr
     return np.array(left)
 
 
-#: Points nearer than this in the logarithm of x are one place of a smooth curve; it needs so many places, and has at
-#: most about `_MOST` of them.
+#: Points nearer than _NEAR in the logarithm of x are merged into one point of the smooth curve. The curve needs at
+#: least _PLACES such points, and has at most about _MOST.
 _NEAR, _PLACES, _MOST = 0.01, 5, 400
-#: A point is far from the curve beyond this logarithm, and beyond so many robust deviations.
+#: A point is far from the curve if the distance of its logarithm exceeds both _FAR and _DEVIATIONS robust standard
+#: deviations.
 _FAR, _DEVIATIONS = 0.4, 5.0
 
 
 def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A smooth curve through positive numbers y (n,) over positive x (n,), as moduli over frequencies: a spline of the
-    logarithms, smoothed by cross-validation. Where a number is far above the curve, it is the number itself.
+    """A smooth curve through positive values y (n,) over positive x (n,), for example moduli over frequencies. It is a
+    spline of the logarithms, smoothed by cross-validation. At a value far above the curve, the result is this value.
 
-    It is the scale of relative errors. Were it the measured number everywhere, a point that is low by chance would have
-    more weight than one that is high, and the fit would be too low by twice the square of the relative noise. A point
-    that is far above by mistake has its own size as scale, so that it does not decide the fit.
+    The curve is the scale of relative errors. If the measured values were the scale, a point that is low by chance
+    would have more weight than a point that is high. The fit would be too low by twice the square of the relative
+    noise. A point that is far too high by mistake has its own value as scale, so that it does not dominate the fit.
     """
     return _curve_of_bytes(np.asarray(x, float).tobytes(), np.asarray(y, float).tobytes())
 
@@ -171,7 +177,8 @@ def _curve_of_bytes(*columns: bytes) -> np.ndarray:
 
 
 def _cells_along(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means of points (n,) in cells along x, ascending, and their numbers; neighbours across a border are one."""
+    """Means of points (n,) in cells along x, in ascending order, and the number of points in each cell. Neighbouring
+    points on two sides of a cell border are merged."""
     near = max(_NEAR, float(np.ptp(x)) / _MOST)
     cell = np.round(x / near)
     for _ in range(2):
@@ -183,25 +190,26 @@ def _cells_along(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _far_from_neighbours(y: np.ndarray) -> np.ndarray:
-    """Which logarithms (n,) are far from the median of the five around them."""
+    """For each logarithm (n,): whether it is far from the median of the five values around it."""
     from scipy.ndimage import median_filter
 
     off = np.abs(y - median_filter(y, size=5, mode="nearest"))
     return off > max(_FAR, _DEVIATIONS * 1.4826 * float(np.median(off)))
 
 
-#: Standard deviation of ln(deviation / modulus) about a smooth curve above which deviations are those of few repeats:
-#: the deviation of five has 0.4, of three 0.64. Fewest points, and degree of the polynomial that replaces them.
+#: Standard deviations come from few repeats if ln(deviation / modulus) scatters about a smooth curve by more than
+#: _FEW_REPEATS. Five repeats give a scatter of 0.4, three repeats 0.64. Then follow the minimum number of points, and
+#: the degree of the polynomial that replaces such deviations.
 _FEW_REPEATS, _POINTS, _DEGREE = 0.25, 8, 2
-#: Deviations whose part of the modulus differs by less than this were computed from one percentage.
+#: If ln(deviation / modulus) varies by less than this, the deviations were computed as one percentage of the moduli.
 _ROUNDED = 0.01
 
 
 def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Deviations (n,) that change smoothly with the frequency, in place of such that scatter from point to point.
+    """Standard deviations (n,) that change smoothly with the frequency, if the given ones scatter from point to point.
 
-    The deviation of three repeats is off by a factor of two and more. Points whose deviation is small by chance would
-    have most of the weight, and the errors would be too small.
+    A standard deviation from three repeats may be wrong by a factor of two and more. Points whose standard deviation is
+    small by chance would have most of the weight, and the errors of the fit would be too small.
     """
     return _smooth_of_bytes(*(np.asarray(v, float).tobytes() for v in (omega, modulus, sd)))
 
@@ -211,7 +219,8 @@ def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     """`smooth_deviations` of the bytes of its columns."""
     omega, modulus, sd = (np.frombuffer(column) for column in columns)
     x, part, curve = np.log(omega), np.log(sd / modulus), smooth_curve(omega, modulus)
-    # Deviations in percent of the measured moduli have the noise of these: they are parts of the curve.
+    # Standard deviations in percent of the measured moduli contain the noise of the moduli. So they are computed as
+    # percent of the smooth curve.
     if np.ptp(part) < _ROUNDED:
         return sd * curve / modulus
     if len(np.unique(x)) < max(_POINTS, len(x)):
@@ -220,18 +229,18 @@ def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     if off < _FEW_REPEATS:
         return sd * curve / modulus if off < 0.5 * distance_from_smooth(x, np.log(sd)) else sd
     smooth = curve * np.exp(np.polyval(np.polyfit(x - x.mean(), part, _DEGREE), x - x.mean()))
-    return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # squares of deviations are right on average
+    return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # the squares of the deviations are right on average
 
 
 def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
-    """One point per frequency: repeated points are averaged."""
+    """One point per frequency: points with the same frequency are averaged."""
     different, place = np.unique(omega, return_inverse=True)
     count = np.bincount(place)
     return different, *(np.bincount(place, column) / count for column in columns)
 
 
 def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
-    """The points from `low` to `high` [Hz]; a note names how many are left out.
+    """The points from `low` to `high` [Hz]. A note tells how many points are left out.
 
     Raises:
         InputError: fewer than `FEWEST` frequencies are left.
@@ -267,16 +276,17 @@ def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
 
 
 def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> Sweep:
-    """The sweep with the standard deviation `error` [N m s] of the friction of the instrument's bearing; size in m."""
+    """The sweep with the standard deviation `error` [N m s] of the friction of the instrument's bearing. `radius` and
+    `height` of the sample are in m."""
     geometry = np.pi * radius**4 / (2 * height)
     return sweep._replace(friction=error * sweep.angular_frequency / geometry, friction_error=error)
 
 
 def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
-    """The points whose modulus exceeds the uncertain part of the instrument's inertia; the others become `grey`.
+    """The points whose modulus exceeds the uncertain part of the instrument's inertia. The other points become `grey`.
 
-    This needs raw torque and angle in the file, and the torque of the sample or its radius and height [m]; or it needs
-    the raw phase.
+    This needs the raw phase; or raw torque and angle, together with the torque of the sample or its radius and height
+    [m].
     """
     raw = sweep.raw
     if not raw or not set(raw_torque.COLUMNS) & set(raw):
@@ -306,7 +316,8 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     empty = int(np.sum(~raw_torque.with_raw_columns(raw)))
     if empty:
         shows += (
-            f" ({empty} of {len(G)} points have an empty cell in the raw columns: their inertia is that of the others)"
+            f" ({empty} of {len(G)} points have an empty cell in the raw columns: for them, the inertia of the other "
+            "points is used)"
         )
     note = f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz it needs {times:.3g} times the torque of the sample"
     if not lost.any():

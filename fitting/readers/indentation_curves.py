@@ -1,4 +1,4 @@
-"""Indentation curves from files: depth and force of a loading."""
+"""Indentation curves from files: depth and force while the indenter moves in."""
 
 import re
 from pathlib import Path
@@ -18,41 +18,43 @@ from fitting.readers.tables.text_tables import (
 from fitting.readers.units import INDENTATION_UNITS
 from liverjax.core.errors import InputError
 
-#: First words of the two columns; of several columns the one with the earlier word is read.
+#: First words of the headings of the two columns. If several columns match, the column with the earlier word in this
+#: list is read.
 _WORDS = {
     "depth": ("indentation", "eindringtiefe", "enfoncement", "depth", "tiefe", "profondeur", "displacement", "weg"),
     "force": ("force", "kraft", "load", "normal force"),
 }
-#: Words of columns that are something else: a speed, an error.
+#: Words of headings that mean something else, for example a speed or an error.
 _NOT = {"rate", "velocity", "speed", "sd", "std", "error", "modulus"}
-#: A number beyond this one, in SI units, is no measurement.
+#: A value above this, in SI units, cannot be a measurement.
 _LARGEST = 1e30
 _FEWEST = 6
-#: A loading ends where the indenter goes back by this part of the depth; a longer hold at its end, in points, is cut.
+#: A loading ends when the indenter goes back by the part _BACK of the depth range. A hold at its end is cut if it has
+#: more than the part _HELD of the points.
 _BACK, _HELD = 0.1, 0.15
-#: An offset is subtracted only if the noise could not hide a rise by this part of the largest force.
+#: An offset is subtracted only if the noise is too small to hide a rise by this part of the largest force.
 _FLAT = 0.01
 
 
 class IndentationCurve(NamedTuple):
     """The measured approach of an indenter."""
 
-    depth: np.ndarray  # (n,) [m] of the indenter, from any origin, larger further in
+    depth: np.ndarray  # (n,) [m] of the indenter, from any origin; it grows as the indenter moves in
     force: np.ndarray  # (n,) [N]
     source: str
     notes: tuple[str, ...] = ()
 
 
 def read_indentation(path: str | Path) -> IndentationCurve:
-    """Read the loading part of a curve, up to the deepest point or to an earlier hold of depth or force; of several
-    loadings the first is read.
+    """Read the loading part of a curve. It ends at the deepest point, or at an earlier hold of depth or force. If the
+    file has several loadings, the first is read.
 
     Args:
-        path: text with a header that names depth (or displacement, indentation) and force (or load), with units m, mm,
-            um, nm and N, mN, uN, nN, pN: `depth_um,force_mN`; or a workbook.
+        path: a workbook, or text with a header that names depth (or displacement, indentation) and force (or load) with
+            their units, for example `depth_um,force_mN`. Units are m, mm, um, nm and N, mN, uN, nN, pN.
 
     Raises:
-        InputError: one sentence naming file, column or line, value and remedy.
+        InputError: one sentence with the file, the column or line, the value and the remedy.
     """
     lines = text_of(Path(path), "an indentation curve").splitlines()
     head = next((k for k, line in enumerate(lines) if len(_depth_and_force(lines, k)) == 2), None)
@@ -73,7 +75,7 @@ def read_indentation(path: str | Path) -> IndentationCurve:
         pulls = len(force) >= _FEWEST and np.mean(force) < 0 and np.argmin(force) > len(force) / 2
         remedy = "the depth falls: it must grow further in, so change its sign" if falls else "give more of them"
         remedy = "the force falls while the depth grows: change its sign" if pulls and not falls else remedy
-        remedy = "the force is the same in all rows: is the right column named?" if np.ptp(force) == 0 else remedy
+        remedy = "the force is the same in all rows: is this the right column?" if np.ptp(force) == 0 else remedy
         raise InputError(f"{path}: {last} loading points; a fit needs {_FEWEST} or more, at different depths: {remedy}")
     depth, force = depth[:last], force[:last]
     offset = _offset(force)
@@ -83,19 +85,19 @@ def read_indentation(path: str | Path) -> IndentationCurve:
 
 
 def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str]]:
-    """Number of points of the first loading, without a hold at its end; then notes."""
+    """Number of points of the first loading, without a hold at its end; and notes."""
     number, notes = len(depth), []
     back = np.maximum.accumulate(depth) - depth > _BACK * np.ptp(depth)
     end = int(np.argmax(back)) if back.any() else number
     last = int(np.argmax(depth[:end])) + 1
-    # After the way back the indenter comes down again, by more than the part that counts as back.
+    # After it has gone back, the indenter moves in again, by more than the part that ends a loading.
     after = depth[end:]
     if len(after) and np.max(after - np.minimum.accumulate(after)) > _BACK * np.ptp(depth):
         notes.append("the file has several loadings: the first is fitted")
     reached = [int(np.argmax(v[:last] >= np.max(v[:last]) - _margin(v[:last]))) + 1 for v in (depth, force)]
     if last - min(reached) > max(5, _HELD * last):
         notes.append(
-            f"{last - min(reached)} points are left out, as depth or force is constant at the end of the loading"
+            f"{last - min(reached)} points are left out, because depth or force is constant at the end of the loading"
         )
         last = min(reached)
     elif last < number:
@@ -104,9 +106,9 @@ def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str
 
 
 def _offset(force: np.ndarray) -> float:
-    """Mean force [N] of the first points, if the next ones have the same: the indenter does not touch there yet.
+    """Mean force [N] of the first points, if the next points have the same mean: then the indenter does not touch yet.
 
-    It is 0 if the noise could hide a rise of the force, or if the noise alone explains this mean.
+    The result is 0 if the noise could hide a rise of the force, or if noise alone explains this mean.
     """
     few = max(3, len(force) // 20)
     first, after = float(np.mean(force[:few])), float(np.mean(force[few : 2 * few]))
@@ -116,7 +118,7 @@ def _offset(force: np.ndarray) -> float:
 
 
 def _margin(values: np.ndarray) -> float:
-    """Distance from the largest value at which a quantity counts as held: twice its noise, plus 0.5 % of its range."""
+    """A quantity counts as held within this distance of its largest value: twice its noise, plus 0.5 % of its range."""
     return 2 * noise_of_series(values) + 0.005 * float(np.ptp(values))
 
 
@@ -129,7 +131,7 @@ class _PlacedColumn(NamedTuple):
 
 
 def _depth_and_force(lines: list[str], head: int) -> dict[str, _PlacedColumn]:
-    """The column of each quantity that a line names, with its unit there or in the line below."""
+    """The column of each quantity that line `head` names. The unit is in the heading or in the line below."""
     cells = split_cells(lines[head], find_delimiter(lines[head]))
     below = split_cells(lines[head + 1], find_delimiter(lines[head])) if head + 1 < len(lines) else []
     found = {}
@@ -141,7 +143,7 @@ def _depth_and_force(lines: list[str], head: int) -> dict[str, _PlacedColumn]:
 
 
 def _places(cells: list[str], below: list[str], quantity: str) -> list[_PlacedColumn]:
-    """Columns of a quantity, best first: those whose heading, with a unit, begins with one of its words."""
+    """Columns of a quantity, best first. Their heading begins with one of the words of the quantity and has a unit."""
     found, units = [], INDENTATION_UNITS[quantity]
     for j, cell in enumerate(cells):
         words = [w for w in re.split(r"[\s_()\[\]#\"/,]+", cell) if w]
@@ -155,7 +157,7 @@ def _places(cells: list[str], below: list[str], quantity: str) -> list[_PlacedCo
 
 
 def _told_of_others(lines: list[str], head: int, found: dict[str, _PlacedColumn]) -> list[str]:
-    """A note for a quantity that several columns name."""
+    """A note for each quantity that several columns name."""
     cells = split_cells(lines[head], find_delimiter(lines[head]))
     below = split_cells(lines[head + 1], find_delimiter(lines[head])) if head + 1 < len(lines) else []
     notes = []
@@ -169,7 +171,7 @@ def _told_of_others(lines: list[str], head: int, found: dict[str, _PlacedColumn]
 def _in_si_units(
     path: str, lines: list[str], head: int, delimiter: str, found: dict[str, _PlacedColumn]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns in SI units; then a note on rows with an empty cell, which are left out."""
+    """The columns in SI units; and a note on the rows that are left out because of an empty cell."""
     numbered = [(k, line) for k, line in enumerate(lines[head + 1 :], head + 2) if line.strip(f"{delimiter} \t")]
     rows = [(k, split_cells(line, delimiter)) for k, line in numbered if not line.lstrip().startswith("#")]
     if rows and means_nothing(rows[0][1][p.column] for p in found.values() if p.column < len(rows[0][1])):

@@ -1,7 +1,9 @@
-"""Effect of the instrument's inertia on a sweep, from the raw torque and displacement of some exports.
+"""Effect of the instrument's inertia on a sweep. It is computed from raw columns (torque, angle, phase) that some
+exports have.
 
-Raw torque M and angle theta obey M e^(i phase) = (K G* - I omega^2) theta, with K the geometry and I the inertia that
-the software has subtracted. I omega^2 / K is its share of the modulus, known up to the relative error `UNCERTAINTY`.
+Raw torque M and angle theta obey M e^(i phase) = (K G* - I omega^2) theta, with the geometry factor K and the inertia I
+that the software has subtracted. I omega^2 / K is the share of the inertia in the modulus. It is known up to the
+relative error `UNCERTAINTY`.
 """
 
 import re
@@ -12,9 +14,10 @@ import numpy as np
 
 from fitting.readers.units import RAW_TORQUE_UNITS
 
-#: Relative standard deviation of an instrument's inertia: the spread of repeated calibrations of one instrument.
+#: Relative standard deviation of an instrument's inertia: the scatter between repeated calibrations of one instrument.
 UNCERTAINTY = 0.03
-#: First words of a heading, and its quantity; if several headings name one quantity, the first of this list is used.
+#: First words of a heading, and its quantity. If several headings name one quantity, the heading that comes first in
+#: this list is used.
 HEADINGS = (
     ("oscillation torque (sample)", "sample_torque"),
     ("oscillation torque", "torque"),
@@ -35,24 +38,24 @@ HEADINGS = (
 
 
 class SampleShare(NamedTuple):
-    """The instrument's inertia, and the modulus that it would add to the sample's."""
+    """The inertia of the instrument, and the size of its contribution to the modulus."""
 
     inertia: float  # I [N m s^2]; NaN if K is not known
     modulus: np.ndarray  # (n,) I omega^2 / K [Pa]
 
 
 def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float]]:
-    """Quantity -> place and factor to SI, of the headings that are known and have a known unit.
+    """For each quantity with a known heading and a known unit: the index of its column and its factor to SI.
 
     Args:
         cells: headings.
-        units: units from a line of their own; may be empty.
+        units: units from a separate line of the file; may be empty.
     """
     return {q: (place, RAW_TORQUE_UNITS[q][unit]) for q, (place, unit) in _places_and_units(cells, units).items()}
 
 
 def unit_of(quantity: str, cells: list[str], units: list[str]) -> str:
-    """The unit of a quantity as headings or the line of units state it; empty if they do not."""
+    """The unit of a quantity, from its heading or from the line of units; empty if neither gives it."""
     return _places_and_units(cells, units).get(quantity, (0, ""))[1]
 
 
@@ -61,10 +64,10 @@ _EXAMPLES = {"torque": "torque_uN.m", "angle": "angle_mrad", "phase": "raw_phase
 
 
 def without_unit(cells: list[str], units: list[str]) -> list[str]:
-    """A note on each raw column of the instrument that cannot be used, for its unit is not known."""
+    """A note on each raw column of the instrument that cannot be used because its unit is not known."""
     known = _places_and_units(cells, units)
     return [
-        f"column {cells[k].strip()!r} is not used to look for the inertia of the instrument: its unit "
+        f"column {cells[k].strip()!r} is not used to find the inertia of the instrument: its unit "
         f"{f'{unit!r} is not known' if unit else 'is not stated'}; name it e.g. {_EXAMPLES[quantity]}"
         for k, quantity, _, unit in _known_headings(cells, units)
         if quantity in _EXAMPLES and quantity not in known
@@ -80,7 +83,7 @@ def _places_and_units(cells: list[str], units: list[str]) -> dict[str, tuple[int
 
 
 def _known_headings(cells: list[str], units: list[str]) -> Iterator[tuple[int, str, int, str]]:
-    """Place, quantity, rank in `HEADINGS` and unit of each heading that is known."""
+    """Column index, quantity, rank in `HEADINGS` and unit of each known heading."""
     for k, cell in enumerate(cells):
         name = cell.strip().strip('"')
         plain = name.lower().replace("_", " ")
@@ -102,8 +105,8 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
     Args:
         omega: (n,) [rad/s].
         G: complex modulus (n,) [Pa], as corrected by the instrument.
-        raw: columns (n,) in SI: torque and angle, perhaps phase and sample_torque.
-        geometry: K [m^3], torque per Pa and rad; needed if there is no sample_torque.
+        raw: columns (n,) in SI units: torque and angle; phase and sample_torque if the file has them.
+        geometry: K [m^3], the torque per Pa and rad. It is needed if there is no sample_torque.
     """
     kept = with_raw_columns(raw)
     if not {"torque", "angle"} <= set(raw) or not kept.any() or np.any(raw["angle"][kept] == 0):
@@ -117,7 +120,7 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
         return None
     if "phase" in own:
         inertias = (K * g.real - stiffness * np.cos(own["phase"])) / w**2
-    else:  # past the resonance, where the raw torque leads: the other root belongs to lower frequencies
+    else:  # the root for frequencies above the resonance; the other root belongs to lower frequencies
         inertias = (K * g.real + np.sqrt(np.maximum(stiffness**2 - (K * g.imag) ** 2, 0))) / w**2
     inertia = _agreed(w, inertias)
     if not inertia * omega[-1] ** 2 > K * np.abs(G[-1]):
@@ -130,15 +133,16 @@ COLUMNS = ("torque", "angle", "phase", "sample_torque")
 
 
 def with_raw_columns(raw: dict[str, np.ndarray]) -> np.ndarray:
-    """Which points (n,) have a number in all raw columns of the instrument; the others have an empty cell."""
+    """For each point (n,): whether all raw columns of the instrument have a value. The other points have an empty
+    cell."""
     return np.all([np.isfinite(raw[q]) for q in COLUMNS if q in raw], axis=0)
 
 
 def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> SampleShare | None:
-    """The inertia by the raw phase alone, without torque and size: I omega^2 / K = G' - G'' / tan(phase).
+    """The inertia from the raw phase alone, without torque and sample size: I omega^2 / K = G' - G'' / tan(phase).
 
-    None if there is no phase, if the phases do not agree on one inertia, or if the inertia is below the modulus even at
-    the highest frequency.
+    None if there is no phase, if the phases at the highest frequencies give different inertias, or if the share of the
+    inertia is below the modulus even at the highest frequency.
     """
     if "phase" not in raw:
         return None
@@ -151,9 +155,10 @@ def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray])
 
 
 def _agreed(omega: np.ndarray, values: np.ndarray) -> float:
-    """The inertia at the highest frequencies if they agree within a tenth; else NaN.
+    """The median inertia at the highest frequencies, if the values there agree within a tenth; else NaN.
 
-    It is known best where inertia is the largest part; elsewhere it is a small difference of large numbers.
+    At these frequencies the inertia has its largest share and is known best. At other frequencies it is a small
+    difference of large numbers.
     """
     if not len(omega):
         return np.nan

@@ -1,8 +1,8 @@
 """Frequency sweeps from files: plain CSV, TA TRIOS text and Anton Paar RheoCompass exports.
 
-One reader is used for all: it looks for a line that names a frequency and two of storage modulus, loss modulus, |G*|,
-phase and tan(delta), an optional line of units below it, and numbers below that. The result is in rad/s and Pa, sorted
-by frequency.
+One reader is used for all these files. It looks for a header line that names a frequency and two of storage modulus,
+loss modulus, |G*|, phase and tan(delta). A line of units may follow, then the numbers. The result is in rad/s and Pa,
+sorted by frequency.
 """
 
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-# Some of these imports are for users only: `fitting.rheometer` exports all names of this module.
+# Some of these imports exist only for users: `fitting.rheometer` exports all names of this module.
 from fitting.readers.frequency_sweep import FEWEST, Sweep
 from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
@@ -27,25 +27,25 @@ from fitting.readers.units import MODULUS_UNITS, celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: A modulus [Pa] or frequency [rad/s] outside of these is beyond any measurement, and its square may overflow.
+#: A modulus [Pa] or frequency [rad/s] outside of these limits cannot be a measurement, and its square may overflow.
 SMALLEST, LARGEST = 1e-30, 1e30
 
 
 def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     """Read a frequency sweep.
 
-    A point with a modulus or frequency that is not finite, not positive or beyond any measurement is left out, and a
-    note names it.
+    A point is left out if a modulus or the frequency is not finite, not positive, or outside of `SMALLEST` to
+    `LARGEST`. A note names it.
 
     Args:
-        path: text with a header naming ``frequency_Hz`` or ``angular_frequency_rad_s``, ``storage_modulus_Pa``,
-            ``loss_modulus_Pa`` (kPa, MPa likewise), optional ``storage_modulus_sd_Pa`` and ``loss_modulus_sd_Pa``;
-            ``#`` comments; or an instrument's export.
-        table: the table to read of a file with several: its number (from 1), its name or a part of its name; by default
-            the table with most frequencies, the first of them if several have as many.
+        path: an instrument's export, or text with a header that names ``frequency_Hz`` or ``angular_frequency_rad_s``,
+            ``storage_modulus_Pa`` and ``loss_modulus_Pa`` (or kPa, MPa). ``storage_modulus_sd_Pa`` and
+            ``loss_modulus_sd_Pa`` are optional. ``#`` begins a comment.
+        table: which table to read if the file has several: its number (from 1), its name or a part of its name. By
+            default, the table with the largest number of frequencies is read (if several have it, the first of them).
 
     Raises:
-        InputError: one sentence naming file, column or line, value and remedy.
+        InputError: one sentence with the file, the column or line, the value and the remedy.
     """
     tables = tables_of(str(path), text_of(Path(path)).splitlines())
     chosen, notes = choose_table(str(path), tables, table)
@@ -54,14 +54,14 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
 
 
 def read_all_sweeps(path: str | os.PathLike) -> list[tuple[str, Sweep]]:
-    """Read every table of a file that is a sweep, with the name of each. Unlike in `read_sweep`, the points are not
-    weighed by their scatter."""
+    """Read every table of a file that is a sweep; return name and sweep of each. Unlike in `read_sweep`, the points are
+    not weighted by their scatter."""
     tables = tables_of(str(path), text_of(Path(path)).splitlines())
     return [(table.name, _sweep(str(path), table, [])) for table in tables]
 
 
 def _usable(path: str, table: Table, values: dict[int, np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """Which rows are good in all columns of `values`, and a note on the others.
+    """For each row: whether it is good in all columns of `values`; and a note on the other rows.
 
     Raises:
         InputError: fewer than half of the points or fewer than three frequencies are good.
@@ -87,7 +87,7 @@ def _usable(path: str, table: Table, values: dict[int, np.ndarray]) -> tuple[np.
 
 
 def _below_zero(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -> list[str]:
-    """A note if several points are left out because their loss is not above zero."""
+    """A note if several points are left out because their loss modulus is not above zero."""
     column, loss = next((first[q] for q in ("loss", "tangent", "phase") if q in first), (None, np.ones(len(good))))
     count = int(np.sum(~good & (loss <= 0)))
     if column is None or count < 2:
@@ -98,12 +98,12 @@ def _below_zero(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -
     ]
 
 
-#: Ratio of G' and G'' [1], or its inverse, that no tissue and few materials reach.
+#: Ratio of G' to G'' [1], or its inverse, that no tissue and few materials reach.
 FAR_APART = 100.0
 
 
 def _unlike_units(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -> list[str]:
-    """A note if G' and G'' have different units, and are far apart only for that reason."""
+    """A note if G' and G'' have different units, and if they differ very much only for this reason."""
     if not {"storage", "loss"} <= set(first):
         return []
     (one, storage), (other, loss) = first["storage"], first["loss"]
@@ -154,9 +154,9 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)
 
 
-#: A note on lines in another order.
+#: A note: the lines were in another order.
 SORTED = "the frequencies were not in ascending order and have been sorted"
-#: A note on frequencies that several lines have, after their number.
+#: A note on frequencies that occur in several lines. Their number comes before this text.
 REPEATED = (
     "frequencies are repeated; each line counts as a measurement of its own, unless the lines of a frequency share "
     "their noise"
@@ -164,24 +164,25 @@ REPEATED = (
 
 #: Words of the note on a sweep at several temperatures.
 WARM = "and one material at one temperature is fitted"
-#: Differences within one sweep, of the temperature [K] and of the strain (largest over smallest), that get a note.
+#: A note is given if the temperature varies within one sweep by more than WARMER [K], or if the largest strain exceeds
+#: STRAINED times the smallest.
 WARMER, STRAINED = 2.0, 1.5
 
 
 def _what_differs(sweep: Sweep) -> list[str]:
-    """Notes if lines were measured at other temperatures, or lines at the same frequency at other strains."""
+    """Notes if temperature or strain differ between the lines of a sweep."""
     out, raw = [], sweep.raw or {}
     heat, strain = (raw[q][np.isfinite(raw[q])] if q in raw else np.empty(0) for q in ("temperature", "strain"))
     if len(np.unique(sweep.angular_frequency)) == len(sweep.angular_frequency):
         if heat.size and np.ptp(heat) > WARMER:
             out.append(
-                f"the temperature changes by {np.ptp(heat):.2g} K in the sweep: what it does to the moduli is taken "
-                "for an effect of the frequency"
+                f"the temperature changes by {np.ptp(heat):.2g} K in the sweep: its effect on the moduli is taken for "
+                "an effect of the frequency"
             )
         if strain.size and strain.min() > 0 and strain.max() > STRAINED * strain.min():
             out.append(
-                f"the strain goes from {strain.min():.2g} to {strain.max():.2g} in the sweep: if it is not small, what "
-                "it does to the moduli is taken for an effect of the frequency"
+                f"the strain goes from {strain.min():.2g} to {strain.max():.2g} in the sweep: if the strain is not "
+                "small, its effect on the moduli is taken for an effect of the frequency"
             )
         return out
     if heat.size and np.ptp(heat) > WARMER:
@@ -191,20 +192,21 @@ def _what_differs(sweep: Sweep) -> list[str]:
         )
     if strain.size and strain.min() > 0 and strain.max() > STRAINED * strain.min():
         out.append(
-            f"the strains are {strain.min():.3g} to {strain.max():.3g}, and one linear material is fitted: give a file "
-            "for each strain"
+            f"the strains are {strain.min():.3g} to {strain.max():.3g}, but one linear material is fitted: give a "
+            "file for each strain"
         )
     return out
 
 
-#: Difference [1] of a column from the other two, in the median, that gets a note.
+#: A note is given if a column differs in the median by more than this [1] from the values that the other two columns
+#: give.
 CONTRADICTS = 0.03
 
 
 def _contradictions(path: str, beside: list[tuple[Column, np.ndarray]], values: Content, stretched: bool) -> list[str]:
-    """Notes on columns of |G*|, phase, tan(delta) or |eta*| that differ from what G' and G'' say of them.
+    """Notes on columns of |G*|, phase, tan(delta) or |eta*| that differ from the values computed from G' and G''.
 
-    Beside E' and E'' (`stretched`) a modulus or viscosity may be that of E* as well as that of G*.
+    If the file has E' and E'' (`stretched`), the column may contain |E*| or |G*|, and so may the viscosity.
     """
     G = values["storage"] + 1j * values["loss"]
     expected = {"complex": np.abs(G), "phase": np.angle(G), "tangent": values["loss"] / values["storage"]}
@@ -225,7 +227,7 @@ def _contradictions(path: str, beside: list[tuple[Column, np.ndarray]], values: 
         if apart > CONTRADICTS:
             out.append(
                 f"column {column.name!r} is not used; it contradicts G' and G'' by {100 * apart:.2g} % "
-                "(median): find out which column is wrong or was corrected"
+                "(median): check which of these columns is wrong, or was corrected"
             )
     return out
 

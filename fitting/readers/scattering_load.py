@@ -1,15 +1,17 @@
-"""A strain or stress that scatters while it is constant or rises straight: what the sample saw, without the scatter."""
+"""A strain or stress that scatters although the real load is constant or rises as a straight line: the load without the
+scatter."""
 
 import numpy as np
 
 from fitting.readers.noise_of_series import noise_of_series
 
-#: Scatter of the load that is too small to matter, as a part of the largest one.
+#: Scatter of the load below this part of the largest load does not matter.
 QUIET = 1e-3
 
 
 def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np.ndarray, list[str]]:
-    """A driven quantity; if it scatters while it is constant, its mean replaces it there. Then notes.
+    """The driven quantity, and notes. If it scatters while it is constant, its mean replaces the constant part. A
+    straight line replaces a straight ramp.
 
     The model treats each reading as a real step, so it would treat the scatter of a sensor as motion.
     """
@@ -20,12 +22,14 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
     near = np.abs(driven - level) <= 5 * noise
     first, told = int(np.argmax(near)), f"the {word} scatters by {100 * noise / size:.2g} % of its largest value"
     share = np.mean(near[first:])
-    if share < 0.5:  # cycles: differences of a few rows do not distinguish them from noise
+    if share < 0.5:  # cycles: from the differences of a few rows they look like noise
         return driven, []
-    # Scatter may bring a row of the ramp near before it ends.
+    # By scatter, a single row of the ramp may be near the level before the ramp ends.
     first = next((int(k) for k in np.flatnonzero(near) if np.mean(near[k:]) >= 0.99), len(near))
     if np.sum(near[first:]) < 0.9 * np.sum(near):
-        return driven, [f"{told}, and each reading counts as a step: moduli come out too small; smooth it first"]
+        return driven, [
+            f"{told}, and each reading counts as a step: the moduli will be too small; smooth this column first"
+        ]
     rest = int(np.argmax(np.abs(driven - np.median(driven[:3])) > 5 * noise))
     rest = rest if rest <= first else 0
     rest_level = float(np.mean(driven[:rest])) if rest else 0.0
@@ -34,26 +38,28 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
         if straight is not None:
             begin, end, held = straight
             return held, [
-                f"{told}: a straight ramp from {begin:.3g} to {end:.3g} s and then a constant are taken; what the "
-                "scatter leaves in these times is not in the standard errors"
+                f"{told}: a straight ramp from {begin:.3g} to {end:.3g} s and then a constant are used; the standard "
+                "errors do not contain the uncertainty of these times"
             ]
         told = f"{told}, and each reading of its ramp counts as a step, which makes G0 too small: smooth the ramp first"
     held = driven.copy()
     held[first:] = np.mean(driven[first:])
     held[:rest] = rest_level
-    return held, [f"{told}: from {time[first]:.3g} s on, where it is constant, its mean is taken"]
+    return held, [f"{told}: from {time[first]:.3g} s on it is constant, and its mean is used"]
 
 
-#: Fewest rows of a ramp that a straight line replaces, and the largest misfit of such a line over the noise.
+#: Minimum number of rows of a ramp that a straight line replaces; and maximum misfit of this line, divided by the
+#: noise.
 _ROWS_OF_RAMP, _STRAIGHT = 4, 1.5
-#: Most rows of rest and of hold that such a line is fitted to.
+#: Maximum number of rows of the rest, and of the hold, to which such a line is fitted.
 _OF_HOLD = 500
 
 
 def _straight_ramp(
     time: np.ndarray, driven: np.ndarray, places: tuple[int, int, float], noise: float
 ) -> tuple[float, float, np.ndarray] | None:
-    """Beginning and end [s] of a ramp, and rest, ramp and hold without scatter (n,); None if it is not straight.
+    """Begin and end [s] of a ramp, and the load (n,) of rest, ramp and hold without scatter. None if the ramp is not
+    straight.
 
     `places`: first row of the load, first row of the hold, level at rest.
     """
@@ -80,7 +86,8 @@ def _straight_ramp(
     ends = np.linspace(time[rest], time[min(first + max(3, (first - rest) // 4), len(time) - 1)], 400)
     near = ends[int(np.argmin([np.sum((line_from(time[0], end, 0.0) - driven) ** 2) for end in ends]))]
     free = scipy.optimize.minimize(misfit, [time[max(rest - 1, 0)], time[first]], method="Nelder-Mead").x
-    # From 0 at the first row on; or else from the level at rest, from a time that is fitted too.
+    # First try: the ramp begins with 0 at the first row. Second try: it begins at the level of the rest, at a fitted
+    # time.
     for begin, end, level in ((time[0], near, 0.0), (free[0], free[1], low)):
         line = line_from(begin, end, level)
         off = (line - driven) / noise

@@ -1,4 +1,5 @@
-"""Relaxation and creep from files: time with modulus, compliance, strain and stress, or other pairs of columns."""
+"""Relaxation and creep tests from files: the time with a modulus, a compliance, strain and stress, or another pair of
+columns."""
 
 import os
 from typing import NamedTuple
@@ -10,34 +11,36 @@ from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.time_columns import FORMS, beyond_small, read_columns
 from liverjax.core.errors import InputError
 
-#: A load at the first row below this part of the largest load counts as rest: its effect on answers is as small.
+#: A load below this part of the largest load counts as rest: its effect on the readings is just as small.
 AT_REST = 0.01
 
-#: Lower bound of the scales: noise over this relative error; in a cyclic test this part of the largest answer.
+#: Lower bound of the scales: the noise divided by RELATIVE. In a cyclic test, the bound is at least the part CYCLIC of
+#: the largest reading.
 RELATIVE, CYCLIC = 0.03, 0.1
 
 
 class TimeTest(NamedTuple):
-    """A relaxation or creep test in SI units, as shear."""
+    """A relaxation or creep test in SI units, as quantities of shear."""
 
     kind: str  # relaxation or creep
     time: np.ndarray  # (n,) [s], ascending
-    driven: np.ndarray  # (n,) strain, in creep stress [Pa], at these times
-    answer: np.ndarray  # (n,) measured response: stress [Pa], in creep strain
-    used: np.ndarray  # (n,) rows whose answer is fitted
+    driven: np.ndarray  # (n,) imposed strain; in creep the imposed stress [Pa]
+    answer: np.ndarray  # (n,) readings: measured stress [Pa]; in creep the strain
+    used: np.ndarray  # (n,) whether the reading of a row is fitted
     source: str = ""
     notes: tuple[str, ...] = ()
 
     @property
     def scales(self) -> np.ndarray:
-        """Scales of the residuals: the size of each answer, with a lower bound for answers that are lost in noise."""
+        """Scales of the residuals: the size of each reading, with a lower bound for readings that are lost in noise."""
         answer = self.answer[self.used]
         floor = max(noise_of_series(answer) / RELATIVE, CYCLIC * float(np.max(np.abs(answer))) if self.cyclic else 0.0)
         return np.hypot(answer, floor)
 
     @property
     def cyclic(self) -> bool:
-        """Whether the driven quantity falls by more than half of its largest value and rises again (answers pass 0)."""
+        """Whether the driven quantity falls by more than half of its largest value and rises again. Then the readings
+        pass 0."""
         driven = np.abs(self.driven)
         half = 0.5 * driven.max()
         fallen = np.maximum.accumulate(driven) - driven > half
@@ -48,16 +51,17 @@ class TimeTest(NamedTuple):
 
     @property
     def begun(self) -> float:
-        """Time [s] of the last row at rest: instruments often record a while before they load."""
+        """Time [s] of the last row at rest. Instruments often record for a while before the load."""
         driven = np.abs(self.driven)
         first = int(np.argmax(driven > AT_REST * driven.max()))
-        while first > 0 and driven[first] - driven[first - 1] > 1e-6 * driven.max():  # back to where it rises from
+        while first > 0 and driven[first] - driven[first - 1] > 1e-6 * driven.max():  # back to where the rise begins
             first -= 1
         return float(self.time[first])
 
     @property
     def resolved(self) -> tuple[float, float]:
-        """Shortest and longest relaxation time [s] that the test resolves: from the first answer used to the last."""
+        """Shortest and longest relaxation time [s] that the test resolves: the times of the first and the last used
+        reading after the load began."""
         time = self.time[self.used] - self.begun
         return float(time[0]), float(time[-1])
 
@@ -75,15 +79,15 @@ def read_time_test(
     """Read a test.
 
     Args:
-        path: text with a header that names time and one of `FORMS`.
+        path: a file with a header that names the time and one of `FORMS`.
         kind: "relaxation" or "creep".
         sample: radius and height of a cylinder, for torque and force.
-        ramp: for a column of modulus or compliance, seconds in which strain or stress was raised; 0 (or None) for a
-            step. For two columns: None; or 0 if the load was a step at 0 s and the rows begin later.
-        start: answers before this time [s] are not fitted.
+        ramp: for a column of modulus or compliance: duration [s] of the ramp of strain or stress; 0 (or None) for a
+            step. For two columns: None; or 0, if the load was a step at 0 s and the rows begin later.
+        start: readings before this time [s] are not fitted.
 
     Raises:
-        InputError: one sentence naming file, column or line, value and remedy.
+        InputError: one sentence with the file, the column or line, the value and the remedy.
     """
     if not (np.isfinite(start) and start >= 0):
         raise InputError(f"--min-time {start:g} cannot be seconds after the load: give 0 or more")
@@ -132,19 +136,19 @@ def of_columns(
     Args:
         kind: "relaxation" or "creep".
         time: (n,) [s], rising from 0.
-        driven, answer: (n,) strain and stress [Pa]; in creep stress and strain.
+        driven, answer: (n,) strain and stress [Pa]; in creep, stress [Pa] and strain.
         source: name of the file, and notes.
-        start: answers before this time [s] are not fitted.
+        start: readings before this time [s] are not fitted.
 
     Raises:
-        InputError: the driven quantity is zero, there are too few answers, or their sign is opposite.
+        InputError: the driven quantity is zero, there are too few readings, or most readings have the opposite sign.
     """
     driven, told = without_scatter(time, driven, "strain" if kind == "relaxation" else "stress")
     told += _ringing(time, driven, answer, start) if kind == "creep" else []
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
 
 
-#: A note on rows that begin at 0 s with the load there.
+#: A note on rows that begin at 0 s under load.
 BEGINS_LOADED = (
     "the first row, at 0 s, is under load already: a step from rest at 0 s is assumed. If the load rose before it, or "
     "the sample was loaded before, give those rows too: what relaxed until then is missing from G0 otherwise. If it "
@@ -156,11 +160,11 @@ BEGINS_LOADED = (
 def from_rest(
     time: np.ndarray, driven: np.ndarray, answer: np.ndarray, at_once: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """The rows (n,), with a row added at 0 s if they begin later; then notes.
+    """The rows (n,), with an added row at 0 s if they begin later; and notes.
 
     Args:
-        time, driven, answer: (n,) as in `of_columns`.
-        at_once: whether the first load acted from 0 s on; else it was raised from 0 s until the first row.
+        time, driven, answer: (n,), see `of_columns`.
+        at_once: whether the first load acted from 0 s on. Otherwise it rose from 0 s until the first row.
     """
     if not time[0] > 0:
         loaded = abs(driven[0]) > AT_REST * np.max(np.abs(driven)) and not at_once
@@ -176,8 +180,8 @@ def from_rest(
 
 
 def kind_of(path: str | os.PathLike) -> str:
-    """ "relaxation" or "creep". A modulus or a compliance decides; else the column that stays constant is the driven
-    one."""
+    """ "relaxation" or "creep". A column of modulus or compliance decides. Otherwise the column that changes less in
+    the second half is the driven quantity."""
     columns, _ = read_columns(path)
     form = next((f for f in FORMS if set(f) <= set(columns)), ("modulus",))
     if len(form) == 1:
@@ -188,9 +192,10 @@ def kind_of(path: str | os.PathLike) -> str:
 
 
 def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: np.ndarray) -> list[str]:
-    """A note if the quantity that this kind of test drives moves in the second half, and the other one is held.
+    """A note if, in the second half, the quantity that this kind of test imposes changes while the other quantity is
+    held.
 
-    There is none if it moves at a constant rate: so a sample is driven whose stress has become steady.
+    No note if it changes at a constant rate: this also happens if a sample is strained until its stress is steady.
     """
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
     late = len(driven) // 2
@@ -202,14 +207,15 @@ def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: 
         return []
     names = ("stress", "strain", "creep") if kind == "relaxation" else ("strain", "stress", "relaxation")
     return [
-        f"the {names[0]} is held and the {names[1]} changes, as in a {names[2]} test: python -m fitting {names[2]} "
-        f"fits what was measured as the answer; here the {names[1]}, with its noise, is taken as exact"
+        f"the {names[0]} is held and the {names[1]} changes, as in a {names[2]} test, so python -m fitting {names[2]} "
+        f"is the right command: this command takes the {names[1]} as exact, although it has noise"
     ]
 
 
-#: A quantity that varies less than this in the second half [1], by its standard deviation, is held.
+#: A quantity is held if its relative standard deviation in the second half is below this [1].
 HELD = 0.01
-#: It moves at a constant rate if it departs from a straight line by less than this part of its change.
+#: A quantity changes at a constant rate if its distance from a straight line is below this part of its change (standard
+#: deviations).
 STEADY = 0.05
 
 
@@ -218,7 +224,7 @@ def _own_table(kind: str) -> str:
 
 
 def _as_a_step(path, time, modulus, ramp):
-    """Times, a driven strain (or stress) of 1 that is reached at once or over a ramp, and answers."""
+    """Times, a driven strain (or stress) that reaches 1 at once or by a ramp, and readings."""
     if not (np.isfinite(ramp) and ramp >= 0):
         raise InputError(f"{path}: --ramp {ramp:g} cannot be the seconds of a ramp; give 0 or more")
     if ramp > time[-1]:
@@ -230,17 +236,18 @@ def _as_a_step(path, time, modulus, ramp):
     return times, np.minimum(times / ramp, 1.0) if ramp else np.ones(len(times)), answer
 
 
-#: Part of the largest modulus or compliance by which it may go the wrong way; in noise, times its deviation.
+#: A modulus or compliance may change in the wrong direction by this part of its largest value, or by this many standard
+#: deviations of its noise.
 _WRONG_WAY, _IN_NOISE = 0.25, 6.0
 
 
 def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, given: tuple) -> list[str]:
-    """Refuse a modulus that rises, or a compliance that falls, where the load is constant; `given`: ramp and start [s].
+    """Refuse a modulus that rises, or a compliance that falls, under a constant load. `given`: ramp [s] and start [s].
 
-    A running median leaves single wrong rows out. Returns notes.
+    A running median removes single wrong rows. Returns notes.
 
     Raises:
-        InputError: one sentence with the time, and what it may be.
+        InputError: one sentence with the time and possible causes.
     """
     from scipy.ndimage import median_filter
 
@@ -279,7 +286,8 @@ def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, 
 
 
 def _ringing(time: np.ndarray, stress: np.ndarray, strain: np.ndarray, start: float) -> list[str]:
-    """A note if the strain falls and rises again under a constant stress: the instrument's inertia rings."""
+    """A note if the strain falls and rises again under a constant stress: then the inertia of the instrument causes
+    oscillations."""
     from scipy.ndimage import median_filter
 
     largest = float(stress[np.argmax(np.abs(stress))])
@@ -304,7 +312,7 @@ def _ringing(time: np.ndarray, stress: np.ndarray, strain: np.ndarray, start: fl
     ]
 
 
-#: Part of the largest strain by which it falls and rises again if it rings.
+#: The strain oscillates if it falls, and rises again, by more than this part of the largest strain.
 _RINGS = 0.02
 
 
@@ -322,12 +330,14 @@ def _as_shear(path, form, columns, sample):
     return strain, columns["force"] / (3 * np.pi * r**2), [note, *beyond_small(float(np.nanmax(np.abs(strain))))]
 
 
-#: Fewest rows at rest whose mean is an offset, and the part of the largest answer below which it does not matter.
+#: Minimum number of rows at rest that show an offset; and the part of the largest reading below which an offset does
+#: not matter.
 RESTING, OFFSET = 3, 0.003
 
 
 def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
-    """The answers without their mean before the load, if it is more than their scatter; then a note."""
+    """The readings, and a note. If the mean before the load clearly exceeds its error, this mean is subtracted from all
+    readings."""
     rest = np.isfinite(test.answer) & (test.time < test.begun) & ~((test.time == 0) & (test.answer == 0))
     count, size = int(rest.sum()), float(np.nanmax(np.abs(test.answer)))
     if count < RESTING:
@@ -343,18 +353,19 @@ def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
 
 
 def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
-    """A note if the answer where the load begins is not 0: one or two rows do not tell an offset from noise."""
+    """A note if the reading at the begin of the load is not 0. One or two rows cannot distinguish an offset from
+    noise."""
     k = int(np.argmax(test.time >= test.begun))
     here, load = float(test.answer[k]), abs(float(test.driven[k])) / float(np.max(np.abs(test.driven)))
     noise = noise_of_series(test.answer[np.isfinite(test.answer) & (test.time > test.begun)])
-    # A steady cycle begins with an answer that lags behind.
+    # In a steady cycle, the first reading is not 0, because the response lags behind.
     if test.cyclic or load > AT_REST or not abs(here) > max(_IN_NOISE * noise, (OFFSET + 2 * load) * size):
         return []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
     return [
         f"the {what} is {here:.3g}{unit} at {test.time[k]:.3g} s, before the load, {100 * abs(here) / size:.2g} % of "
-        f"the largest: if it is an offset of the sensor, it changes all moduli: take it off all rows, or give {RESTING}"
-        " or more rows before the load"
+        "the largest: if this is an offset of the sensor, it changes all moduli: subtract it from all rows, or give "
+        f"{RESTING} or more rows before the load"
     ]
 
 
@@ -372,7 +383,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         )
     if not np.sum(driven[used] * answer[used]) > 0:
         raise InputError(
-            f"{test.source}: most answers have the opposite sign of the {test.kind} test's input; correct the signs"
+            f"{test.source}: most readings of the {test.kind} test have the wrong sign for its load; correct the signs"
         )
     notes, before = (*test.notes, *told), int(np.sum(test.time <= test.begun))
     if before > 2:

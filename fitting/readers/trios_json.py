@@ -1,12 +1,13 @@
-"""TA TRIOS exports in JSON, turned into the text tables that the other readers know.
+"""TA TRIOS exports in JSON, converted to the text tables that the other readers read.
 
-Layout: TRIOSJSONExportSchema of TA Instruments. `Results` (or its part `Processed`, else `Raw`) has `ColumnHeaders`,
-key -> name and unit, `Rows` of key -> value, and the steps of the test by their id.
+Layout: TRIOSJSONExportSchema of TA Instruments. `Results` (or its part `Processed`, or else `Raw`) has three entries:
+`ColumnHeaders` gives name and unit for each key, `Rows` have a value for each key, and `ResultsSteps` give the steps of
+the test by their id.
 """
 
 import json
 
-#: Key of a row that says which step it belongs to.
+#: Key in a row whose value is the id of the row's step.
 STEP = "Results Step Id"
 
 
@@ -33,7 +34,7 @@ def tables(text: str) -> str | None:
 
 
 def _is_column(values: list) -> bool:
-    """Whether all values are numbers, or empty because a point was aborted."""
+    """Whether all values are numbers or empty, with at least one number. A value is empty if its point was aborted."""
     return all(v is None or _is_number(v) for v in values) and any(map(_is_number, values))
 
 

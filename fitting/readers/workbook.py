@@ -1,4 +1,4 @@
-"""Spreadsheets (.xls, .xlsx, .xlsb, .ods) as lines of text: every sheet is a table with tabs between the cells."""
+"""Spreadsheets (.xls, .xlsx, .xlsb, .ods) as lines of text. Every sheet is a table with tabs between the cells."""
 
 import io
 from pathlib import Path
@@ -15,7 +15,7 @@ def is_one(data: bytes) -> bool:
 
 
 def text(path: Path, data: bytes, wanted: str) -> str:
-    """The sheets of a workbook, one after the other, in the form of an instrument's text export with several steps.
+    """The sheets of a workbook, one after the other, in the form of an instrument's text export: each sheet is a step.
 
     Args:
         path: path of the file, for error messages.
@@ -35,7 +35,7 @@ def text(path: Path, data: bytes, wanted: str) -> str:
     try:
         book = python_calamine.CalamineWorkbook.from_filelike(io.BytesIO(data))
         sheets = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
-    except Exception as error:  # the reader has an exception for each format, and raises others on damaged bytes
+    except Exception as error:  # the library has an exception for each format, and raises other ones for damaged bytes
         raise InputError(
             f"{path} is a spreadsheet workbook that cannot be read ({_line(error)}): save it again, or export {wanted} "
             "as CSV"
@@ -45,5 +45,5 @@ def text(path: Path, data: bytes, wanted: str) -> str:
 
 
 def _line(cell: object) -> str:
-    """A cell without the characters that end a cell or a line; numbers with all their digits."""
+    """A cell as text, without tabs and line ends. Numbers keep all their digits."""
     return " ".join(str(cell).split())

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 
 def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequence[str] = ()) -> Content:
-    """Write fit.json and fit.png into the existing folder `out`; the best fit comes first. More `warnings` come
-    before its own.
+    """Write fit.json and fit.png into the existing folder `out`. The best fit comes first. `warnings` are written
+    before the warnings of the fits.
     """
     content = {
         "error_is": "root mean square of the relative misfit of G' and G''",
@@ -48,14 +48,14 @@ def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequen
 
 
 def table(sweep: StrainSweep, fits: list[StrainFit]) -> str:
-    """Table of the laws, the best first, and the third harmonic of the best at the largest strain."""
+    """Table of the laws, with the best law first; and the third harmonic of the best law at the largest strain."""
     most, third = 100 * sweep.strain[-1], round(100 * fits[0].third[-1], 9)
     said = f"{fits[0].law.label}: at a strain of {most:.3g} % the third harmonic is {third:.2g} % of the first"
     return "\n".join([curves_report.table([f.law for f in fits]), said])
 
 
 def figure(sweep: StrainSweep, fits: list[StrainFit]) -> "Figure":
-    """Moduli against strain with the best laws on the left, the third harmonics that they predict on the right."""
+    """Moduli over strain with the best laws on the left; the third harmonics that these laws predict on the right."""
     fig = pyplot().figure(figsize=(10, 4.2), layout="constrained")
     left, right = fig.subplots(1, 2)
     percent = 100 * sweep.strain

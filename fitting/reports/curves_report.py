@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Points of a drawn line.
+#: Number of points of a drawn line.
 FINE = 200
-#: The shapes are the same for every law and figure, so it is compiled once per law.
+#: The array shapes are the same for all figures, so the function is compiled once per law.
 _stress = jax.jit(partial(homogeneous.nominal_stress, constant=True))
 
 
@@ -33,7 +33,7 @@ def best_first(fits: list[LawFit]) -> list[LawFit]:
 
 
 def summary(fit: LawFit) -> Content:
-    """One law's entry of curves.json."""
+    """The entry of one law in curves.json."""
     return {
         "law": fit.label,
         "parameters": dict(zip(fit.names, fit.values.tolist(), strict=True)),
@@ -57,7 +57,8 @@ def summary(fit: LawFit) -> Content:
 
 
 def write(out: Path, curves: list[Curve], fits: list[LawFit], structured: Sequence[str] = ()) -> None:
-    """Write curves.json and curves.png into the existing folder `out`; `structured`: sentences on misfits."""
+    """Write curves.json and curves.png into the existing folder `out`. `structured`: sentences on structured
+    misfits."""
     ordered = best_first(fits)
     content = {
         "best": ordered[0].label,
@@ -76,7 +77,7 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit], structured: Sequen
 
 
 def figure(curves: list[Curve], ordered: list[LawFit]) -> "Figure":
-    """Every curve with the best laws, and below them the error of each law with its number of parameters."""
+    """Every curve with the best laws; below, the error and the number of parameters of each law."""
     shown = ordered[: len(COLOURS)]
     columns = min(4, len(curves))
     rows = -(-len(curves) // columns)
@@ -106,10 +107,10 @@ def figure(curves: list[Curve], ordered: list[LawFit]) -> "Figure":
 
 
 def fine(curve: Curve) -> Curve:
-    """The path of a curve at `FINE` places; its stress is set to zero.
+    """The deformations of a curve at `FINE` points along it, with a stress of zero.
 
-    Between two points F12, F21 and the logarithms of the diagonal change linearly. So a tension test stays a tension
-    test: its sides keep the stretch lambda^(-1/2). F33 keeps the volume.
+    Between two measured points, the shears and the logarithms of the diagonal of F change linearly. So a tension test
+    stays a tension test: its sides keep the stretch lambda^(-1/2). F33 is scaled so that the volume stays the same.
     """
     at, places = np.linspace(0, len(curve.stress) - 1, FINE), np.arange(len(curve.stress))
     F = np.zeros((FINE, 3, 3))
@@ -135,7 +136,7 @@ def _curve(axis: Any, curve: Curve, dense: Curve, stresses: list[np.ndarray]) ->
 
 
 def table(fits: list[LawFit]) -> str:
-    """One line per law, the best first: error, time, criterion, parameters ± standard error."""
+    """One line per law, with the best law first: error, times, criterion, G0, parameters ± standard error."""
     lines = [f"{'law':18s} {'error':>7s} {'run':>8s} {'compile':>8s} {'AICc':>8s}  G0 [Pa]    parameters"]
     for f in best_first(fits):
         parameters = ", ".join(

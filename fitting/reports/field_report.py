@@ -24,24 +24,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: chi^2 per component above which there is a warning that the model misses something, and below which the noise counts
-#: as overstated: fifty components are below it by chance once in a million times.
+#: Above TOO_FAR of chi^2 per component, a warning says that the model misses something. Below TOO_NEAR, the stated
+#: noise counts as too large. With FEW components, chi^2 is below TOO_NEAR by chance once in a million times.
 TOO_FAR, TOO_NEAR, FEW = 1.5, 0.4, 50
-#: Error of the mesh in the data, over their noise, that is named beside such a chi^2.
+#: If chi^2 is too large, the mesh error is reported too if it exceeds this many times the noise of the data.
 MESH = 1.0
 
 
 def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
-    """A warning if the fit misses the displacements by more than their noise, or by far less; else None.
+    """A warning if the fit misses the displacements by more than their noise, or by much less than their noise; else
+    None.
 
-    If an estimate of the mesh's error counts as noise (`with_mesh`), less is no sign of a wrong noise.
+    If the noise contains an estimate of the mesh error (`with_mesh`), a small misfit does not mean that the noise is
+    wrong.
     """
     ratio = found.chi2 / found.components
     if ratio < TOO_NEAR and found.components >= FEW and not with_mesh:
         return (
             f"chi2 is {ratio:.3g} per component, so the displacements scatter {np.sqrt(ratio):.2g} times as much as "
-            "the stated noise, and the errors are too large by as much: give the noise in metres (--noise), whatever "
-            "the unit of the file"
+            "the stated noise, and the errors are too large by this factor: give the noise (--noise) in metres, "
+            "whatever the unit of the file is"
         )
     if not ratio > TOO_FAR:
         return None
@@ -53,11 +55,11 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
         )
     said = (
         f"chi2 stays at {ratio:.3g} per component, so the fit misses the displacements by {np.sqrt(ratio):.2g} times "
-        "their noise: the numbers may be wrong by much more than their errors"
+        "their noise: the parameters may be wrong by much more than their errors"
     )
     if found.mesh_over_noise is not None and found.mesh_over_noise > MESH:
         said += (
-            f"; the mesh's error in the data is {found.mesh_over_noise:.2g} times the noise: refine the mesh, or take "
+            f"; the mesh's error in the data is {found.mesh_over_noise:.2g} times the noise: refine the mesh, or use "
             "order = 2 (the bias of a region's border that goes through elements is not in the mesh bias)"
         )
     return (
@@ -67,7 +69,7 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
 
 
 def noise_sentence(found: Field) -> str | None:
-    """A warning if the residuals of a map stay above the stated noise by more than chance; else None."""
+    """A warning if the residuals of a map exceed the stated noise by more than chance explains; else None."""
     chance = 3 * np.sqrt(2 * found.components)
     if found.reached or found.chi2 <= found.components + chance:
         return None
@@ -78,7 +80,7 @@ def noise_sentence(found: Field) -> str | None:
 
 
 def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
-    """The content of field.json for a few numbers; `with_mesh` is that of `misfit_sentence`."""
+    """The content of field.json for a few parameters. `with_mesh`: see `misfit_sentence`."""
     return {
         "values": dict(zip(found.names, found.values.tolist(), strict=True)),
         "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
@@ -138,7 +140,8 @@ def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> No
 
 
 def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n: int = 200) -> tuple[np.ndarray, tuple]:
-    """Values at the vertices (V,) on the plane through `middle` normal to an axis, NaN outside, and its extent [cm]."""
+    """The values at the vertices (V,), interpolated on a plane through `middle` normal to `axis` (NaN outside of the
+    body); and the extent of the plane [cm]."""
     X = np.asarray(mesh.points)
     low, high = X.min(axis=0), X.max(axis=0)
     a, b = (k for k in range(3) if k != axis)
@@ -152,7 +155,8 @@ def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n:
 
 
 def map_figure(mesh: TetMesh, found: Field) -> "Figure":
-    """Sections through the node farthest from the median: the factor on the scene's number, and its uncertainty."""
+    """Sections through the node whose value is farthest from the median: the factor on the parameter of the scene, and
+    its uncertainty."""
     middle = np.asarray(mesh.points)[np.argmax(np.abs(found.log_factor - np.median(found.log_factor)))]
     figure, axes = pyplot().subplots(2, 3, figsize=(11, 5.5), layout="constrained")
     rows = (
@@ -172,7 +176,7 @@ def map_figure(mesh: TetMesh, found: Field) -> "Figure":
 
 
 def table_of_numbers(found: Estimate) -> str:
-    """Names, values, standard errors, for the terminal."""
+    """Names, values, standard errors and mesh bias of the parameters, for the terminal."""
     width = max(map(len, found.names))
     rows = [f"{'parameter':{width}}  {'value':>11}  {'standard error':>14}  {'mesh bias':>11}"]
     bias = ["not known"] * len(found.names) if found.mesh_bias is None else [f"{b:.3g}" for b in found.mesh_bias]
@@ -183,7 +187,7 @@ def table_of_numbers(found: Estimate) -> str:
 
 
 def table_of_field(found: Field) -> str:
-    """Table of the fits that were tried, and the result, for the terminal."""
+    """Table of the tried fits, and the result, for the terminal."""
     rows = ["prior sd  chi2/component  iterations  evaluations  seconds"]
     for h in found.history:
         rows.append(

@@ -20,14 +20,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Contact radius / radius of a sphere, and depth / thickness, above which small strains are in doubt.
+#: Above these ratios (contact radius / radius of the sphere, depth / thickness), the strains may not be small.
 _WIDE, _DEEP = 0.4, 0.2
 
 
 def write(
     out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit, level: ContactFit | None = None
 ) -> Content:
-    """Write both files; returns the JSON. `level`: fit without a tilt of the base line, if there is one."""
+    """Write both files and return the JSON. `level`: fit without a tilt of the base line, if the base line of `fit` has
+    one."""
     out.mkdir(parents=True, exist_ok=True)
     G, errors = fit.modulus / (2 * (1 + rig.poisson)), fit.standard_errors
     alone = half_space(rig, curve.depth - fit.contact_point)
@@ -76,14 +77,14 @@ def _of_level(level: ContactFit) -> Content:
 def indentation_warnings(
     curve: IndentationCurve, rig: Indenter, fit: ContactFit, level: ContactFit | None = None
 ) -> list[str]:
-    """Warnings about the modulus for its reader."""
+    """Warnings about the modulus, for the user."""
     told, deepest = [], float(curve.depth.max() - fit.contact_point)
     if fit.before < 3:
         told.append(f"{fit.before} points are before contact: measure the approach too, it fixes the contact point")
     if level is not None:
         told.append(
-            "the force rises or falls steadily before contact: the sensor drifts, and modulus and contact point follow "
-            f"it. Without a straight line through these points E = {level.modulus:.5g} ± "
+            "the force rises or falls steadily before contact: the sensor drifts, and this changes modulus and "
+            f"contact point. Without a straight line through these points E = {level.modulus:.5g} ± "
             f"{level.standard_errors[0]:.2g} Pa and d0 = {level.contact_point:.5g} ± {level.standard_errors[1]:.2g} m"
         )
     width = np.sqrt(deepest / rig.radius) if rig.shape == "sphere" else 0.0
@@ -93,10 +94,10 @@ def indentation_warnings(
             if width > _WIDE
             else f"the indenter goes {deepest:.3g} m deep, {deepest / rig.thickness:.0%} of the thickness"
         )
-        told.append(f"{far}: the theory is for small strains; fit a part of the curve as well and compare")
+        told.append(f"{far}: the theory is for small strains; also fit only a part of the curve, and compare")
     if fit.modulus <= 0:
         told.append("the modulus is not positive: the force does not rise with the depth; check the signs")
-    # The points before contact have noise alone: with them a misfit of the indentation would look like noise.
+    # The points before contact contain only noise. With these points, a misfit in contact would look like noise.
     touching = fit.residuals[curve.depth > fit.contact_point]
     runs, chance = runs_probability(np.sign(touching))
     if chance < 1e-3:
@@ -110,9 +111,9 @@ def indentation_warnings(
             f"neighbouring points share their noise, or the model misses something: {len(fit.residuals)} points "
             f"measure as much as {fit.independent:.0f} of independent noise; standard errors are those of such noise"
         )
-    # The residuals contain the adhesion itself, the scatter of neighbours does not.
+    # The noise is estimated from neighbouring points, because the residuals contain the adhesion.
     if curve.force.min() < -5 * noise_of_series(curve.force):
-        told.append("forces are negative: this is adhesion, which the model does not have")
+        told.append("some forces are negative: this is adhesion, which the model does not contain")
     return told
 
 

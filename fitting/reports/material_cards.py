@@ -1,7 +1,7 @@
 """Prony modes as material cards of liverjax, FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
 
 All cards are neo-Hookean with G0, the instantaneous shear modulus. The whole stress relaxes, as in the simulations here
-(part = "all"). A shear test does not determine the bulk modulus, which follows from Poisson's ratio `POISSON`.
+(part = "all"). A shear test does not determine the bulk modulus. It is computed from Poisson's ratio `POISSON`.
 """
 
 from pathlib import Path
@@ -12,14 +12,14 @@ from fitting.methods.generalised_maxwell import Maxwell
 
 #: Poisson's ratio of the elastic law: nearly incompressible.
 POISSON = 0.49
-#: Terms that FEBio's viscoelastic material has.
+#: Maximum number of terms in FEBio's viscoelastic material.
 FEBIO_TERMS = 6
-#: Largest sum of ratios for Abaqus and liverjax, where it must be below 1.
+#: Largest sum of ratios in the cards for Abaqus and liverjax, where the sum must be below 1.
 LARGEST_SUM = 1 - 1e-6
 
 
 def write(folder: Path, model: Maxwell) -> list[str]:
-    """Write the files; returns sentences on what a program cannot represent."""
+    """Write the files. Return sentences on everything that a program cannot represent."""
     folder.mkdir(parents=True, exist_ok=True)
     told = []
     if len(model.ratios) > FEBIO_TERMS:
@@ -29,7 +29,8 @@ def write(folder: Path, model: Maxwell) -> list[str]:
         (folder / "febio.feb").write_text(febio(model))
     if np.sum(model.ratios) > LARGEST_SUM:
         told.append(
-            "the model is a fluid: Abaqus and liverjax need an equilibrium modulus, their cards keep a millionth of G0"
+            "the model is a fluid, but Abaqus and liverjax need an equilibrium modulus: their cards keep a millionth "
+            "of G0"
         )
     for name, card in (
         ("liverjax.toml", scene_tables),
@@ -42,7 +43,7 @@ def write(folder: Path, model: Maxwell) -> list[str]:
 
 
 def _span(model: Maxwell) -> str:
-    """What a card leaves out."""
+    """A sentence on the relaxation that a card does not contain."""
     times = np.asarray(model.relaxation_times)
     return f"Modes of {times.min():.3g} to {times.max():.3g} s: faster and slower relaxation is not in this card."
 
@@ -56,12 +57,12 @@ def _written_number(value: float) -> str:
 
 
 def _below_one(ratios: np.ndarray) -> np.ndarray:
-    """The ratios, those of a fluid reduced so that a millionth does not relax."""
+    """The ratios. The ratios of a fluid are reduced so that a millionth of G0 does not relax."""
     return np.asarray(ratios) * min(1.0, LARGEST_SUM / max(float(np.sum(ratios)), 1e-300))
 
 
 def scene_tables(model: Maxwell) -> str:
-    """Tables of a scene file of liverjax: the law with G0, and its relaxation."""
+    """Tables for a scene file of liverjax: the law with G0, and the viscosity."""
     G0, ratios, times = model
     return "\n".join(
         [
@@ -82,7 +83,7 @@ def scene_tables(model: Maxwell) -> str:
 
 
 def febio(model: Maxwell) -> str:
-    """A viscoelastic material; g0 is the equilibrium part, so the elastic law is the instantaneous law."""
+    """A viscoelastic material. g0 is the equilibrium part, so the elastic law is the instantaneous law."""
     G0, ratios, times = model
     young = _written_number(2 * (1 + POISSON) * float(G0))
     terms = [f"      <t{k}>{_written_number(t)}</t{k}>" for k, t in enumerate(times, 1)]
@@ -109,7 +110,8 @@ def febio(model: Maxwell) -> str:
 
 
 def abaqus(model: Maxwell) -> str:
-    """Hyperelastic, instantaneous moduli, C10 = G0 / 2 and D1 = 2 / K; a line g, k, tau for each mode."""
+    """A hyperelastic material with instantaneous moduli, C10 = G0 / 2 and D1 = 2 / K. Each mode has a line g, k,
+    tau."""
     G0, ratios, times = model
     kept = zip(_below_one(ratios), times, strict=True)
     rows = [f"{_written_number(g)}, {_written_number(g)}, {_written_number(t)}" for g, t in kept]
@@ -128,7 +130,8 @@ def abaqus(model: Maxwell) -> str:
 
 
 def ansys(model: Maxwell) -> str:
-    """Mechanical APDL: neo-Hookean mu = G0, d = 2 / K; same Prony pairs for shear and bulk, six numbers per line."""
+    """Mechanical APDL: a neo-Hookean law with mu = G0 and d = 2 / K. Shear and bulk have the same Prony pairs, with six
+    values per line."""
     G0, ratios, times = model
     pairs = [_written_number(v) for pair in zip(ratios, times, strict=True) for v in pair]
     data = [f"TBDATA,{k + 1},{','.join(pairs[k : k + 6])}" for k in range(0, len(pairs), 6)]
@@ -142,7 +145,8 @@ def ansys(model: Maxwell) -> str:
 def sofa(model: Maxwell) -> str:
     """A hyperelastic force field at the equilibrium modulus. SOFA has no Prony series, so a comment contains it.
 
-    Its energy is mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2: the second number is Lame's, not the bulk modulus.
+    The energy of SOFA's law is mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2. So the second parameter is Lame's lambda,
+    not the bulk modulus.
     """
     G0, ratios, times = model
     rest = float(G0) * (1 - float(np.sum(ratios)))

@@ -1,4 +1,4 @@
-"""A fit on one page to print or to file: pictures, numbers, points left out, and warnings."""
+"""A fit on one page for printing: pictures, parameters, notes and warnings."""
 
 import textwrap
 from pathlib import Path
@@ -14,17 +14,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: A4 [inch], the part of its height that is text, and the margin.
+#: Width and height of A4 [inch], the part of the height that is text, and the margin (as a part of the size).
 WIDTH, HEIGHT, TEXT, MARGIN = 8.27, 11.69, 0.56, 0.06
-#: Characters per line, and the font size [pt] at which they fit; a longer text gets a smaller font.
+#: Characters per line, and the font size [pt] at which a line fits. A text with more lines gets a smaller font.
 CHARACTERS, SIZE = 104, 8.0
 
 
 def write(file: Path, sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> None:
-    """Write the page as PDF, or in another format that the name of the file states.
+    """Write the page as PDF, or in another format, by the ending of the file name.
 
     Args:
-        sweep, fits: as in `sweep_report.write`.
+        sweep, fits: see `sweep_report.write`.
         content: content of fit.json.
         first: lines before the table of the fit.
     """

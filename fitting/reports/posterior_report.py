@@ -1,4 +1,4 @@
-"""Files of a posterior's samples: a part of fit.json, posterior.csv, and lines on the terminal."""
+"""Reports of the draws of a posterior: a part of fit.json, the file posterior.csv, and lines on the terminal."""
 
 from pathlib import Path
 
@@ -36,7 +36,8 @@ def summary(p: Posterior) -> Content:
 
 
 def write_draws(path: Path, p: Posterior) -> None:
-    """Write a row for each draw: the number of its chain, then the numbers in SI units, named as in fit.json."""
+    """Write a row for each draw: the index of its chain, then the parameters in SI units, with the names of
+    fit.json."""
     rows = np.column_stack([np.repeat(np.arange(len(p.draws)), p.draws.shape[1]), p.draws.reshape(-1, len(p.names))])
     header = ",".join(["chain", *p.names])
     np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt=["%d"] + ["%.9g"] * len(p.names))

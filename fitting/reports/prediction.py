@@ -1,4 +1,4 @@
-"""Prediction of a test that was not fitted: its error, and whether the stated errors cover it."""
+"""Prediction of a test that was not fitted: how far the prediction is off, and whether its stated errors cover this."""
 
 from typing import NamedTuple
 
@@ -16,14 +16,14 @@ from fitting.readers.time_tests import TimeTest
 
 
 class Prediction(NamedTuple):
-    """A test and its prediction; numbers in the order of `fitting.fits.together.Together.fitted`."""
+    """A test and its prediction. The values are in the order of `fitting.fits.together.Together.fitted`."""
 
     name: str  # sweep, dispersion, relaxation or creep
     source: str
     predicted: np.ndarray  # (m,)
     measured: np.ndarray  # (m,)
-    standard_errors: np.ndarray  # (m,) of the prediction, infinite if the fit does not determine it
-    scales: np.ndarray  # (m,) weights: deviations if the test has them
+    standard_errors: np.ndarray  # (m,) of the prediction; infinite if the fit does not determine it
+    scales: np.ndarray  # (m,) weights: standard deviations if the test has them
     sizes: np.ndarray  # (m,) divisors of relative errors
     inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep
 
@@ -34,15 +34,15 @@ class Prediction(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """The factor by which the prediction fits best. Another sample or another strain often changes all numbers by
+        """The factor by which the prediction fits best. Another sample or another strain often changes all values by
         one factor."""
         y, p = (v[self.inside] / self.scales[self.inside] for v in (self.measured, self.predicted))
         return float(p @ y / (p @ p))
 
     @property
     def covered(self) -> float:
-        """Share of the measured numbers in the band that lie within two standard errors; these contain the scatter of
-        the numbers."""
+        """Share of the measured values in the band that lie within the 95 % interval of the prediction. This interval
+        contains the scatter of the measured values."""
         off = (self.predicted - self.measured)[self.inside]
         own = self.scales[self.inside] * noise_of_series(off / self.scales[self.inside])
         return float(
@@ -51,10 +51,10 @@ class Prediction(NamedTuple):
 
 
 def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Prediction:
-    """The prediction of a test.
+    """Predict a test.
 
     Args:
-        fit: fit of a sweep; its Prony modes are the model.
+        fit: fit of a sweep. Its Prony modes are the model.
         resolved: shortest and longest relaxation time [s] that the sweep resolves.
         test: a test that was not fitted.
     """
@@ -85,12 +85,12 @@ def sentence(found: Prediction) -> str:
     share, inside = len(found.measured), int(found.inside.sum())
     name = f"{found.name} {found.source}"
     if not inside:
-        return f"{name}: predicted, but all of its {share} numbers lie outside the band of the sweep"
+        return f"{name}: predicted, but all its {share} values lie outside the band of the sweep"
     off = 100 * found.relative_errors[found.inside].mean()
     told = (
         f"{name}: predicted within {off:.2g} % on average; {100 * found.covered:.0f} % of {inside} numbers within the "
         f"95 % interval of the prediction"
     )
-    if abs(found.factor - 1) > 0.005 * off:  # half of the error is one factor
+    if abs(found.factor - 1) > 0.005 * off:  # one factor explains half of the error
         told += f"; {found.factor:.3g} times the prediction would fit it best"
     return told + (f"; {share - inside} numbers outside the band are not counted" if inside < share else "")

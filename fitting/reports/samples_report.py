@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def write(out: Path, found: Samples) -> Content:
-    """Write all three files; returns the JSON."""
+    """Write all three files and return the JSON."""
     out.mkdir(parents=True, exist_ok=True)
     content = numbers(_json_content(found))
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
@@ -32,7 +32,7 @@ def write(out: Path, found: Samples) -> Content:
 
 
 def _json_content(found: Samples) -> Content:
-    """The content of fit.json: a typical sample comes first; the population and all samples follow."""
+    """The content of fit.json: first a typical sample, then the population and all samples."""
     typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
     own = (
         {}
@@ -73,7 +73,7 @@ def _times_of_strengths(found: Samples) -> Content:
 
 
 def _labels(found: Samples) -> dict[str, str]:
-    """Names of the numbers for a reader: a strength is named by its time."""
+    """Names of the parameters for the user: a strength is named by its relaxation time."""
     times = _times_of_strengths(found)["relaxation_times"] if found.kind.effective is not None else {}
     return {n: f"strength at {times[n]:.3g} s" if n in times else n for n in found.populations}
 
@@ -98,7 +98,7 @@ def _population(p: Any) -> Content | None:
 
 
 def _sample_entry(found: Samples, k: int) -> Content:
-    """The fit of one sample by itself, and its numbers moved towards the population."""
+    """The fit of one sample by itself, and its parameters moved towards the population (pooled)."""
     fit, sweep = found.fits[k], found.sweeps[k]
     pooled = {
         name: {"value": p.pooled[k], "standard_deviation_of_logarithm": p.pooled_errors[k]}
@@ -109,7 +109,7 @@ def _sample_entry(found: Samples, k: int) -> Content:
 
 
 def warnings(found: Samples) -> list[str]:
-    """Warnings of the population, and how often each warning of a single sample occurs."""
+    """Warnings on the population; and for each warning on single samples, the number of samples that have it."""
     out = []
     for name, p in found.populations.items():
         own = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
@@ -118,10 +118,12 @@ def warnings(found: Samples) -> list[str]:
         if p is None and "exponent" in name and np.all(np.abs(own - np.round(own[0])) < 1e-3):
             out.append(f"{name}: it is {np.round(own[0]):g} in all samples, the springpot is a pure spring or dashpot")
         elif p is None:
-            out.append(f"{name}: fewer than two samples determine it; it has no population")
+            out.append(f"{name}: fewer than two samples determine this parameter, so it has no population")
         else:
             if p.spread == 0:
-                out.append(f"{name}: the errors of the samples explain their spread; no spread between samples is seen")
+                out.append(
+                    f"{name}: the errors of the samples explain their differences; no spread between samples is found"
+                )
             without = [Path(s.source).name for s, x in zip(found.sweeps, p.pooled, strict=True) if np.isnan(x)]
             if without:
                 out.append(
@@ -134,7 +136,8 @@ def warnings(found: Samples) -> list[str]:
     if heat.size and np.ptp(heat) > WARMER:
         low, high = celsius(np.array([heat.min(), heat.max()]))
         out.append(
-            f"the samples were measured at {low:.4g} to {high:.4g} °C: their spread contains the temperature's part"
+            f"the samples were measured at {low:.4g} to {high:.4g} °C: their spread contains the effect of the "
+            "temperature"
         )
     failed = [Path(s.source).name for f, s in _pairs(found) if not f.converged]
     if failed:
@@ -156,12 +159,14 @@ def warnings(found: Samples) -> list[str]:
     return out
 
 
-#: Relative difference of a limit of the typical sample's Prony modes from that of its model that gets a sentence.
+#: A sentence is given if the equilibrium modulus of the typical sample's Prony modes differs from the mean of the
+#: population by more than this (relative).
 APART = 0.01
 
 
 def _limits_of_typical(found: Samples) -> list[str]:
-    """A sentence if the Prony modes at the top of fit.json have another equilibrium modulus than the population."""
+    """A sentence if the equilibrium modulus of the Prony modes at the top of fit.json differs from the mean of the
+    population."""
     p = found.populations.get("equilibrium_modulus")
     if found.kind.values is None or p is None:
         return []
@@ -195,7 +200,7 @@ def table(found: Samples) -> str:
         middle, new = ends
         rows.append(f"{label:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
     every = [found.values(k) for k in range(len(found.fits))]
-    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # the first number that most have
+    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # that most samples have
     rows.append(f"{'sample':32s} {'mean error':>10s}   {labels[name]}")
     for (fit, sweep), own in zip(_pairs(found), every, strict=True):
         value, error = own[name]
@@ -212,7 +217,7 @@ def table(found: Samples) -> str:
 
 
 def figure(found: Samples) -> "Figure":
-    """Moduli of all samples on the left; every number of every sample, and its population, on the right."""
+    """Moduli of all samples on the left; every parameter of every sample, with its population, on the right."""
     fig = pyplot().figure(figsize=(10, max(5.0, 0.7 * len(found.populations) + 1.5)), layout="constrained")
     left, right = fig.subplots(1, 2, width_ratios=(5.6, 4.4))
     for fit, sweep in _pairs(found):

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Part of a standard error up to which closed form and simulation count as equal.
+#: Closed form and simulation count as equal up to this part of a standard error.
 AGREED = 0.1
 STEMS = ("ratios", "relaxation_times")
 MARK = "* moves by more than independent noise explains without the first or the last half decade"
 
 
 def numbers(values: Any) -> Any:
-    """JSON numbers; numbers that are not finite become null."""
+    """The values as JSON numbers. Values that are not finite become null."""
     if isinstance(values, dict):
         return {k: numbers(v) for k, v in values.items()}
     if isinstance(values, (list, tuple)):
@@ -87,13 +87,13 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
 
 
 def ends_of_interval(details: Content) -> list[float] | None:
-    """Ends of the interval of the equilibrium modulus; None for another model than Prony modes."""
+    """Ends of the interval of the equilibrium modulus; None for models other than Prony modes."""
     found = details.get(INTERVAL)
     return [found["low"], found["high"]] if found else None
 
 
 def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
-    """Moduli of a fit in closed form with their standard errors, which contain the choice of the model."""
+    """Moduli of a closed-form fit with their standard errors. These errors contain the uncertainty about the model."""
     found = moduli_errors.fitted_moduli(fit, sweep.angular_frequency, sweep.noise_given)
     storage, loss = np.split(found.values, 2)
     errors = np.split(found.standard_errors, 2)
@@ -120,13 +120,14 @@ def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | No
 
 
 def band_sensitivity(fit: Fit) -> Content:
-    """Changes by the names of `standard_errors`; None if too few points were left."""
+    """Changes of the parameters without an end of the band, by the names of `standard_errors`; None if too few points
+    were left."""
     changes = fit.details.get("band_sensitivity", {})
     return {part: None if found is None else by_stem(found) for part, found in changes.items()}
 
 
 def by_stem(flat: dict[str, float]) -> Content:
-    """Numbers by the names of `standard_errors`: one list for ratios[0], ratios[1], …"""
+    """Values by the names of `standard_errors`: one list for ratios[0], ratios[1], …"""
     out: Content = {}
     for name, value in flat.items():
         stem = name.split("[")[0]
@@ -146,7 +147,7 @@ def own_numbers(p: Estimate | None, kind: Kind) -> Content:
 
 
 def spectrum_rows(details: Content) -> list[str]:
-    """Lines about a spectrum for the reader; none for other models."""
+    """Lines about a spectrum for the user. Other models have no lines."""
     found = details.get("spectrum")
     if not found:
         return []
@@ -160,7 +161,7 @@ def spectrum_rows(details: Content) -> list[str]:
 
 
 def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = ()) -> list[str]:
-    """Lines with a model's parameters, and the error of its Prony modes; parameters in `marked` have a star."""
+    """Lines with the parameters of a model, and the error of its Prony modes. Parameters in `marked` get a star."""
     rows = []
     for name, value, error, unit in zip(p.names, p.values, p.standard_errors, kind.units, strict=True):
         if not name.startswith("strengths["):
@@ -175,7 +176,7 @@ def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = 
 def write(
     out: Path, sweep: Sweep, fits: list[Fit], profile: Content | None, posterior: Posterior | None = None
 ) -> Content:
-    """Write fit.json, fit.png and fit.h5 of the last of `fits` (the others are added); returns the JSON.
+    """Write fit.json, fit.png and fit.h5 of the last fit in `fits`, with the other fits added. Return the JSON.
 
     If there is a posterior, its summary is in the JSON and its draws are in posterior.csv.
     """
@@ -193,7 +194,7 @@ def write(
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
         content["largest_shift_over_standard_error"] = largest_shift(*fits)
-    if profile is not None:  # it belongs to the closed form in all cases
+    if profile is not None:  # the profile always belongs to the closed form
         content.get("closed_form", content)["profile_intervals_95"] = profile
     if posterior is not None:
         content["posterior"] = posterior_report.summary(posterior)
@@ -233,7 +234,7 @@ def _store(path: Path, sweep: Sweep, fits: list[Fit], content: Content) -> None:
 def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
     """Moduli and residuals on the left; time constants and the table of parameters on the right.
 
-    Lengths are inches: the picture grows with the table, so that no panel shrinks and no line is lost.
+    Lengths are in inches. The picture grows with the table, so that no panel shrinks and no line is cut off.
     """
     fit = fits[-1]
     lines = _parameter_rows(fit)
@@ -248,7 +249,7 @@ def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
     draw_time_constants(times, sweep, fits)
     table.axis("off")
     text = table.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=table.transAxes)
-    text.set_in_layout(False)  # its axes are as large as it is
+    text.set_in_layout(False)  # its axes are as large as the text
     seconds = f"{fit.run_time:.2g} s run, {fit.compile_time:.2g} s compile"
     plural = "s" if fit.modes > 1 else ""
     mean = 100 * fit.relative_errors(sweep).mean()
@@ -259,7 +260,7 @@ def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
 
 
 def _nearest_of_all(fits: list[Fit]) -> str:
-    """A second line of the title: how near the best linear material of any spectrum comes to the data."""
+    """A second line of the title: how close any linear material, of whatever spectrum, can come to the data."""
     misfit = fits[0].details.get("consistency", {}).get("kramers_kronig_misfit")
     if misfit is None:
         return ""
@@ -267,7 +268,8 @@ def _nearest_of_all(fits: list[Fit]) -> str:
 
 
 def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
-    """Draw the data, the closed form (a fine line) and the simulation on `top`, the relative differences on `rest`."""
+    """Draw the data, the closed form (a fine line) and the simulation on `top`, and the relative differences on
+    `rest`."""
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
     fine = np.geomspace(f[0], f[-1], 400)
@@ -278,7 +280,7 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     )
     bands = _bands(closed, sweep)
     for symbol, data, sd, fitted, colour, line, marker, cross in rows:
-        if sd is not None:  # a bar below zero has no place on a log axis
+        if sd is not None:  # a log axis cannot show a bar below zero
             low = np.minimum(sd, 0.9 * data)
             top.errorbar(f, data, yerr=[low, sd], fmt="none", ecolor=colour, alpha=0.35, capsize=2)
         measured = f"{symbol} measured" + ("" if sd is None else " ± sd")
@@ -306,7 +308,7 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
 
 
 def _bands(closed: Fit, sweep: Sweep) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Ends of the 95 % intervals of G' and G'' at the data; empty for a compressed sample."""
+    """Ends of the 95 % intervals of G' and G'' at the measured frequencies; empty for a compressed sample."""
     if "precompression" in closed.details:
         return {}
     found = moduli_errors.fitted_moduli(closed, sweep.angular_frequency, sweep.noise_given)
@@ -316,7 +318,8 @@ def _bands(closed: Fit, sweep: Sweep) -> dict[str, tuple[np.ndarray, np.ndarray]
 
 
 def _moduli_as_measured(closed: Fit, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """G' and G'' as the instrument shows them: a compression makes them differ from those of the sample."""
+    """G' and G'' as the instrument measures them. If the sample is compressed, they differ from the moduli of the
+    sample at rest."""
     found = closed.details.get("precompression")
     factors = (1.0, 1.0)
     if found is not None:
@@ -331,12 +334,12 @@ def _moduli_as_measured(closed: Fit, omega: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _legend_above(axes: Any, columns: int) -> None:
-    """Put the legend outside of the axes, where it covers nothing."""
+    """Put the legend outside of the axes, so that it covers no data."""
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.3, fontsize=8, ncols=columns, frameon=False)
 
 
 def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int = 2) -> None:
-    """Strength against time constant with 95 % intervals, and the band that the frequencies resolve.
+    """Draw ratio over relaxation time with 95 % intervals, and the band that the frequencies resolve.
 
     Args:
         columns: number of columns of the legend.
@@ -358,12 +361,12 @@ def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int =
         ends = [np.array([np.minimum(w, 0.95 * v), w]) for w, v in zip(wide, (g, tau), strict=True)]
         axes.errorbar(tau, g, xerr=ends[1], yerr=ends[0], fmt="none", color=GREY, lw=0.8, label="with the ends, 95 %")
     axes.set(xscale="log", xlabel="relaxation time [s]", ylabel="ratio of G0 [1]")
-    axes.set_ylim(0, 1.05 * axes.get_ylim()[1])  # room above the largest
+    axes.set_ylim(0, 1.05 * axes.get_ylim()[1])  # room above the largest bar
     _legend_above(axes, columns)
 
 
 def _parameter_rows(fit: Fit) -> list[str]:
-    """The moduli and one line per mode, or the numbers of another model."""
+    """The moduli and one line per mode, or the parameters of another model."""
     u, n = fit.uncertainty, fit.modes
     if fit.parameters is not None:
         return own_rows(fit.parameters, fit.kind, fit.details, edges.moved(fit))
@@ -418,7 +421,7 @@ def _lines(fit: Fit) -> list[str]:
 
 
 def table(sweep: Sweep, fits: list[Fit]) -> str:
-    """Parameters ± standard error of every method side by side, errors and times below."""
+    """Parameters ± standard error, side by side for every method; errors and times below."""
     columns = []
     for fit in fits:
         errors = fit.relative_errors(sweep)
@@ -438,7 +441,7 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
     )
 
 
-#: Names of the sources of errors for a reader.
+#: Names of the sources of errors, for the user.
 SOURCES = {
     "noise": "noise",
     "geometry": "gap and radius",
@@ -450,7 +453,7 @@ SOURCES = {
 
 
 def _totals(fit: Fit) -> list[str]:
-    """The total error of the moduli, and its shares."""
+    """Lines with the total errors of the moduli and their shares."""
     whole, parts, known = total_error.total_errors(fit), total_error.error_shares(fit), edges.values(fit)
     symbols = {"shear_modulus": "G0", "equilibrium_modulus": "G_inf"}
     out = []
@@ -462,7 +465,7 @@ def _totals(fit: Fit) -> list[str]:
 
 
 def _compression(fits: list[Fit]) -> list[str]:
-    """The assumed compression of the sample, and the axial force for a check."""
+    """Lines with the assumed compression of the sample, and with the axial force as a check of it."""
     found = [fit.details["precompression"] for fit in fits if "precompression" in fit.details]
     if not found:
         return []
@@ -480,7 +483,7 @@ def _compression(fits: list[Fit]) -> list[str]:
 
 
 def _agreement(fits: list[Fit]) -> list[str]:
-    """One line on the difference that the simulation makes."""
+    """One line on the difference between simulation and closed form."""
     if len(fits) < 2:
         return []
     shift, seconds = largest_shift(*fits), fits[-1].run_time + fits[-1].compile_time

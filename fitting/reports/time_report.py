@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 
 def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None = None) -> Content:
-    """Write both files, and the draws of a posterior. Return the JSON; its names are the same as for a sweep."""
+    """Write both files, and the draws of the posterior if there is one. Return the JSON; it has the same names as for a
+    sweep."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = fit.uncertainty, fit.modes
     e, errors = u.standard_errors, fit.relative_errors
@@ -73,7 +74,8 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
 
 
 def _total_errors_in_time(fit: TimeFit) -> Content:
-    """Errors by noise, by the size of the sample and by long times; nothing for a rig that a file describes."""
+    """Total errors and their shares (noise, size of the sample, short and long times). Empty for a test that a TOML
+    file describes."""
     if "geometry_error" not in fit.details:
         return {}
     shares = total_error.error_shares(fit)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Names of the curves of a test over frequency, and the axis label of each panel.
+#: Names of the curves of a test over frequency; and the axis label of each panel.
 CURVES = {"sweep": ("G'", "G''"), "dispersion": ("phase velocity [m/s]", "attenuation [1/m]")}
 QUANTITIES = {
     "sweep": "modulus [Pa]",
@@ -36,12 +36,12 @@ QUANTITIES = {
 
 
 def write(out: Path, found: Together, relative: float) -> Content:
-    """Write both files. Return the JSON; its names are the same as for a sweep, and `tests` is added.
+    """Write both files. Return the JSON; it has the same names as for a sweep, and `tests` in addition.
 
     Args:
         out: folder.
         found: the fit.
-        relative: relative error of all moduli of a test by the size of its sample.
+        relative: relative error of all moduli of a test that comes from the size of its sample.
     """
     out.mkdir(parents=True, exist_ok=True)
     u, n = found.uncertainty, found.modes
@@ -117,7 +117,7 @@ def _share_of_test(share: Share, found: Together) -> Content:
 
 
 def _measured(found: Together, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Abscissae [Hz or s] and measured numbers of test k, in the order of `Together.fitted`."""
+    """Abscissae [Hz or s] and measured values of test k, in the order of `Together.fitted`."""
     test = found.tests[k]
     if isinstance(test, Sweep):
         return test.angular_frequency / (2 * np.pi), np.concatenate([test.storage, test.loss])
@@ -133,7 +133,8 @@ def _largest(found: Together) -> list[float]:
 
 
 def table(found: Together, relative: float) -> str:
-    """Parameters ± standard error, the errors that remain without each of the tests, and the total error of G0."""
+    """Parameters ± standard error, the errors of a fit without each test, and the total error of the first
+    parameter."""
     u, n, own = found.uncertainty, found.modes, found.parameters
     heads = [f"without {k}" for k in range(1, len(found.shares) + 1)]
     rows = [f"{k}: {s.name}, {s.points} numbers, {Path(s.source).name}" for k, s in enumerate(found.shares, 1)]
@@ -165,7 +166,8 @@ def table(found: Together, relative: float) -> str:
 
 
 def _with_sizes(found: Together, relative: float) -> list[str]:
-    """The total error of the first number, and the largest part that the sizes of the samples have in the others."""
+    """A line with the total error of the first parameter. It adds the other parameter that depends most on the sizes of
+    the samples, if its error from these sizes exceeds its error from noise."""
     shares = sizes_of_samples.shares_with_sizes(found, relative)
     whole, names = total_error.root_of_squares(shares), list(shares["noise"])
     if not names or not np.isfinite(whole[names[0]]):
@@ -185,7 +187,7 @@ def _error(value: float) -> str:
 
 
 def figure(found: Together) -> "Figure":
-    """One panel per test, measured and fitted."""
+    """One panel per test, with measured and fitted values."""
     count = len(found.tests)
     fig = pyplot().figure(figsize=(max(6.0, 3.6 * count), 4.4), layout="constrained")
     axes = np.atleast_1d(fig.subplots(1, count))

@@ -1,16 +1,17 @@
 """A sample that the plates compress before they turn it (`--precompression`).
 
-The sample has the plates' radius at rest and is not trimmed. It is held until its stress has relaxed. Moduli here are
-those that the instrument shows: it computes them with the plates' radius and with the gap of the test.
+At rest, the sample has the radius of the plates; it is not trimmed after the compression. The plates hold it until its
+stress has relaxed. Moduli here are the moduli that the instrument reports: it computes them with the radius of the
+plates and with the gap of the test.
 
-If the plates let the sample slide sideways, it stays a cylinder, with the stretches a along the radius and l along the
-axis, and with the axial stress s. With an isotropic law, a shear between both directions has the modulus l^2 s / (l^2 -
-a^2). The stress of the compression contributes s to it (Ericksen's relation; Rivlin 1949 for the incompressible
-cylinder). The torque grows with the fourth power of the radius, and so the instrument shows
+If the sample can slide sideways on the plates, it stays a cylinder. It has the stretches a along the radius and l along
+the axis, and the axial stress s. With an isotropic law, a shear between both directions has the modulus l^2 s / (l^2 -
+a^2). The stress of the compression contributes s to this modulus (Ericksen's relation; Rivlin 1949 for the
+incompressible cylinder). The torque grows with the fourth power of the radius, and so the instrument reports
 
     G*(omega) = a^4 s [a^2 / (l^2 - a^2) (1 - sum_k g_k / (1 + i omega tau_k)) + (1 - sum_k g_k)]
 
-where s is the axial stress before it relaxes. So the relaxing part and the equilibrium modulus have different factors.
+where s is the axial stress before relaxation. So the relaxing part and the equilibrium modulus have different factors.
 """
 
 from typing import NamedTuple
@@ -25,14 +26,14 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.laws import Law
 
-#: Largest part of the height that a sample may be compressed by.
+#: Maximum compression of a sample, as a part of its height.
 LARGEST = 0.5
-#: Largest strain of one load step.
+#: Maximum strain of one load step.
 _STEP = 0.05
 
 
 class Shares(NamedTuple):
-    """Apparent moduli of a compressed cylinder that may slide sideways, divided by its moduli at rest [1]."""
+    """Apparent moduli of a compressed cylinder that can slide sideways, divided by its moduli at rest [1]."""
 
     relaxing: float  # of the relaxing moduli
     equilibrium: float  # of the equilibrium modulus
@@ -49,10 +50,11 @@ def check_strain(strain: float) -> None:
 
 
 def shares(law: Law, strain: float) -> Shares:
-    """Shares for a law compressed by `strain` between smooth plates (formula of the module).
+    """`Shares` for a sample of this law, compressed by `strain` between smooth plates (formula at the top of this
+    file).
 
     Raises:
-        InputError: a law that is not isotropic, or that pulls when it is compressed.
+        InputError: the law is not isotropic, or it does not resist the compression.
     """
     if strain == 0:
         return Shares(1.0, 1.0)
@@ -69,9 +71,9 @@ def shares(law: Law, strain: float) -> Shares:
 
 
 def incompressible(law: Law, strain: float) -> Shares | None:
-    """`shares` of the same law if the sample keeps its volume: s is then that of the law without U(J).
+    """The result of `shares` if the sample keeps its volume. s is then the stress of the law without U(J).
 
-    None for a law that has no part without volume.
+    None if the law has no isochoric part, or if the strain is 0.
     """
     _refuse_directions(law)
     axial, own = 1 - strain, law.isochoric_part()
@@ -79,7 +81,7 @@ def incompressible(law: Law, strain: float) -> Shares | None:
         return None
     a = 1 / np.sqrt(axial)
     side, _, s = _cauchy(own, a, axial)
-    s -= side  # the pressure that leaves the side free of force
+    s -= side  # this pressure makes the side free of force
     G = float(np.asarray(law.shear_modulus()))
     relaxing = float(a**6 * s / (axial**2 - a**2) / G)
     return Shares(relaxing, relaxing + float(a**4 * s / G))
@@ -93,7 +95,8 @@ def side_stretch(law: Law, strain: float) -> float:
 
 
 def smooth_force(law: Law, strain: float, radius: float) -> float:
-    """Force [N] with which a sample of this radius at rest [m] pushes smooth plates apart before it relaxes."""
+    """Force [N] with which the sample pushes smooth plates apart before relaxation. `radius`: radius of the sample at
+    rest [m]."""
     if strain == 0:
         return 0.0
     a = side_stretch(law, strain)
@@ -121,7 +124,7 @@ def load_steps(strain: float) -> int:
 
 
 def too_far(strain: float) -> InputError:
-    """The refusal of a strain at which the simulation of glued plates fails."""
+    """The error for a strain at which the simulation with glued plates fails."""
     return InputError(
         f"--precompression {strain:g}: the simulated sample could not be compressed so far; give less, or --method "
         "closed-form, whose plates are smooth"
@@ -129,13 +132,13 @@ def too_far(strain: float) -> InputError:
 
 
 def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
-    """The rig with its sample compressed by `strain` and held, before it turns.
+    """The rig with its sample compressed by `strain` and held, before the plate turns.
 
     Args:
-        rig: rig of the sample at rest; the height of the result is that of the gap.
+        rig: rig of the sample at rest. The height of the returned rig is the gap.
         law: law of the sample.
         strain: part of the height at rest.
-        smooth: let the sample slide sideways on the plates while it is compressed, so that it stays a cylinder; else
+        smooth: the sample slides sideways on the plates during the compression, so that it stays a cylinder. Otherwise
             it is glued and bulges.
 
     Raises:

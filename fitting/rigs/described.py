@@ -1,13 +1,15 @@
-"""A test in time through a rig, described by a small TOML file: force and displacement of a sample that is not sheared.
+"""A test in time in a rig, described by a small TOML file: force and displacement of a sample that is not simply
+sheared.
 
-f(d) is the force on an elastic sample of unit shear modulus at a displacement d. For glued samples it is computed by
-finite elements and corrected by their estimated error; for indenters it is the exact solution of a bonded layer. The
-force on the viscoelastic sample follows from linear viscoelasticity with f(d) in the place of the strain,
+f(d) is the force on an elastic sample of unit shear modulus at a displacement d. For glued samples, f(d) is computed by
+finite elements and corrected for their estimated error. For indenters, it is the exact solution of a bonded layer. The
+force on the viscoelastic sample follows from linear viscoelasticity with f(d) in place of the strain,
 
     F(t) = integral of G(t - s) d f(d(s)),
 
-This is exact if strains are small and bulk relaxes as shear does or is far stiffer; for an indenter, also only while
-its contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438). At large strain it is Fung's quasi-linear form.
+This is exact if strains are small and if the bulk modulus relaxes like the shear modulus or is much larger. For an
+indenter, it holds only while the contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438). At large strain, it is
+Fung's quasi-linear form.
 """
 
 import tomllib
@@ -27,7 +29,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.status import NAMES
 from liverjax.laws import NeoHookean
 
-#: Lengths that each test needs, in metres; the cone has an angle.
+#: Lengths [m] that each test needs. The cone needs an angle [degrees] too.
 TESTS: dict[str, tuple[str, ...]] = {
     "tension": ("radius", "height"),
     "compression": ("radius", "height"),
@@ -37,23 +39,26 @@ TESTS: dict[str, tuple[str, ...]] = {
     "punch": ("radius", "thickness"),
 }
 _OTHER = ("test", "data", "drive", "poisson", "min_time", "ramp")
-#: Driven quantity -> kind of the test.
+#: For each driven quantity, the kind of the test.
 _KINDS = {"displacement": "relaxation", "force": "creep"}
-#: Default Poisson's ratios: glued samples have K/mu = 1000, layers keep their volume.
+#: Default Poisson's ratios: glued samples have K/mu = 1000, and layers keep their volume.
 _GLUED, _LAYER = 0.4995, 0.5
-#: Displacements, divided by the largest one, at which glued samples are computed; more of them for large strains.
+#: Displacements, divided by the largest displacement, at which glued samples are computed. Above the strain _LARGE, the
+#: finer grid is used.
 _GRID, _FINER_GRID, _LARGE = (0.05, 0.5, 1.0), (0.05, 0.25, 0.5, 0.75, 1.0), 0.1
-#: Cells at the rims of the plates over the shortest length there. Small ones turn inside out at large compression.
+#: Sizes of the cells at the rims of the plates, divided by the shortest length there. They are tried in this order:
+#: small cells turn inside out at large compression.
 _RIMS = (0.04, 0.1, 0.2)
-#: An indenter goes back where its depth falls by this part of the largest depth, and by so many times its scatter.
+#: An indenter goes back if its depth falls by more than the part _BACK of the largest depth and by more than _SCATTERS
+#: times the scatter of the depth.
 _BACK, _SCATTERS = 0.02, 4.0
-#: Fewest rows of a growing contact, the one at rest included.
+#: Minimum number of rows of a growing contact, including the row at rest.
 _FEWEST = 6
-#: Most rows of an indenter's test, with the rows that are added between the measured ones.
+#: Maximum number of rows of an indenter's test, including the rows that are added between the measured rows.
 _MOST_ROWS = 2000
-#: Height of a glued sample over its radius up to which it is computed. Beyond it meshes are large, and minutes go by.
+#: A glued sample is computed up to this ratio of height to radius. Above it, meshes are large and a run takes minutes.
 _SLENDER = 10.0
-#: Deviation from a straight line above which there is a note.
+#: If the force deviates from a straight line by more than this, a note is given.
 _CURVED = 0.02
 
 
@@ -66,19 +71,19 @@ class Described(NamedTuple):
     poisson: float
     drive: str  # displacement or force
     min_time: float
-    at_once: bool  # ramp = 0: the load of the first row acted from 0 s on
+    at_once: bool  # ramp = 0 in the file: the load of the first row acted from 0 s on
 
 
 def read_described(path: str | Path) -> TimeTest:
-    """The described test as a test of shear: strain f(d)/S and stress F/S. S is chosen so that small strains are d
-    divided by a length of the sample.
+    """Read the described test as a test in shear, with the strain f(d)/S and the stress F/S. S is chosen so that a
+    small strain is d divided by a length of the sample.
 
     Args:
-        path: TOML with test, data (a table of time, displacement and force), the sizes that the test needs in metres,
-            and optionally drive, poisson, min_time, ramp = 0.
+        path: TOML file with test, data (a table of time, displacement and force), and the sizes in metres that the test
+            needs. drive, poisson, min_time and ramp = 0 are optional.
 
     Raises:
-        InputError: one sentence naming file, key, value and remedy.
+        InputError: one sentence with the file, the key, the value and the remedy.
     """
     path = Path(path)
     described = _description(path)
@@ -122,10 +127,10 @@ def read_described(path: str | Path) -> TimeTest:
 
 
 def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list[str]]:
-    """The number of rows until the indenter goes back, and a note if it does: the force on a contact that shrinks is
-    another one (Ting 1966, J. Appl. Mech. 33:845).
+    """The number of rows until the indenter goes back, and a note if it goes back. While the contact shrinks, another
+    formula holds for the force (Ting 1966, J. Appl. Mech. 33:845).
     """
-    depth = scipy.ndimage.median_filter(np.maximum(depth, 0.0), 5, mode="nearest")  # a single reading is no return
+    depth = scipy.ndimage.median_filter(np.maximum(depth, 0.0), 5, mode="nearest")  # a single reading is no way back
     scatter = 1.4826 * float(np.median(np.abs(np.diff(depth, 2)))) / np.sqrt(6) if len(depth) > 2 else 0.0
     fall = np.maximum.accumulate(depth) - depth
     back = fall > max(_BACK * float(depth.max()), _SCATTERS * scatter)
@@ -133,13 +138,14 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
         return len(time), []
     kept = int(np.argmax(back))
     return kept, [
-        f"{len(time) - kept} rows from {time[kept]:.4g} s on are left out: the indenter goes back there, and the force "
-        "on a contact that shrinks does not follow from these formulas"
+        f"{len(time) - kept} rows from {time[kept]:.4g} s on are left out: there the indenter goes back, and these "
+        "formulas do not hold while the contact shrinks"
     ]
 
 
 def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The rows, and more rows between them without a force: between two rows d is linear in time, f(d) is not."""
+    """The rows, and more rows between them without a force. They are needed because d is linear in time between two
+    rows, but f(d) is not."""
     parts = int(np.clip(_MOST_ROWS // len(time), 1, 8))
     place = np.arange((len(time) - 1) * parts + 1) / parts
     rows = np.arange(len(time))
@@ -149,7 +155,7 @@ def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tu
 
 
 def curve_of(curve: Callable[[float], float], d: np.ndarray) -> np.ndarray:
-    """f at displacements (n,) [m], continued as a straight line below 0."""
+    """f at displacements (n,) [m]. Below 0, f is continued as a straight line."""
     grid = np.linspace(0.0, max(float(d.max()), 0.0), 400)
     values = np.array([0.0, *(curve(each) for each in grid[1:])])
     below = curve(grid[1]) / grid[1] * np.minimum(d, 0.0)
@@ -202,7 +208,7 @@ def _number_of(path: Path, key: str, value: Any) -> float:
 
 
 def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
-    """f(d) [m^2] per unit shear modulus, the length that divides d to give a strain, and notes."""
+    """f(d) [m^2] for unit shear modulus, the length by which d is divided to give a strain, and notes."""
     sizes = described.sizes
     if "thickness" not in sizes:
         return _glued_curve(described, largest, path)
@@ -214,7 +220,7 @@ def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[
         half_angle=sizes.get("half_angle", 45.0),
     )
     layer, per_shear = thin_layer.Layer(indenter), 2 * (1 + described.poisson)
-    layer.force(np.array([largest]))  # refuses depths that its table does not reach
+    layer.force(np.array([largest]))  # raises an error for depths beyond its table
     said = "the contact begins where displacement is 0, without adhesion"
     if described.test != "punch":
         said += ", and grows until the largest displacement"
@@ -222,13 +228,13 @@ def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[
 
 
 def _glued_curve(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
-    """The curve by finite elements, corrected for the error of the mesh."""
+    """f(d) by finite elements, corrected for the error of the mesh; with the same results as `_elastic`."""
     sizes, way = described.sizes, 1.0 if described.test == "tension" else -1.0
     radius, height = sizes["radius"], sizes["height"]
     if largest >= 0.5 * height:
         raise InputError(
-            f"{path}: the displacement reaches {largest:g} m, more than half of the height {height:g} m: change height "
-            "or the displacement's unit"
+            f"{path}: the displacement reaches {largest:g} m, which is more than half of the height {height:g} m: "
+            "correct the height, or the unit of the displacement"
         )
     if height > _SLENDER * radius:
         raise InputError(
@@ -268,6 +274,6 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
     if abs(secant[-1] / secant[0] - 1) > _CURVED:
         notes.append(
             f"at the largest displacement the elastic force is {100 * (secant[-1] / secant[0] - 1):+.0f} % off a "
-            "straight line; the fit lets it relax as shear does (quasi-linear)"
+            "straight line; in the fit it relaxes like shear (quasi-linear)"
         )
     return (lambda d: d * float(np.interp(d, at, secant))), height, notes

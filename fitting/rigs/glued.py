@@ -1,10 +1,10 @@
 """Tension, indentation and creep of a cylinder as differentiable experiments.
 
-Each experiment is a scene, into which law and viscosity are filled, and a reading from its run. The sample is glued to
-its plates: that is part of the simulation, so no factor of shape has to correct for it.
+Each experiment is a scene, to which law and viscosity are added, and a reading from its run. The sample is glued to its
+plates. The simulation contains this, so no shape factor is needed.
 
-By default the mesh is a narrow sector of the cylinder between two planes of symmetry, fine at the rims of the plates
-and at the punch's edge, where stresses are infinite. Its error is in experiments/TABLES.md.
+By default, the mesh is a narrow sector of the cylinder between two planes of symmetry. It is fine at the rims of the
+plates and at the edge of the punch, where stresses are infinite. experiments/TABLES.md has its error.
 """
 
 import warnings
@@ -26,29 +26,30 @@ from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Prony
 from liverjax.simulation import automatic
 
-#: Smallest width of the punch, and of the ring around it, over the sample's radius, for which the mesh is made.
+#: Minimum width of the punch, and of the ring around it, divided by the radius of the sample.
 NARROWEST = 0.01
-#: A default mesh is known to be within 1 % for these height / radius, and up to these K/mu by form for volume changes.
-#: Mixed needs a law with bulk apart from shear, and a viscosity of `part = "isochoric"` or none.
+#: A default mesh is known to be within 1 % for height / radius between SHAPES, and up to a K/mu of STIFFEST. STIFFEST
+#: depends on how volume changes are treated. "mixed" needs a law that separates bulk from shear, and a viscosity with
+#: `part = "isochoric"` or no viscosity.
 SHAPES, STIFFEST = (0.2, 5.0), {"mixed": 1e4, "element": 20.0}
 
 
 class Cells(NamedTuple):
-    """The mesh of a rig; the default is within 1 % of the converged result (experiments/TABLES.md)."""
+    """The mesh of a rig. The default mesh is within 1 % of the converged result (experiments/TABLES.md)."""
 
     size: float | None = None  # [m] of all cells, in a whole cylinder; None: a graded sector
-    rim: float = 0.04  # cells of a sector at the rim of a plate / shortest length there
-    edge: float = 0.02  # the same at a punch's edge
-    largest: float = 0.34  # longest cells of a sector / radius; along the axis twice as long
+    rim: float = 0.04  # size of a sector's cells at the rim of a plate / shortest length there
+    edge: float = 0.02  # the same at the edge of a punch
+    largest: float = 0.34  # longest cells of a sector / radius; twice as long along the axis
     growth: float = cylinders.GROWTH  # of cells away from rims and edge
-    corners: int = 24  # of the polygon in place of the circle; a sector has one of its edges
+    corners: int = 24  # corners of the polygon in place of the circle; a sector has one edge of it
     order: int = 2  # of the elements
-    volumetric: str = "auto"  # how volume changes are treated, as in `lj.Solve`
+    volumetric: str = "auto"  # how volume changes are treated, see `lj.Solve`
 
 
 @struct
 class Rig:
-    """A scene without its law, and what is read from it along z."""
+    """A scene without its law, and the quantity that is read from it along z."""
 
     scene: lj.Scene = param("1", "scene whose law `read` replaces")
     nodes: Indices = param("1", "numbers (n,) of the nodes that are read")
@@ -63,8 +64,8 @@ class _Sample(NamedTuple):
     mesh: lj.TetMesh
     fixed: tuple
     physics: tuple
-    parts: float  # number of such meshes in a whole cylinder
-    under: np.ndarray  # nodes of the top under the punch, or of the whole top
+    parts: float  # number of such meshes that make a whole cylinder
+    under: np.ndarray  # nodes of the top under the punch, or all nodes of the top
     volumetric: str
 
 
@@ -72,17 +73,18 @@ def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]
     """Readings of the rig at every step (T,) [N] or [m], and the codes of the steps (T,).
 
     Raises:
-        InputError: the law has directions of its own, and the mesh is a sector, which needs symmetry around the axis.
+        InputError: the law is not isotropic, but the mesh is a sector, which needs symmetry around the axis.
     """
     result = lj.simulate(_with(rig, law, prony))
     return _reading(rig, result.positions, result.reactions), result.status
 
 
 def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
-    """Estimate of the change of each reading (T,) [N] or [m] by an infinitely fine mesh; not for traced numbers.
+    """Estimate how each reading (T,) [N] or [m] would change with an infinitely fine mesh. It does not work with traced
+    values.
 
-    It needs a run, and one linear solve per step in elements of higher order (`liverjax.simulation.mesh_error`). It is
-    NaN if a step has no estimate.
+    It needs a run, and one linear solve per step in elements of higher order (`liverjax.simulation.mesh_error`). A step
+    without an estimate has NaN.
     """
     result = lj.simulate(_with(rig, law, prony), mesh_error=True)
     assert result.mesh_error is not None
@@ -101,7 +103,7 @@ def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
     ratio = _ratio(law)
     if not rig.whole and most is not None and ratio is not None and ratio > most * (1 + 1e-9):
         warnings.warn(
-            f"K/mu = {ratio:.3g} is above {most:g}, up to which the mesh is known to be within 1 %: see "
+            f"K/mu = {ratio:.3g} is above {most:g}, and the mesh is known to be within 1 % only up to this value: see "
             "rigs.mesh_error",
             stacklevel=3,
         )
@@ -109,7 +111,7 @@ def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
 
 
 def _ratio(law: Law) -> float | None:
-    """Bulk over shear modulus; None if a law does not state them, or while they are traced."""
+    """Bulk modulus over shear modulus. None if the law does not give them, or while they are traced."""
     try:
         moduli = law.bulk_modulus(), law.shear_modulus()
     except InputError:
@@ -128,17 +130,17 @@ def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
 
 
 def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size: float | Cells | None = None) -> Rig:
-    """A cylinder pulled (or pressed) between glued plates; the force is read.
+    """A cylinder that is pulled (or pressed) between glued plates. The force is read.
 
     Args:
-        radius, height: of the sample [m].
+        radius, height: size of the sample [m].
         dt: time step [s].
         strains: nominal strain at the end of every step (T,).
-        cell_size: edge length [m] of a mesh of the whole cylinder with cells of one size, or `Cells`; default a graded
-            sector.
+        cell_size: `Cells`, or an edge length [m]: then the mesh is the whole cylinder with cells of one size. Default:
+            a graded sector.
 
     Raises:
-        InputError: lengths or times that are not positive, strains that are not finite or flatten the sample.
+        InputError: a length or a time is not positive, or a strain is not finite or flattens the sample.
     """
     strains = _finite_history("strains", strains)
     if strains.min() <= -0.9:
@@ -152,15 +154,16 @@ def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size
 def indentation(
     radius: float, height: float, punch: float, dt: float, depths: Numbers, cell_size: float | Cells | None = None
 ) -> Rig:
-    """A glued flat punch of radius `punch` [m] pressed into a cylinder by `depths` (T,) [m]; its force is read.
+    """A glued flat punch of radius `punch` [m] that is pressed into a cylinder by `depths` (T,) [m]. Its force is read.
 
     A negative depth pulls.
 
     Args:
-        radius, height, dt, cell_size: as in `tension`; a ring of nodes is at the punch's edge.
+        radius, height, dt, cell_size: see `tension`. A ring of nodes lies at the edge of the punch.
 
     Raises:
-        InputError: as in `tension`; a punch wider than the sample, or far narrower; depths beyond the sample.
+        InputError: see `tension`; or the punch is too wide or too narrow for the sample, or a depth is too large for
+            it.
     """
     depths = _finite_history("depths", depths)
     cells = _cells(radius, height, dt, cell_size)
@@ -182,12 +185,13 @@ def indentation(
 def creep(
     radius: float, height: float, dt: float, steps: int, stress: float, cell_size: float | Cells | None = None
 ) -> Rig:
-    """A cylinder under a constant pull `stress` [Pa] on its top from time 0 on; the top's mean displacement is read.
+    """A cylinder under a constant pull `stress` [Pa] on its top from time 0 on. The mean displacement of the top is
+    read.
 
-    The pull grows during the first step, as it does in a rheometer. The mean is taken over the area.
+    The pull rises during the first step, as in a rheometer. The mean is over the area.
 
     Raises:
-        InputError: as in `tension`; no steps, or a stress that is not finite.
+        InputError: see `tension`; or there are no steps, or the stress is not finite.
     """
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
         raise InputError(f"steps = {steps!r} must be a whole number, 1 or more")
@@ -214,7 +218,7 @@ def _finite_history(name: str, values: Numbers) -> np.ndarray:
 
 
 def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | None) -> Cells:
-    """Check all numbers; return the cells of the mesh."""
+    """Check all values and return the cells of the mesh."""
     cells = cell_size if isinstance(cell_size, Cells) else Cells(size=cell_size)
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(f"dt = {dt} must be positive: give the time step in seconds")
@@ -224,15 +228,16 @@ def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | N
     shape = height / radius
     if cells.size is None and not SHAPES[0] * (1 - 1e-9) <= shape <= SHAPES[1] * (1 + 1e-9):
         warnings.warn(
-            f"height = {height:g} m is {shape:.3g} radii, and the mesh is known to be within 1 % from {SHAPES[0]:g} to "
-            f"{SHAPES[1]:g}: see rigs.mesh_error",
+            f"height = {height:g} m is {shape:.3g} radii, and the mesh is known to be within 1 % only from "
+            f"{SHAPES[0]:g} to {SHAPES[1]:g} radii: see rigs.mesh_error",
             stacklevel=3,
         )
     return cells
 
 
 def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None) -> _Sample:
-    """A sector with cells of given lengths at given radii and heights; with `cells.size`, the whole cylinder."""
+    """A sector with cells of given lengths at given radii (`rings`) and heights (`layers`); with `cells.size`, the
+    whole cylinder."""
     radius, height = max(rings), max(layers)
     if cells.size is not None:
         rings, layers = (dict.fromkeys(places, cells.size) for places in (rings, layers))
@@ -250,7 +255,7 @@ def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None)
     bottom = lj.Fixed(nodes=jnp.asarray(sets["bottom"]))
     if normal is None:
         return _Sample(mesh, (bottom,), (), parts, sets["under"], cells.volumetric)
-    # The axis lies in both planes, and so do the mid-edge nodes on it.
+    # The axis lies in both planes of symmetry, with its mid-edge nodes.
     axis = np.intersect1d(sets["start"], sets["end"])
     fixed = (
         bottom,
@@ -262,7 +267,7 @@ def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None)
 
 
 def _with_punch(mesh: lj.TetMesh, radii: np.ndarray, punch: float | None) -> lj.TetMesh:
-    """The mesh with a node set `under`: the top within the ring at `punch`, or all of it."""
+    """The mesh with a node set `under`: the nodes of the top within the ring at `punch`, or all nodes of the top."""
     top = np.asarray(mesh.node_sets["top"])
     if punch is not None:
         # The nodes of a layer are numbered from the axis outwards, ring after ring.
@@ -277,7 +282,8 @@ def _driven(sample: _Sample, dt: float, lift: np.ndarray) -> Rig:
     history[1:, 2] = lift
     times = dt * np.arange(len(lift) + 1)
     nodes = jnp.asarray(sample.under)
-    # Along z alone: the planes of symmetry fix some of these nodes already, and no node may be prescribed twice.
+    # The motion is prescribed along z only. The planes of symmetry fix other axes of some of these nodes already, and
+    # nothing may be prescribed twice.
     moved = lj.Displaced(nodes=nodes, times=jnp.asarray(times), history=jnp.asarray(history), axes="z")
     sample = sample._replace(fixed=(*sample.fixed, lj.Fixed(nodes=nodes, axes="xy")))
     scene = _scene(sample, dt, len(lift), displaced=(moved,))

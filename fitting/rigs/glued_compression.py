@@ -1,11 +1,13 @@
-"""A compressed sample between glued plates by quadratic elements: what the coarse mesh of the torsion rig misses.
+"""A compressed sample between glued plates, computed with quadratic elements, because the mesh of the torsion rig is
+too coarse.
 
-The sample is glued, so it bulges, and the stresses at the rims of the plates are infinite. Linear elements of the
-torsion rig are a fifth too stiff there, against a few percent in pure torsion. So factors and force are computed once
-for each law and strain, with a quarter of the cylinder that is fine at the rims.
+The sample is glued, so it bulges, and the stresses at the rims of the plates are infinite. In this state, the linear
+elements of the torsion rig are a fifth too stiff; in pure torsion they are only a few percent too stiff. So factors and
+force are computed once for each law and strain, on the mesh of a quarter cylinder that is fine at the rims.
 
-A sample whose stress relaxes by m = G*/G0, down to m_inf, shows the modulus G0 (R m + S m_inf). Both factors come from
-two harmonic solutions about the compressed state; others are within 1e-4 of a sum of this form.
+If the stress of a sample relaxes by m = G*/G0, down to m_inf, its measured modulus is G0 (R m + S m_inf). The factors R
+and S come from two harmonic solutions about the compressed state. Other harmonic solutions are within 1e-4 of this
+formula.
 """
 
 from typing import NamedTuple
@@ -21,21 +23,23 @@ from liverjax.mesh import cylinders
 from liverjax.mesh.promotion import quadratic
 from liverjax.mesh.tetrahedra import with_points
 
-#: Cells at the rim of a plate, over the shorter of radius and half of the height: the coarser ones where a large strain
-#: inverts the finer elements at the rim.
+#: Size of the cells at the rim of a plate, divided by the shorter of radius and half height. The coarser cells are used
+#: if a large strain inverts the finer elements at the rim.
 RIMS = (0.1, 0.25)
-#: Cells at the rim of a second mesh, over those of the first; both have the same number of cells.
+#: Size of the cells at the rim of a second mesh, divided by their size in the first mesh. Both meshes have the same
+#: number of cells.
 COARSER = 2.5
-#: Order of the error in the length of these cells: 0.74 from cells of 0.25, 0.1 and 0.04.
+#: Order of convergence in the size of these cells. Cells of 0.25, 0.1 and 0.04 gave 0.74.
 ORDER = 0.75
-#: Longest cells over the radius; along the axis twice as long.
+#: Longest cells, divided by the radius; twice as long along the axis.
 LARGEST = 0.34
-#: Corners of the polygon in place of the circle.
+#: Number of corners of the polygon in place of the circle.
 CORNERS = 16
 
 
 class Glued(NamedTuple):
-    """Factors of the moduli at rest [1] that a compressed sample shows, and its force before it relaxes [N]."""
+    """Factors [1] from the moduli at rest to the measured moduli of a compressed sample, and its force before
+    relaxation [N]."""
 
     relaxing: float  # R
     standing: float  # S
@@ -43,15 +47,16 @@ class Glued(NamedTuple):
 
 
 def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Glued]:
-    """Factors and force of a sample that glued plates compress by `strain`, and what the meshes may miss of each.
+    """Factors and force of a sample that glued plates compress by `strain`; and an estimate of the mesh error in each
+    of them.
 
-    Two meshes are extrapolated by `ORDER`, which is low because stresses are infinite at the rims. The change by the
-    extrapolation, with its sign, is the second result.
+    The results of two meshes are extrapolated with `ORDER`. This order is low because stresses are infinite at the
+    rims. The second result is the change by the extrapolation, with its sign.
 
     Args:
-        radius: of the plates, and of the sample at rest [m].
+        radius: radius of the plates, and of the sample at rest [m].
         gap: height of the compressed sample [m].
-        law: its law.
+        law: law of the sample.
         strain: part of the height at rest.
 
     Raises:
@@ -60,7 +65,7 @@ def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Gl
     for rim in RIMS:
         mesh, wider = (_quarter(radius, gap / (1 - strain), rim, coarser) for coarser in (1.0, COARSER))
         fine = _on_mesh(mesh, radius, law, strain)
-        # The same neighbours, and so the same compiled program.
+        # The mesh has the same connectivity, so the same compiled program is used.
         coarse = None if fine is None else _on_mesh(with_points(mesh, wider.points), radius, law, strain)
         if fine is not None and coarse is not None:
             change = [(a - b) / (COARSER**ORDER - 1) for a, b in zip(fine, coarse, strict=True)]
@@ -69,7 +74,8 @@ def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Gl
 
 
 def _quarter(radius: float, height: float, rim: float, coarser: float) -> lj.TetMesh:
-    """A quarter of the cylinder; cells at the rims are `coarser` times as long, the number of cells is the same."""
+    """The mesh of a quarter of the cylinder. The cells at the rims are `coarser` times as long, but their number stays
+    the same."""
     cell = rim * min(radius, height / 2)
     inwards = _wider(cylinders.graded(radius, {0.0: cell}, LARGEST * radius), coarser)
     half = _wider(cylinders.graded(height / 2, {0.0: cell}, 2 * LARGEST * radius), coarser)
@@ -78,13 +84,13 @@ def _quarter(radius: float, height: float, rim: float, coarser: float) -> lj.Tet
 
 
 def _wider(places: np.ndarray, factor: float) -> np.ndarray:
-    """Places from 0 to the same end, the first one `factor` times as far away."""
+    """Positions from 0 to the same end, with the first one `factor` times as far from 0."""
     end = places[-1]
     return end * (places / end) ** (1 + np.log(factor) / np.log(places[1] / end))
 
 
 def _on_mesh(mesh: lj.TetMesh, radius: float, law: Law, strain: float) -> Glued | None:
-    """The numbers of one mesh; None if the run failed."""
+    """The result of one mesh; None if the run failed."""
     sets = {name: np.asarray(nodes) for name, nodes in mesh.node_sets.items()}
     bottom, top = sets["bottom"], sets["top"]
     # Between the plates, without the axis: the planes y = 0 and x = 0.
@@ -107,18 +113,18 @@ def _on_mesh(mesh: lj.TetMesh, radius: float, law: Law, strain: float) -> Glued 
     if np.any(np.asarray(pressed.status) != 0):
         return None
     x, force = pressed.positions[-1], 4 * np.asarray(pressed.reactions[-1])[top]
-    # A turn moves the planes along their normals.
+    # When the sample is twisted, the planes move along their normals.
     turned = scene(("xz", "yz", "xyz"), 0.0, lj.Solve(kind="harmonic", volumetric="element"))
     turn = jnp.zeros(x.shape, complex).at[top, :2].set(jnp.stack([-x[top, 1], x[top, 0]], axis=1))
     size = 2 * height * (1 - strain) / (np.pi * radius**4) / float(np.asarray(law.shear_modulus()))
 
     def seen(stands: float) -> float:
-        """R + S stands: the modulus shown before anything has relaxed (m = 1), over G0; NaN without a solution."""
+        """R + S stands: the measured modulus before relaxation (m = 1), divided by G0; NaN if there is no solution."""
         prony = lj.Prony(ratios=jnp.array([1 - stands]), relaxation_times=jnp.array([1.0]))
         moved = lj.harmonic(replace(turned, viscosity=prony), [1.0], jnp.ones(1, complex), x, turn)
         on_plate, at = 4 * np.asarray(moved.reactions[0].real)[top], np.asarray(x)[top]
         torque = np.sum(at[:, 0] * on_plate[:, 1] - at[:, 1] * on_plate[:, 0])
-        # The plate turns, and the force that it has carried since the compression does not.
+        # The plate turns, but the force on it from the compression keeps its direction.
         return size * float(torque - stands * np.sum(at[:, :2] * force[:, :2]))
 
     much, little = seen(0.8), seen(0.2)

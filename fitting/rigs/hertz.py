@@ -11,7 +11,7 @@ SHAPES = ("sphere", "cone", "punch")
 
 
 class Indenter(NamedTuple):
-    """An indenter on a layer, or on a half-space, which is a layer of infinite thickness."""
+    """An indenter on a layer. A half-space is a layer of infinite thickness."""
 
     shape: str  # one of `SHAPES`
     thickness: float  # [m]
@@ -21,7 +21,7 @@ class Indenter(NamedTuple):
 
 
 def half_space(rig: Indenter, depth: np.ndarray) -> np.ndarray:
-    """Force [N] per unit Young's modulus [Pa] at depths [m], 0 before contact; by Hertz and by Sneddon."""
+    """Force [N] for a Young's modulus of 1 Pa at depths [m] (formulas of Hertz and Sneddon). It is 0 before contact."""
     depth, plane = np.maximum(depth, 0.0), 1 / (1 - rig.poisson**2)
     if rig.shape == "sphere":
         return 4 / 3 * plane * np.sqrt(rig.radius) * depth**1.5

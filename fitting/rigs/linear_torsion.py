@@ -1,4 +1,4 @@
-"""The torsion rig at small strain: its stiffness, the bias of its mesh, and the moduli it shows, without time steps."""
+"""The torsion rig at small strain: its stiffness, the bias of its mesh, and its moduli, computed without time steps."""
 
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from liverjax.tensors.matrices import deformation_gradient, matmul
 
 
 def rest_stiffness(rig: Rig, law: Law) -> jax.Array:
-    """Elastic tangent at rest in the rig's coordinates, dense (n, n) [N/m]."""
+    """Elastic tangent at rest in the coordinates of the rig, a dense matrix (n, n) [N/m]."""
     mesh = rig.mesh
     V = mesh.points.shape[0]
     dofs = (3 * mesh.tetrahedra[:, :, None] + jnp.arange(3)[None, None]).reshape(-1, 12)
@@ -44,14 +44,15 @@ def rest_stiffness(rig: Rig, law: Law) -> jax.Array:
 
 
 class Response(NamedTuple):
-    """The linear response of the rig: coordinates per unit arc length (real or complex), and force per arc length."""
+    """The linear response of the rig: its coordinates for unit arc length (real or complex), and the force per arc
+    length."""
 
     shape: jax.Array  # (n,), its last entry 1
     stiffness: jax.Array  # [N/m]
 
 
 def _response(column: jax.Array) -> Response:
-    """The response, from the coordinates (n,) that a unit force on the last of them causes."""
+    """The response, from the coordinates (n,) that a unit force on the last coordinate causes."""
     return Response(column / column[-1], 1 / column[-1])
 
 
@@ -62,16 +63,17 @@ def exact_stiffness(rig: Rig, law: Law) -> Number:
 
 @jax.jit
 def geometry_factor(rig: Rig, law: Law) -> jax.Array:
-    """Elastic torsional stiffness of the mesh over pi r^4 G / (2 h): the effect of polygon and stiff elements.
+    """Elastic torsional stiffness of the mesh, divided by pi r^4 G / (2 h). It differs from 1 because of the polygonal
+    section and the stiff elements.
 
-    Moduli divided by it are free of that bias in the linear range.
+    Moduli divided by this factor have no such bias in the linear range.
     """
     inverse = jnp.linalg.inv(rest_stiffness(rig, law))
     return _response(inverse[:, -1]).stiffness / exact_stiffness(rig, law)
 
 
 class Vibrations(NamedTuple):
-    """Vibrations of the elastic rig: K v = value M v, with vectors of unit mass. They have no derivative."""
+    """Vibrations of the elastic rig: K v = value M v, with vectors of unit modal mass. They have no derivatives."""
 
     values: jax.Array  # (n,) [1/s^2]
     vectors: jax.Array  # (n, n) [kg^-1/2]
@@ -84,18 +86,18 @@ class Vibrations(NamedTuple):
 class Linearised(NamedTuple):
     """The linearised rig, before a frequency is given."""
 
-    inverse: jax.Array  # of the stiffness (n, n) in a motion too fast to relax
-    relaxing: jax.Array | None  # relaxing part of the stiffness; then its constant part; None: all relaxes
+    inverse: jax.Array  # inverse of the stiffness (n, n) for a motion too fast to relax
+    relaxing: jax.Array | None  # relaxing part of the stiffness, then its constant part; None: everything relaxes
     standing: jax.Array | None
-    held: "Held | None" = None  # the compressed sample; then the part of the stress that stands
+    held: "Held | None" = None  # the compressed sample; then the part of the stress that does not relax
     stands: Number = 1.0
-    mass: jax.Array | None = None  # (n,) [kg] of each coordinate, with inertia; then stiffness and vibrations
+    mass: jax.Array | None = None  # (n,) [kg] for each coordinate, if there is inertia; then stiffness and vibrations
     elastic: jax.Array | None = None  # (n, n) [N/m]
     modes: Vibrations | None = None
 
 
 def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
-    """The stiffness of the rig for all frequencies, and its inverse; with inertia its masses and vibrations too."""
+    """The stiffness of the rig for all frequencies, and its inverse; with inertia, also its masses and vibrations."""
     rest = _without_inertia(rig, law, prony)
     if rig.density is None:
         return rest
@@ -110,7 +112,8 @@ def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
 
 
 def rest_masses(rig: Rig) -> jax.Array:
-    """Lumped masses (n,) [kg] of the rig's coordinates: nodes, then lift and turn of the plate."""
+    """Lumped masses (n,) [kg] of the coordinates of the rig: of the nodes, then of lift (if it is free) and turn of the
+    plate."""
     assert rig.density is not None
     mass = rig.density * nodal_volumes(rig.mesh)
     plate, X = mass[-rig.top :], rig.mesh.points[-rig.top :]
@@ -131,9 +134,11 @@ def _without_inertia(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
 
 
 def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
-    """Stiffness (n, n) [N/m] of a compressed sample in two parts: of changing stress, and of the constant stress.
+    """Stiffness (n, n) [N/m] of a compressed sample in two parts: the part from changes of the stress, and the part
+    from the constant stress.
 
-    A motion only rotates a stress S that has been constant for long. The second part is computed with the unrelaxed S.
+    A stress S that has been constant for a long time is only rotated by a motion. The second part is computed with the
+    unrelaxed S.
     """
     mesh = rig.mesh
     rest = jnp.zeros(number_of_coordinates(rig), mesh.points.dtype)
@@ -156,7 +161,7 @@ def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
 
 
 def steady_response(rest: Linearised, modulus: Number) -> Response:
-    """Response in a steady cycle in which the relaxing stress is `modulus` (complex) times the elastic stress."""
+    """Response in a steady cycle, if the relaxing stress is `modulus` (complex) times the elastic stress."""
     if rest.relaxing is None or rest.standing is None:
         elastic = _response(rest.inverse[:, -1])
         return Response(elastic.shape, elastic.stiffness * modulus)
@@ -165,19 +170,20 @@ def steady_response(rest: Linearised, modulus: Number) -> Response:
 
 
 def torque_for_strain(rig: Rig, modulus: Number, strain: Number) -> Number:
-    """Torque amplitude [N m] that gives about `strain` at the rim of a sample of dynamic modulus |G*| [Pa]."""
+    """Torque amplitude [N m] that gives about `strain` at the rim of a sample with the dynamic modulus |G*| = `modulus`
+    [Pa]."""
     return jnp.pi * rig.radius**3 / 2 * modulus * strain
 
 
 def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """The limit of `moduli` as the strain goes to zero: complex moduli [Pa] (n,) of the recursion itself.
+    """The limit of `torsion.moduli` for small strain: the complex moduli (n,) [Pa] that the recursion in time gives.
 
-    In this limit the rig is linear, and its bias is divided out. So the moduli depend neither on the mesh nor on the
-    plates. Their derivatives by the parameters are those of `moduli`, up to an error of the order of the strain, so the
-    simulation need not be differentiated. Inertia is not included.
+    In this limit, the rig is linear and its bias is divided out. So the moduli depend neither on the mesh nor on the
+    plates. Their derivatives by the parameters equal the derivatives of `torsion.moduli`, up to an error of the order
+    of the strain. So the simulation need not be differentiated. Inertia is not included.
 
     Args:
-        law: the law, scaled to G0, its modulus at rest.
+        law: the law, scaled to G0 (its shear modulus at rest).
         prony: its relaxation.
         omega: angular frequencies (n,) [rad/s].
         steps: time steps per cycle; None: continuous time.
@@ -189,14 +195,15 @@ def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -
 class Held(NamedTuple):
     """A compressed sample of a law, before its relaxation is given."""
 
-    relaxing: jax.Array  # (n, n) [N/m]: `about_held`
+    relaxing: jax.Array  # (n, n) [N/m], see `about_held`
     standing: jax.Array
-    bias: jax.Array  # of its mesh at rest: `geometry_factor`
-    factors: jax.Array  # R and S (2,) [1] of its mesh, as in `glued_compression`
+    bias: jax.Array  # bias of its mesh at rest, see `geometry_factor`
+    factors: jax.Array  # R and S (2,) [1] of its mesh, see `glued_compression`
     meshless: jax.Array | None  # R and S (2,) without a mesh, if they are known
 
     def bias_at(self, modulus: Number, stands: Number) -> jax.Array:
-        """Bias of the mesh, of a sample whose stress relaxes by `modulus` (complex), down to `stands`."""
+        """Bias of the mesh, for a sample whose stress relaxes by the factor `modulus` (complex), and finally to the
+        part `stands`."""
         if self.meshless is None:
             return self.bias + 0j
         own, true = (R * modulus + S * stands for R, S in (self.factors, self.meshless))
@@ -204,7 +211,7 @@ class Held(NamedTuple):
 
 
 def held(rig: Rig, law: Law) -> Held:
-    """Input of `held_moduli` from a rig of `compression.compressed`."""
+    """The input of `held_moduli` for a rig from `compression.compressed`."""
     relaxing, standing = about_held(rig, law)
     whole, part = (1 / jnp.linalg.inv(relaxing + s * standing)[-1, -1] for s in (1.0, 0.5))
     factors = jnp.stack([2 * part - whole, 2 * (whole - part)]) / exact_stiffness(rig, law)
@@ -213,7 +220,7 @@ def held(rig: Rig, law: Law) -> Held:
 
 
 def moving_response(rest: Linearised, modulus: Number, square: Number) -> Response:
-    """`steady_response` with inertia: accelerations are -`square` [1/s^2] times displacements."""
+    """The result of `steady_response` with inertia. Accelerations are -`square` [1/s^2] times displacements."""
     assert rest.mass is not None and rest.elastic is not None and rest.modes is not None
     mass, modes, elastic = rest.mass, rest.modes, rest.elastic
     unit = jnp.zeros(len(mass), complex).at[-1].set(1.0)
@@ -232,7 +239,7 @@ def moving_response(rest: Linearised, modulus: Number, square: Number) -> Respon
 
 
 def held_moduli(of: Held, rig: Rig, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """`linear_moduli` of the compressed sample `of`: complex moduli [Pa] (n,) of its mesh.
+    """The result of `linear_moduli` for the compressed sample `of`: complex moduli (n,) [Pa], from its mesh.
 
     Args:
         of, rig: the sample.

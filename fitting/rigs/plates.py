@@ -1,6 +1,6 @@
-"""The sample between the plates of a rheometer: its mesh, and the coordinates of its motion between them.
+"""The sample between the plates of a rheometer: its mesh, and the coordinates of its motion.
 
-Coordinates are the displacements u of the free nodes, the lift of the top plate, and arc = radius * angle.
+The coordinates are the displacements u of the free nodes, the lift of the top plate, and arc = radius * angle.
 """
 
 import math
@@ -14,13 +14,15 @@ from liverjax.core.struct import Number, param, static, struct
 from liverjax.mesh import shapes
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: Chapter, section 5.3; its section 5.2 prints 41 mm for 4 mm +- 1 mm (at 41 mm inertia resonates inside the band).
+#: From the chapter, section 5.3. Section 5.2 prints 41 mm in place of 4 mm +- 1 mm (at 41 mm, the sample would be in
+#: resonance within the band).
 RADIUS, HEIGHT = 0.010, 0.004
 
 
 @struct
 class Rig:
-    """A sample between two plates; nodes are ordered bottom plate, free, top plate."""
+    """A sample between two plates. The nodes of the bottom plate come first, then the free nodes, then the nodes of the
+    top plate."""
 
     mesh: TetMesh = param("m", "the sample")
     radius: Number = param("m", "plate radius")
@@ -38,15 +40,17 @@ class Rig:
 
 
 def cell_size_for(radius: float, height: float) -> float:
-    """Default cell [m]: 100 to 400 nodes for any shape; `geometry_factor` removes their linear error."""
+    """Default cell size [m]. It gives 100 to 400 nodes for any shape. `geometry_factor` removes the error of such a
+    mesh at small strain."""
     return max((math.pi * radius**2 * height / 100) ** (1 / 3), radius / 6, height / 12)
 
 
 def linear_cell_for(radius: float, height: float) -> float:
-    """Cell [m] of about 100 nodes: enough for small strain without inertia, where `bias` is all of the mesh's error.
+    """Cell size [m] for about 100 nodes. This is enough for small strain without inertia: then `bias` is the whole
+    error of the mesh.
 
-    The rest of the error is of the order of the strain: at 1e-3 the moduli differ by 1e-5 from those of `cell_size_for`
-    (experiments/benchmarks/torsion_speed.py).
+    The remaining error is of the order of the strain. At a strain of 1e-3, the moduli differ by 1e-5 from the moduli
+    with `cell_size_for` (experiments/benchmarks/torsion_speed.py).
     """
     return max((math.pi * radius**2 * height / 30) ** (1 / 3), radius / 4, height / 8)
 
@@ -61,13 +65,13 @@ def make_rig(
     """A rig with a generated cylinder.
 
     Args:
-        radius, height: of the sample [m].
+        radius, height: size of the sample [m].
         cell_size: edge length of the mesh [m]; default `cell_size_for`.
-        free_height: let the top plate rise (Poynting effect) instead of holding the gap.
-        density: [kg/m^3]; `None` leaves inertia out.
+        free_height: the top plate may rise (Poynting effect); otherwise the gap is held.
+        density: density [kg/m^3]; None: without inertia.
 
     Raises:
-        InputError: lengths that are not positive.
+        InputError: a length is not positive.
     """
     for name, value in (("radius", radius), ("height", height)):
         if not (math.isfinite(value) and value > 0):
@@ -79,7 +83,7 @@ def make_rig(
 def rig_from_mesh(
     mesh: TetMesh, radius: float, height: float, free_height: bool = False, density: float | None = None
 ) -> Rig:
-    """A rig around any mesh whose axis is z and whose plates are its lowest and highest planes."""
+    """A rig with any mesh. The axis of the mesh must be z, and its lowest and highest planes are the plates."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     z = points[:, 2]
     near = 1e-9 * (z.max() - z.min())
@@ -98,7 +102,7 @@ def rig_from_mesh(
 
 
 def sample_positions(rig: Rig, u: jax.Array, lift: Number, angle: Number) -> jax.Array:
-    """Positions (V, 3) [m] at displacements u of the free nodes, a lift and an angle of the top plate."""
+    """Positions (V, 3) [m] for displacements u of the free nodes, and lift and angle of the top plate."""
     X = rig.mesh.points if rig.held is None else rig.held
     n = X.shape[0] - rig.top
     c, s = jnp.cos(angle), jnp.sin(angle)
@@ -108,7 +112,7 @@ def sample_positions(rig: Rig, u: jax.Array, lift: Number, angle: Number) -> jax
 
 
 def work_conjugates(rig: Rig, x: jax.Array, f: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Work conjugates of (u, lift, arc): nodal forces, axial force, torque / radius [N]."""
+    """Forces [N] that are work-conjugate to (u, lift, arc): nodal forces, axial force, torque / radius."""
     n = x.shape[0] - rig.top
     top, force = x[n:], f[n:]
     torque = jnp.sum(top[:, 0] * force[:, 1] - top[:, 1] * force[:, 0])
@@ -116,23 +120,23 @@ def work_conjugates(rig: Rig, x: jax.Array, f: jax.Array) -> tuple[jax.Array, ja
 
 
 def coordinates(rig: Rig, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(u, lift, angle) from the full vector of coordinates, angle last."""
+    """(u, lift, angle) from the full vector of coordinates."""
     if rig.free_height:
         return q[:-2], q[-2], q[-1] / rig.radius
     return q[:-1], jnp.zeros((), q.dtype), q[-1] / rig.radius
 
 
 def packed(rig: Rig, u: jax.Array, axial: jax.Array, arc: jax.Array) -> jax.Array:
-    """The full vector of coordinates, or of the forces along them."""
+    """The full vector of coordinates, or of the forces along the coordinates."""
     return jnp.concatenate([u, axial[None], arc[None]] if rig.free_height else [u, arc[None]])
 
 
 def rest_height(rig: Rig) -> jax.Array:
-    """Height of the sample before it is compressed [m]."""
+    """Height of the sample [m] before the compression."""
     z = rig.mesh.points[:, 2]
     return jnp.max(z) - jnp.min(z)
 
 
 def number_of_coordinates(rig: Rig) -> int:
-    """Number of coordinates."""
+    """Number of coordinates of the rig."""
     return 3 * (rig.mesh.number_of_nodes - rig.top - rig.bottom) + 1 + rig.free_height

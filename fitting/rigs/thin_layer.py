@@ -1,8 +1,9 @@
 """A rigid indenter on an elastic layer that is bonded to a rigid base: small strains, no friction, no adhesion.
 
-A layer of any thickness under a punch, a sphere or a cone has an exact solution. Its surface moves K(xi h) times as
-much as that of a half-space, for every wave number xi. This makes one integral equation on the contact circle, which is
-solved at Gauss points. The force is linear in the modulus, so one table of force over depth is enough for a whole fit.
+There is an exact solution for a layer of any thickness under a punch, a sphere or a cone. For every wave number xi, the
+surface of the layer moves K(xi h) times as much as the surface of a half-space. This gives one integral equation on the
+contact circle, which is solved at Gauss points. The force is linear in the modulus, so one table of force over depth is
+enough for a whole fit.
 
 Sources: Lebedev and Ufliand 1958, J. Appl. Math. Mech. 22:442; Hayes et al. 1972, J. Biomech. 5:541 (the layer);
 Dimitriadis et al. 2002, Biophys. J. 82:2798 (the series).
@@ -16,9 +17,9 @@ import scipy.interpolate
 from fitting.rigs.hertz import SHAPES, Indenter, half_space
 from liverjax.core.errors import InputError
 
-#: Largest contact radius / thickness in a table.
+#: Maximum of contact radius / thickness in a table.
 WIDEST = 8.0
-#: Beyond this, 1 - K(eta), which falls as eta^2 exp(-2 eta), is below 1e-13.
+#: Above this eta, 1 - K(eta) is below 1e-13 (it falls as eta^2 exp(-2 eta)).
 _LAST_WAVE = 20.0
 _WAVES, _POINTS, _ROWS = 160, 48, 48
 
@@ -26,14 +27,15 @@ _WAVES, _POINTS, _ROWS = 160, 48, 48
 class Factors(NamedTuple):
     """Table of the force on a layer divided by the force on a half-space at the same depth."""
 
-    reach: np.ndarray  # (n,) ascending from 0: size of the half-space's contact over the thickness, see `reach`
+    reach: np.ndarray  # (n,) ascending from 0: size of a half-space's contact / thickness, see `reach`
     factor: np.ndarray  # (n,) force / force on the half-space
 
 
 def stiffening(eta: np.ndarray, poisson: float) -> np.ndarray:
-    """1 - K(eta), with K the surface motion of a bonded layer over that of a half-space at wave number eta/h."""
+    """1 - K(eta). K is the surface motion of a bonded layer, divided by the surface motion of a half-space, at the wave
+    number eta/h."""
     c = 3 - 4 * poisson
-    # Divided by exp(2 eta), so that no hyperbolic function overflows.
+    # All terms are divided by exp(2 eta), so that no hyperbolic function overflows.
     e = np.exp(-2 * eta)
     above = c * (1 - e**2) - 4 * eta * e
     below = c * (1 + e**2) + (4 * eta**2 + 1 + c**2) * e
@@ -41,7 +43,8 @@ def stiffening(eta: np.ndarray, poisson: float) -> np.ndarray:
 
 
 def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
-    """Depth and force at contact radius over thickness `width`, over those of the half-space at the same radius."""
+    """Depth and force at the contact radius `width` times the thickness, divided by depth and force of a half-space at
+    the same contact radius."""
     tau, w = np.polynomial.legendre.leggauss(_POINTS)
     tau, w = np.append((tau + 1) / 2, 1.0), np.append(w / 2, 0.0)  # the edge of the contact has no weight
     eta, v = np.polynomial.legendre.leggauss(_WAVES)
@@ -52,13 +55,13 @@ def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
     level, dented = np.linalg.solve(np.eye(len(tau)) - kernel * w, np.stack([np.ones_like(tau), profile], axis=1)).T
     if shape == "punch":
         return 1.0, float(w @ level)
-    depth = dented[-1] / level[-1]  # the pressure ends without a jump
+    depth = dented[-1] / level[-1]  # at this depth, the pressure at the edge is 0
     alone = w @ (profile[-1] - profile)
     return float(depth / profile[-1]), float(w @ (depth * level - dented) / alone)
 
 
 def factors(poisson: float, shape: str) -> Factors:
-    """The table of a sphere or cone, by contact radius over thickness from 0 to 8.
+    """The table for a sphere or a cone, for contact radius / thickness from 0 to 8.
 
     Args:
         poisson: 0 to 0.5.
@@ -72,12 +75,13 @@ def factors(poisson: float, shape: str) -> Factors:
 
 
 def punch_factor(radius: float, thickness: float, poisson: float) -> float:
-    """The factor that Hayes tabulates: force of a flat punch on a layer over that on a half-space."""
+    """The factor that Hayes tabulates: the force of a flat punch on a layer, divided by its force on a half-space."""
     return _contact(radius / thickness, poisson, "punch")[1]
 
 
 def reach(rig: Indenter, depth: np.ndarray) -> np.ndarray:
-    """Size of the half-space's contact over the thickness: sqrt(R d)/h of a sphere, d tan(angle)/h of a cone."""
+    """Size of the contact on a half-space, divided by the thickness: sqrt(R d)/h for a sphere, d tan(angle)/h for a
+    cone."""
     depth = np.maximum(depth, 0.0)
     if rig.shape == "sphere":
         return np.sqrt(rig.radius * depth) / rig.thickness
@@ -88,7 +92,8 @@ def check_indenter(rig: Indenter) -> None:
     """Refuse an indenter that cannot be computed.
 
     Raises:
-        InputError: an unknown shape, a length that is not above 0, a Poisson's ratio or an angle out of bounds.
+        InputError: the shape is not known, a length is not above 0, Poisson's ratio or the angle is out of range, or a
+            punch is too wide.
     """
     if rig.shape not in SHAPES:
         raise InputError(f"shape = {rig.shape!r} is not known: use {', '.join(SHAPES)}")
@@ -107,10 +112,10 @@ def check_indenter(rig: Indenter) -> None:
 
 
 class Layer:
-    """Force of an indenter on its layer; the table is made once.
+    """Force of an indenter on its layer. The table is computed once.
 
     Raises:
-        InputError: a rig that cannot be used, or depths beyond `deepest`.
+        InputError: the rig cannot be used, or a depth is beyond `deepest`.
     """
 
     def __init__(self, rig: Indenter) -> None:
@@ -126,19 +131,19 @@ class Layer:
         self.deepest = float((table.reach[-1] / unit) ** (2 if rig.shape == "sphere" else 1))
 
     def force(self, depth: np.ndarray) -> np.ndarray:
-        """Force [N] per unit Young's modulus [Pa] at depths [m] up to `deepest`, 0 before contact."""
+        """Force [N] for a Young's modulus of 1 Pa, at depths [m] up to `deepest`. It is 0 before contact."""
         largest = float(np.max(depth, initial=0.0))
         if not largest <= self.deepest:
             raise InputError(
-                f"depth = {largest:.4g} m is not within the {self.deepest:.4g} m that the layer's table covers: leave "
-                "deeper points out"
+                f"depth = {largest:.4g} m is not within the {self.deepest:.4g} m that the table of the layer covers: "
+                "leave deeper points out"
             )
         alone = half_space(self.rig, depth)
         return alone * (self._punch if self.rig.shape == "punch" else self._factor(reach(self.rig, depth)))
 
 
 def series(chi: np.ndarray, poisson: float) -> np.ndarray:
-    """The factor of a sphere to third order in chi = sqrt(R d)/h, from the same integral equation; for small chi."""
+    """The factor of a sphere for small chi = sqrt(R d)/h, to third order in chi, from the same integral equation."""
     eta, v = np.polynomial.legendre.leggauss(_WAVES)
     eta, v = _LAST_WAVE * (eta + 1) / 2, _LAST_WAVE * v / 2
     missing = v * stiffening(eta, poisson)
@@ -147,5 +152,6 @@ def series(chi: np.ndarray, poisson: float) -> np.ndarray:
 
 
 def dimitriadis(chi: np.ndarray) -> np.ndarray:
-    """The factor of a sphere on an incompressible layer as Dimitriadis et al. print it (equation 12); for small chi."""
+    """The factor of a sphere on an incompressible layer for small chi, as printed by Dimitriadis et al. (equation
+    12)."""
     return 1 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4

@@ -1,10 +1,11 @@
 """The rheometer as a differentiable simulation (chapter, sections 5.2 and 5.3).
 
 The sample is a cylinder of tetrahedra. Its bottom is fixed, and its top turns rigidly about the axis by one angle. A
-sinusoidal torque (the stress-controlled AR2000) or angle drives it; every time step is solved by Newton's method and
-differentiated implicitly; the moduli come from demodulating the last cycle.
+sinusoidal torque (the stress-controlled AR2000) or a sinusoidal angle drives the top. Every time step is solved by
+Newton's method and differentiated implicitly. The moduli come from demodulation of the last cycle.
 
-The run starts on the steady cycle of the linearised discrete problem, so in the linear range there is no transient.
+By default, the run starts on the steady cycle of the linearised discrete problem. So there is no transient in the
+linear range.
 """
 
 import math
@@ -16,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.rigs.linear_torsion import (  # noqa: F401  names that users find here
+from fitting.rigs.linear_torsion import (  # noqa: F401  names that users import from here
     Held,
     Linearised,
     Response,
@@ -31,7 +32,7 @@ from fitting.rigs.linear_torsion import (  # noqa: F401  names that users find h
     steady_response,
     torque_for_strain,
 )
-from fitting.rigs.plates import (  # noqa: F401  names that users find here
+from fitting.rigs.plates import (  # noqa: F401  names that users import from here
     HEIGHT,
     RADIUS,
     Rig,
@@ -64,7 +65,8 @@ from liverjax.tensors.matrices import deformation_gradient
 class Drive(NamedTuple):
     """Drive of the rig and number of steps; static in compiled programs.
 
-    `steps` per cycle, `cycles` in a run (the last is demodulated), `by` "torque" or "angle", `start` "cycle" or "rest".
+    `steps`: time steps per cycle. `cycles`: cycles of a run; the last one is demodulated. `by`: "torque" or "angle".
+    `start`: "cycle" or "rest".
     """
 
     steps: int = 50
@@ -75,7 +77,7 @@ class Drive(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One oscillation: samples at times 0, dt, … (n + 1,), and Newton's statistics of each of the n steps."""
+    """One oscillation: values at the times 0, dt, … (n + 1,), and Newton's statistics for each of the n steps."""
 
     time: jax.Array  # [s]
     angle: jax.Array  # [rad]
@@ -90,18 +92,19 @@ class Moduli(NamedTuple):
     storage: jax.Array  # G' [Pa]
     loss: jax.Array  # G'' [Pa]
     strain: jax.Array  # amplitude at the rim, radius * angle / height
-    defect: jax.Array  # |angle at the end - one period earlier| / amplitude: the rest of the transient
-    bias: jax.Array  # of the mesh, complex; `geometry_factor` if the whole stress relaxes
-    statistics: newton.NewtonStatistics  # worst over the steps
+    defect: jax.Array  # |angle at the end - angle one period earlier| / amplitude: the remaining transient
+    bias: jax.Array  # bias of the mesh, complex; `geometry_factor` if the whole stress relaxes
+    statistics: newton.NewtonStatistics  # largest over the steps
 
 
 def scene_of(
     rig: Rig, law: Law, prony: Prony | None, omega: Number, amplitude: Number, drive: Drive = Drive()
 ) -> Scene:
-    """The oscillation as a scene with a rigid plate, for `lj.simulate`, from rest. Arguments as in `oscillate`.
+    """The oscillation from rest, as a scene with a rigid plate for `lj.simulate`. The arguments are the same as for
+    `oscillate`.
 
-    `oscillate` with `start="rest"` gives the same result in a fraction of the time: it uses the inverse of the small
-    body's stiffness.
+    `oscillate` with `start="rest"` gives the same result in a fraction of the time: it uses the inverse of the
+    stiffness, because the body is small.
     """
     steps, n = drive.steps * drive.cycles, rig.mesh.number_of_nodes
     dt = 2 * jnp.pi / (omega * drive.steps)
@@ -137,7 +140,7 @@ class _Oscillation(NamedTuple):
 
     @property
     def by_torque(self) -> bool:
-        """Whether the torque is given and the angle unknown."""
+        """Whether the torque is given and the angle is unknown."""
         return self.drive.by == "torque"
 
     @property
@@ -147,32 +150,32 @@ class _Oscillation(NamedTuple):
 
     @property
     def rate(self) -> Number:
-        """Velocity over displacement [rad/s] in a steady cycle of Newmark's average accelerations."""
+        """Ratio of velocity to displacement [rad/s] in a steady cycle of Newmark's average acceleration method."""
         return 2 / self.dt * jnp.tan(self.omega * self.dt / 2)
 
     def positions(self, q: jax.Array) -> jax.Array:
-        """Positions (V, 3) [m] of all coordinates."""
+        """Positions (V, 3) [m] for all coordinates q."""
         return sample_positions(self.rig, *coordinates(self.rig, q))
 
     def full(self, q: jax.Array, t: Number) -> jax.Array:
-        """All coordinates at time t, from the unknown ones."""
+        """All coordinates at time t, from the unknown coordinates q."""
         if self.by_torque:
             return q
         return jnp.append(q, self.rig.radius * self.amplitude * jnp.sin(self.omega * t))
 
     def solved_part(self, q: jax.Array) -> jax.Array:
-        """The unknown coordinates among all."""
+        """The unknown coordinates, from all coordinates."""
         return q if self.by_torque else q[:-1]
 
 
 class _Cycle(NamedTuple):
-    """The steady cycle of the linearised discrete problem, and the inverse stiffness for its solution."""
+    """The steady cycle of the linearised discrete problem, and the preconditioner for the solution of a step."""
 
     steady: Response
     arc: Number | complex  # amplitude of the last coordinate [m]
-    precondition: Callable[[jax.Array], jax.Array]  # nearly the inverse of the tangent of the unknowns
+    precondition: Callable[[jax.Array], jax.Array]  # approximate inverse of the tangent by the unknowns
     twist: Number = (
-        0.0  # force [N] that turns a compressed mesh, never quite symmetric, without a load: it is subtracted
+        0.0  # force [N] that turns a compressed mesh, which is not quite symmetric, without a load: it is subtracted
     )
 
     def at(self, omega: Number, t: Number) -> jax.Array:
@@ -181,12 +184,12 @@ class _Cycle(NamedTuple):
 
 
 def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
-    """The run, and the bias of the mesh at this frequency (complex if only the isochoric part relaxes)."""
+    """The run, and the bias of the mesh at this frequency. The bias is complex if only the isochoric part relaxes."""
     rig, drive = o.rig, o.drive
     modulus = 1.0 if o.prony is None else 1 - jnp.sum(viscosity.complex_ratios(o.prony, o.omega, o.dt), axis=0)
     still = steady_response(rest, modulus)
     steady = still if rig.density is None else moving_response(rest, modulus, o.rate**2)
-    # A sin(w t) = Re(-i A e^(i w t)); the complex arc of the linearised discrete problem.
+    # A sin(w t) = Re(-i A e^(i w t)). This is the complex arc of the linearised discrete problem.
     arc = -1j * o.amplitude * (1 / (steady.stiffness * rig.radius) if o.by_torque else rig.radius)
     twist = 0.0 if rig.held is None else jax.lax.stop_gradient(_twist(o))
     cycle = _Cycle(steady, arc, _preconditioner(o, rest), twist)
@@ -210,7 +213,8 @@ def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
 
 
 def _preconditioner(o: _Oscillation, rest: Linearised) -> Callable[[jax.Array], jax.Array]:
-    """Nearly the inverse of a step's tangent: of the elastic stiffness, and of Newmark's masses if there is inertia."""
+    """An approximate inverse of the tangent of a step: the inverse of the elastic stiffness, plus Newmark's masses if
+    there is inertia."""
     if rest.modes is None:
         inverse = jax.lax.stop_gradient(rest.inverse if o.by_torque else _without_last(rest.inverse))
         return lambda r: inverse @ r
@@ -227,19 +231,20 @@ def _preconditioner(o: _Oscillation, rest: Linearised) -> Callable[[jax.Array], 
 
 
 def _twist(o: _Oscillation) -> jax.Array:
-    """Torque of the compressed sample without a load, divided by the radius [N], after relaxation."""
+    """Torque of the compressed sample without a load after relaxation, divided by the radius [N]."""
     standing = 1.0 if o.prony is None else 1 - jnp.sum(jnp.asarray(o.prony.ratios))
     x = o.positions(jnp.zeros(number_of_coordinates(o.rig), o.rig.mesh.points.dtype))
     return standing * work_conjugates(o.rig, x, mjed.internal_force(o.rig.mesh, o.law, x))[2]
 
 
 def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tuple[tuple, tuple]:
-    """One time step: coordinates and memories, then angle, torque, lift and Newton's statistics."""
+    """One time step. Returns coordinates and memories; and angle, torque, lift and Newton's statistics."""
     (q_old, memories), rig, mesh = carry, o.rig, o.rig.mesh
     mask = jnp.ones_like(mesh.points)
     if not o.by_torque and o.drive.start == "rest":
-        # The speed of the top plate jumps at the start: its average acceleration would oscillate and grow. What is left
-        # is of first order in the time step. On the cycle nothing jumps, and the average is of second order.
+        # The speed of the top plate jumps at the start, so its average acceleration would oscillate and grow. It is
+        # left out here. The remaining error is of first order in the time step. If the run starts on the cycle, nothing
+        # jumps, and the error is of second order.
         mask = mask.at[len(mask) - rig.top :, :2].set(0.0)
     physics, free = _sample_physics(rig, o.law, o.prony), Free(mask)
     steps, tolerance = o.drive.steps * o.drive.cycles, o.drive.options.tolerance
@@ -255,7 +260,7 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
     load = jnp.zeros_like(q_old)
     if o.by_torque:
         load = load.at[-1].set(o.amplitude * jnp.sin(o.omega * t) / rig.radius)
-    # The linear solution at this time, plus the deviation of the last step from it.
+    # The linear solution at this time, plus the deviation of the last step from the linear solution.
     guess = cycle.at(o.omega, t) + (q_old - cycle.at(o.omega, t - o.dt))
     q, statistics = newton.newton_root(
         lambda v: o.solved_part(forces(o.full(v, t)) - load),
@@ -286,7 +291,8 @@ def _sample_physics(rig: Rig, law: Law, prony: Prony | None) -> tuple[Physics, .
 
 
 def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[jax.Array, tuple]:
-    """Coordinates at time 0, and the memories of the physics: at rest, or on the cycle of the linearised problem."""
+    """Coordinates at time 0 and the memories of the physics, either at rest or on the cycle of the linearised
+    problem."""
     rig, prony, on_cycle, mesh = o.rig, o.prony, o.drive.start == "cycle", o.rig.mesh
     q = jnp.real(shape * arc) if on_cycle else jnp.zeros(shape.shape, mesh.points.dtype)
     history = None if prony is None else viscosity.initial_history(prony, mesh.volumes.shape[0], q.dtype)
@@ -294,13 +300,13 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[
     def S(q):
         return viscosity.relaxing_stress(prony, o.law, deformation_gradient(mesh, o.positions(q)))
 
-    if prony is not None and rig.held is not None:  # it was held until its stress had relaxed
+    if prony is not None and rig.held is not None:  # the sample was held until its stress had relaxed
         stands = S(jnp.zeros_like(q))
         history = viscosity.relaxed_history(prony, stands)
     if prony is not None and on_cycle:
         _, slope = jax.linearize(S, jnp.zeros_like(q))
         S_shape = slope(jnp.real(shape)) * arc
-        if jnp.iscomplexobj(shape):  # a real shape needs the slope once: it is a fifth of the program
+        if jnp.iscomplexobj(shape):  # a real shape needs only one slope, which is a fifth of the program
             S_shape += slope(jnp.imag(shape)) * 1j * arc
         ratios = viscosity.complex_ratios(prony, o.omega, o.dt)
         gamma = jnp.real(ratios[:, None, None] * S_shape[None])
@@ -315,15 +321,15 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[
 
 @partial(jax.jit, static_argnames="drive")
 def oscillate(rig: Rig, law: Law, prony: Prony | None, omega: Number, amplitude: Number, drive: Drive = Drive()) -> Run:
-    """Drive the rig by amplitude * sin(omega t).
+    """Drive the rig with amplitude * sin(omega t).
 
     Args:
         rig: the rig, from `make_rig`.
-        law: any law: the instantaneous response.
-        prony: its relaxation, or `None`.
+        law: any law; it gives the instantaneous response.
+        prony: relaxation of the law, or None.
         omega: angular frequency [rad/s].
-        amplitude: [N m] if driven by torque, [rad] if by angle.
-        drive: see `Drive`; static.
+        amplitude: amplitude of the torque [N m] or of the angle [rad].
+        drive: see `Drive`; static in compiled programs.
     """
     return _oscillate(_Oscillation(rig, law, prony, omega, amplitude, drive), linearised_rig(rig, law, prony))[0]
 
@@ -338,14 +344,15 @@ def demodulate(run: Run, omega: Number, drive: Drive) -> tuple[jax.Array, jax.Ar
 def moduli(
     rig: Rig, law: Law, prony: Prony | None, omega: jax.Array, amplitude: jax.Array, drive: Drive = Drive()
 ) -> Moduli:
-    """G* = 2 h / (pi r^4) M / theta of many oscillations at once (section 5.3), one compiled program for all.
+    """G* = 2 h / (pi r^4) M / theta for many oscillations at once (section 5.3), with one compiled program.
 
-    The moduli are divided by the bias of the mesh, `geometry_factor` (if only the isochoric part relaxes, each
-    frequency has its own bias, because the bulk has more effect as the modulus falls). With a density the inertial part
-    is divided as well: refine the mesh instead. The moduli times `Moduli.bias` are those of the mesh itself.
+    The moduli are divided by the bias of the mesh, `geometry_factor`. If only the isochoric part relaxes, the bias
+    depends on the frequency, because the bulk modulus has more effect as the shear modulus falls. With a density, the
+    inertial part is divided by the bias too, which is not exact: refine the mesh. The moduli times `Moduli.bias` are
+    the moduli of the mesh without this correction.
 
     Args:
-        omega, amplitude: (n,) or numbers, broadcast; see `oscillate`.
+        omega, amplitude: (n,) or single values, which are broadcast; see `oscillate`.
     """
     rest = linearised_rig(rig, law, prony)
     omega, amplitude = jnp.broadcast_arrays(jnp.asarray(omega, float), jnp.asarray(amplitude, float))
@@ -359,14 +366,16 @@ def moduli(
         return Moduli(jnp.real(G), jnp.imag(G), jnp.abs(angle) * rig.radius / rig.height, defect, bias, worst)
 
     lanes = jnp.atleast_1d(omega), jnp.atleast_1d(amplitude)
-    # On a CPU one lane after another stays in the cache (1.7 times faster for the Jacobian); a GPU runs all at once.
+    # On a CPU, one lane after another stays in the cache (1.7 times faster for the Jacobian). A GPU runs all lanes at
+    # once.
     return jax.lax.map(lambda lane: one(*lane), lanes) if jax.default_backend() == "cpu" else jax.vmap(one)(*lanes)
 
 
 def strain_sweep(
     rig: Rig, law: Law, prony: Prony | None, strains: Numbers, omega: float = 2 * math.pi, drive: Drive | None = None
 ) -> Moduli:
-    """Dynamic strain sweep (section 5.2): moduli at rim strain amplitudes, driven by angle, three cycles each.
+    """Dynamic strain sweep (section 5.2): moduli at strain amplitudes of the rim. By default the angle is driven, for
+    three cycles each.
 
     Args:
         strains: amplitudes at the rim, e.g. 1e-4 … 0.2.
@@ -377,9 +386,10 @@ def strain_sweep(
 
 
 def linearity_limit(strains: Numbers, storage: Numbers, deviation: float = 0.05) -> float:
-    """Strain at which G' has moved by `deviation` from its value at the smallest strain; infinity if it never does.
+    """Strain at which G' differs by `deviation` from its value at the smallest strain; infinity if it never differs so
+    much.
 
-    A modulus that is not finite (a diverged run) counts as moved: the last good strain is returned.
+    If a modulus is not finite (a diverged run) before that, the last good strain is returned.
     """
     strains, change = np.asarray(strains), np.abs(np.asarray(storage) / np.asarray(storage)[0] - 1)
     beyond = np.flatnonzero(~(change <= deviation))

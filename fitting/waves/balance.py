@@ -1,16 +1,16 @@
 """The balance of forces in measured waves, and the modulus that follows from it.
 
 At the inner nodes of a body no force acts from outside, so C(G) u + B p = 0. C has the rows of K(G) - omega^2 M at
-these nodes, where K contains the shear stress alone. B p are the forces of a pressure p (linear in the elements,
-continuous), which is unknown, so that no bulk modulus is needed. The measured motion is d = u + noise, at all nodes.
-If the pressure has a large prior variance g sd^2, the likeliest motion that obeys this is
+these nodes, where K contains the shear stress alone. B p are the forces of a pressure p, which is linear in the
+elements and continuous. The pressure is unknown, so no bulk modulus is needed. The measured motion is d = u + noise, at
+all nodes. If the pressure has a large prior variance g sd^2, the likeliest motion that fulfils this balance is
 
-    u = d - C^H q,   S q = C d,   S = C C^H + g B B^H,   chi^2 = (C d)^H q / sd^2:
+    u = d - C^H q,   S q = C d,   S = C C^H + g B B^H,   chi^2 = (C d)^H q / sd^2.
 
-no condition is set at the body's surface, whose motion is measured with noise like all other motion. By the modulus,
-chi^2 / 2 has the gradient Re(q^H C' u) / sd^2 and the Gauss-Newton Hessian (C' u)^H S^-1 C' u / sd^2 (variable
-projection: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10, 413). Since C' acts on u, not on d, noise does not lower
-the modulus, as it does in the direct inversion of second derivatives.
+No condition is needed at the surface of the body: its motion is measured with noise, like all other motion. As a
+function of the modulus, chi^2 / 2 has the gradient Re(q^H C' u) / sd^2 and the Gauss-Newton Hessian
+(C' u)^H S^-1 C' u / sd^2 (variable projection: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10, 413). Since C' acts on
+u and not on d, noise does not lower the modulus. In the direct inversion of second derivatives, noise lowers it.
 """
 
 from typing import NamedTuple
@@ -28,26 +28,27 @@ from liverjax.waves.harmonic import element_operator
 
 
 class Matrices(NamedTuple):
-    """Parts of the dynamic stiffness of every element with n nodes, and their places."""
+    """Parts of the dynamic stiffness of every element with n nodes, and their positions in the matrices."""
 
-    shear: np.ndarray  # (n, 3, n, 3, E) of a shear modulus of 1 Pa [N/m/Pa]
+    shear: np.ndarray  # (n, 3, n, 3, E) for a shear modulus of 1 Pa [N/m/Pa]
     mass: np.ndarray  # (n, n, E) of one component [kg]
     unknowns: np.ndarray  # (n, 3, E) index of each in 3 V, x, y, z of a node together
     rows: np.ndarray  # (n, 3, E) index among the inner unknowns, -1: none
     pattern: scipy.sparse.csr_array  # of C
-    places: np.ndarray  # places in pattern.data of the elements' entries with an inner row
+    places: np.ndarray  # positions in pattern.data of the elements' entries with an inner row
     entries: np.ndarray  # indices of these entries among all
     pressure: np.ndarray  # g B B^H (bandwidth + 1, I), by diagonals
     balances: int  # real equations that chi^2 sums over
 
 
-#: Ratio of the part of the pressures in S to the part of the shear stress at the modulus `TYPICAL` [Pa]; the error of
-#: a finite ratio is about its inverse. It is the same for every modulus, so that chi^2 of two moduli can be compared.
+#: FREE: ratio of two parts of S, the part of the pressures to the part of the shear stress at the modulus `TYPICAL`
+#: [Pa]. The error that a finite ratio causes is about its inverse. The part of the pressures is the same for every
+#: modulus, so that chi^2 of two moduli can be compared.
 FREE, TYPICAL = 1e4, 3000.0
 
 
 def _columns_of(band: np.ndarray, a: int, b: int) -> np.ndarray:
-    """Columns a to b of a banded lower triangle, from row a to the last that is not zero."""
+    """Columns a to b of a banded lower triangle, from row a to the last row that is not zero."""
     bands, size = len(band), b - a
     out = np.zeros((size, size + bands - 1), band.dtype)  # transposed
     diagonals = np.lib.stride_tricks.as_strided(
@@ -66,7 +67,7 @@ class Balanced(NamedTuple):
     factor: np.ndarray  # (bandwidth + 1, I): L of S = L L^H, by diagonals
 
     def whitened(self, columns: scipy.sparse.csc_array, kind: type = np.complex128) -> np.ndarray:
-        """L^-1 times columns (I, k): the products of two such columns are products with S^-1."""
+        """L^-1 times columns (I, k). The scalar product of two such results is a product of the columns with S^-1."""
         left, (bands, n) = columns.astype(kind).toarray(), self.factor.shape
         for a in range(0, n, bands):
             b = min(a + bands, n)
@@ -108,13 +109,14 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
 
 
 def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_array:
-    """Forces of pressures with prior variance `FREE`, from forces B of 1 Pa and entries of C at modulus `TYPICAL`."""
+    """Forces of pressures, scaled to the prior variance that `FREE` sets. B: forces of pressures of 1 Pa; `shear`:
+    entries of C at the modulus `TYPICAL`."""
     part = np.sum(shear**2) / B.shape[0]  # mean of the diagonal of C C^H
     return np.sqrt(FREE * part / B.power(2).sum(axis=1).mean()) * B
 
 
 def _in_order(body: VoxelBody) -> np.ndarray:
-    """Unknowns of the inner nodes, slice by slice along the longest side, so that coupled nodes are close."""
+    """Unknowns of the inner nodes, slice by slice along the longest side, so that coupled nodes have close indices."""
     nodes = np.flatnonzero(body.inner)
     voxel = body.voxel[nodes]
     longest_last = voxel[:, np.argsort(np.ptp(voxel, axis=0))]
@@ -122,7 +124,8 @@ def _in_order(body: VoxelBody) -> np.ndarray:
 
 
 def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy.sparse.csr_array:
-    """B (I, P): integrals of each corner's linear function times the divergence of each inner node's function."""
+    """B (I, P): integrals of the linear function of each corner times the divergence of the function of each inner
+    node."""
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
     gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3) of the linear functions
     second = (1 + np.eye(4)) / 20  # integrals of their products, over the volume
@@ -140,7 +143,7 @@ def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy
 
 
 def rows_of_balance(m: Matrices, G: np.ndarray, omega: float) -> scipy.sparse.csr_array:
-    """C (I, 3 V) of complex moduli of the elements (E,) [Pa] at an angular frequency [rad/s]."""
+    """C (I, 3 V) for complex moduli G of the elements (E,) [Pa] at an angular frequency [rad/s]."""
     mass = m.mass[:, None, :, None] * np.eye(3)[None, :, None, :, None]
     real = G.real * m.shear - omega**2 * mass
     C = m.pattern.copy()
@@ -172,16 +175,17 @@ def likeliest(
         B: covariance of the forces of pressures, by diagonals.
         d: measured motion (U,) [m]; 0 where it was not measured.
         sd: standard deviation of real and imaginary part of one component [m].
-        spread: variance of each unknown's difference from d (U,), over sd^2; None: 1.
+        spread: variance (U,) of the difference between each unknown and d, divided by sd^2; None: 1.
     """
     CH = C.conj().T.tocsr()
     WCH = CH if spread is None else scipy.sparse.diags_array(spread) @ CH
-    # Hermitian and positive: no pivots are needed, and an order for symmetric matrices keeps the factor small.
+    # S is Hermitian and positive definite: no pivots are needed, and an order for symmetric matrices keeps the factor
+    # small.
     S = by_diagonals((C @ WCH).tocsr())
     if len(S) < len(B):
         S = np.pad(S, ((0, len(B) - len(S)), (0, 0)))
     S[: len(B)] += B
-    # Banded: faster here than sparse factors, which would fill the band too.
+    # A banded factor is faster here than a sparse one, which would fill the band too.
     factor = scipy.linalg.cholesky_banded(S, overwrite_ab=True, lower=True, check_finite=False)
     r = C @ d
     q = scipy.linalg.cho_solve_banded((factor, True), r, check_finite=False)
@@ -199,14 +203,14 @@ def by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:
 
 
 def gigabytes(body: VoxelBody) -> float:
-    """Memory of a factor [GB]."""
+    """Memory [GB] of the factor of S for one frequency."""
     voxel = body.voxel[body.inner]
     sides = np.sort(np.ptp(voxel, axis=0) + 1)
     return 16e-9 * 3 * len(voxel) * 3 * (4 * sides[0] * sides[1] + 4 * sides[0] + 5)
 
 
 def by_modulus(m: Matrices, u: np.ndarray) -> scipy.sparse.csc_array:
-    """C' u: derivative of C u by the modulus of every element, (I, E)."""
+    """C' u: derivatives (I, E) of C u by the modulus of every element."""
     forces = np.einsum("arbse,bse->are", m.shear, u[m.unknowns], optimize=True)
     inside = m.rows >= 0
     element = np.broadcast_to(np.arange(m.rows.shape[-1]), m.rows.shape)

@@ -1,14 +1,14 @@
-"""Noise of neighbouring voxels that is alike: how much larger the errors of moduli are than those of white noise.
+"""Noise that neighbouring voxels share: how much larger it makes the errors of moduli, compared with white noise.
 
-Scanners and filters smooth, so that neighbours share their noise. Then fewer independent numbers are measured, and
-fourth differences see only a part of the noise. The residual motion d - u shows both. It is a projection of the noise,
-so that even white noise leaves residuals whose neighbours are slightly unlike. Draws of white and of smoothed noise,
-projected in the same way, tell which width of a Gaussian filter makes the correlation that is seen, along each axis,
-and which part of the noise is left in the residuals.
+Scanners and filters smooth the data, so neighbours share their noise. Then fewer independent values are measured, and
+the estimate from fourth differences contains only a part of the noise. The residual motion d - u shows both effects. It
+is a projection of the noise: even white noise leaves residuals with a small negative correlation between neighbours. So
+random white noise and smoothed noise are projected in the same way. This tells which width of a Gaussian filter gives
+the observed correlation along each axis, and which part of the noise is left in the residuals.
 
-The error of a modulus is a sum over the voxels, v^H n / H with v = C^H S^-1 C' u (`fitting.waves.balance`). So its
-variance is that of white noise, times sum_l R(l) sum_x conj(v(x)) v(x + l) / sum_x |v(x)|^2, where R is the noise's
-autocorrelation.
+The error of a modulus is a sum over the voxels, v^H n / H, with the noise n and v = C^H S^-1 C' u
+(`fitting.waves.balance`). So the variance for white noise is multiplied by sum_l R(l) sum_x conj(v(x)) v(x + l) / sum_x
+|v(x)|^2, where R is the autocorrelation of the noise.
 """
 
 from typing import NamedTuple
@@ -20,24 +20,25 @@ import scipy.sparse
 
 from fitting.waves.balance import Balanced
 
-#: Widths [voxels] of the filters that are tried, the draws of each for `SMALL` voxels, and how far filters reach.
+#: Widths [voxels] of the filters that are tried; DRAWS: number of random draws for each width if the body has `SMALL`
+#: voxels; REACH: half length of a filter [voxels].
 WIDTHS = (0.0, 0.35, 0.45, 0.55, 0.65, 0.75, 0.9, 1.1, 1.4, 1.8)
 DRAWS, SMALL, REACH = 6, 1500, 6
-#: Correlation of neighbouring residuals, above that of white noise, from which noise counts as correlated; and the
-#: same in its standard deviations by chance.
+#: The noise counts as correlated if the correlation of neighbouring residuals exceeds the correlation for white noise
+#: by more than SEEN, and by more than BY_CHANCE standard deviations.
 SEEN, BY_CHANCE = 0.04, 4.0
 
 
 class Correlation(NamedTuple):
-    """What the residuals of one frequency say of the noise."""
+    """What the residuals of one frequency tell about the noise."""
 
-    beyond: float  # largest correlation of neighbours along an axis, above that of white noise
+    beyond: float  # largest correlation of neighbours along an axis, minus that for white noise
     seen: bool  # whether this is more than chance
-    enlarged: np.ndarray  # (R,) error of each modulus over that of white noise with the given deviation
+    enlarged: np.ndarray  # (R,) error of each modulus over its error for white noise with the given sd
 
 
 class _Projection(NamedTuple):
-    """The matrices of the likeliest motion, and the places of the measured unknowns."""
+    """The matrices of the likeliest motion, and the voxels of the measured unknowns."""
 
     C: scipy.sparse.csr_array
     here: Balanced
@@ -54,7 +55,7 @@ class _Projection(NamedTuple):
         return out
 
     def residual(self, noise: np.ndarray) -> np.ndarray:
-        """What the likeliest motion leaves of noise (nx, ny, nz, 3) that is added to it."""
+        """The residuals that noise (nx, ny, nz, 3) leaves if it is added to the likeliest motion."""
         n = np.zeros(self.C.shape[1], complex)
         n[: self.measured] = noise[tuple(self.voxel.T)].ravel()
         q = scipy.linalg.cho_solve_banded((self.here.factor, True), self.C @ n, check_finite=False)
@@ -64,15 +65,15 @@ class _Projection(NamedTuple):
 def correlation(
     C: scipy.sparse.csr_array, here: Balanced, columns: np.ndarray, d: np.ndarray, sd: float, voxel: np.ndarray
 ) -> Correlation:
-    """The correlation of the noise, from the residuals at the fitted moduli.
+    """The correlation of the noise, estimated from the residuals at the fitted moduli.
 
     Args:
         C: rows of balance (I, U) at these moduli.
         here: the likeliest motion.
         columns: derivatives of C u by the moduli (I, R).
         d: measured motion (3 V,) [m], x, y, z of a node together.
-        sd: deviation of real and imaginary part of one component that was taken [m].
-        voxel: place of each node (V, 3).
+        sd: assumed standard deviation of real and imaginary part of one component [m].
+        voxel: voxel index of each node (V, 3).
     """
     own = _Projection(C, here, voxel - voxel.min(axis=0))
     left = own.grid(d - here.motion[: own.measured])
@@ -104,7 +105,8 @@ def _of_neighbours(values: np.ndarray) -> np.ndarray:
 
 
 def _drawn(own: _Projection, width: float, draws: int) -> tuple[np.ndarray, float]:
-    """Correlation (3,) of neighbouring residuals of noise of this width, and the part of the noise that is left."""
+    """For random noise smoothed with this width: the correlation (3,) of neighbouring residuals, and the part of the
+    noise that is left in them."""
     rng, shape = np.random.default_rng(0), tuple(own.voxel.max(axis=0) + 1 + 2 * REACH)
     inside = (slice(REACH, -REACH),) * 3
     found, parts = [], []
@@ -128,7 +130,8 @@ def _filter(width: float) -> np.ndarray:
 
 
 def _enlargement(own: _Projection, column: np.ndarray, widths: np.ndarray) -> float:
-    """Error of one modulus by noise of these widths (3,), over that by white noise of the same size."""
+    """Error of one modulus for noise smoothed with these widths (3,), divided by its error for white noise of the same
+    size."""
     q = scipy.linalg.cho_solve_banded((own.here.factor, True), column, check_finite=False)
     v = own.grid(own.C.conj().T @ q)
     smooth = v

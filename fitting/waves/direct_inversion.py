@@ -1,13 +1,13 @@
 """The usual direct inversion of waves (algebraic Helmholtz), as a baseline for the balance of forces.
 
-The curl q of the displacement obeys G laplace(q) = - density omega^2 q where G is uniform, since the curl contains no
-pressure. By least squares over the three components and a window of voxels
+Where G is uniform, the curl q of the displacement fulfils G laplace(q) = - density omega^2 q, since the curl contains
+no pressure. Least squares over the three components and a window of voxels give
 
     G = - density omega^2 sum(conj(laplace q) q) / sum(|laplace q|^2)
 
 (Oliphant et al. 2001, Magn. Reson. Med. 45, 299; Papazoglou et al. 2008, Phys. Med. Biol. 53, 3147). The denominator
-has the square of the noise of laplace(q), so noise makes the modulus too small. A window over an edge mixes both sides.
-Both are known faults of the method, and are left in it.
+contains the square of the noise of laplace(q), so noise makes the modulus too small. A window over an edge mixes both
+sides. Both are known faults of the method; they are not corrected here.
 """
 
 import math
@@ -25,13 +25,15 @@ WINDOW = 3
 
 
 def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, window: int = WINDOW) -> np.ndarray:
-    """Complex modulus (F, nx, ny, nz) [Pa]; NaN outside, and where derivatives or smoothing reach the mask's edge.
+    """Complex modulus (F, nx, ny, nz) [Pa]. It is NaN outside of the mask, and where derivatives or smoothing reach the
+    edge of the mask.
 
     Args:
-        field: measured waves; without all three components the result is NaN everywhere.
+        field: measured waves. If not all three components are measured, the result is NaN everywhere.
         density: [kg/m^3].
-        smoothing: [voxels] standard deviation of the Gaussian; 0 along an axis that is too short for it.
-        window: [voxels] an odd number.
+        smoothing: standard deviation of the Gaussian [voxels]. Along an axis that is too short for it, nothing is
+            smoothed.
+        window: side of the window [voxels], an odd number.
     """
     if not density > 0 or window < 1 or window % 2 == 0 or smoothing < 0:
         raise InputError(
@@ -45,7 +47,7 @@ def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, windo
 
 def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.ndarray:
     inside = field.mask & np.all(np.isfinite(U), axis=-1)
-    # A derivative and a second difference reach one voxel further each, the Gaussian three of its deviations.
+    # A derivative and a second difference reach one voxel each, the Gaussian three of its standard deviations.
     reach = [2 + math.ceil(3 * smoothing)] * 3
     ends = [np.flatnonzero(inside.any(axis=tuple(b for b in range(3) if b != a))) for a in range(3)]
     widths = [0.0] * 3
@@ -71,7 +73,7 @@ def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.n
 
 
 def _smooth(u: np.ndarray, inside: np.ndarray, widths: list[float]) -> np.ndarray:
-    """Mean of the voxels inside, weighted by a Gaussian of deviations along the axes."""
+    """Mean over the voxels inside, weighted by a Gaussian. `widths`: its standard deviation along each axis."""
     known = np.where(inside, u, 0.0)
     if not any(widths):
         return known

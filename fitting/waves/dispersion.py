@@ -1,4 +1,5 @@
-"""Phase velocities of shear waves over frequency, with or without attenuation, from files, as ultrasound gives them."""
+"""Phase velocities of shear waves over frequency, with or without attenuation, from files, for example from
+ultrasound."""
 
 import os
 import re
@@ -13,7 +14,7 @@ from fitting.readers.units import WAVE_UNITS
 from fitting.waves.shear_waves import DENSITY
 from liverjax.core.errors import InputError
 
-#: Words that begin a heading, and the quantity.
+#: First words of a heading, and its quantity.
 WORDS = (
     ("angular frequency", "frequency"),
     ("frequency", "frequency"),
@@ -23,7 +24,7 @@ WORDS = (
     ("speed", "velocity"),
     ("attenuation", "attenuation"),
 )
-#: Fewest frequencies of a file.
+#: Minimum number of frequencies in a file.
 FEWEST = 3
 
 
@@ -49,7 +50,7 @@ class Dispersion(NamedTuple):
 
     @property
     def scales(self) -> np.ndarray:
-        """Smooth curves through the measured numbers, to which their errors are relative."""
+        """Smooth curves through the measured values: the divisors of relative errors."""
         columns = [self.velocity] if self.attenuation is None else [self.velocity, self.attenuation]
         return np.concatenate([smooth_curve(self.angular_frequency, column) for column in columns])
 
@@ -63,11 +64,11 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
     """Read a table with a header such as ``frequency_Hz,phase_velocity_m/s,attenuation_Np/m``.
 
     Args:
-        path: text.
-        density: density of the material [kg/m^3]; None: `DENSITY`, with a note.
+        path: text file.
+        density: density of the material [kg/m^3]; None: `DENSITY` is used, with a note.
 
     Raises:
-        InputError: one sentence naming file, line or column, value and remedy.
+        InputError: one sentence with the file, the line or column, the value and the remedy.
     """
     lines = text_of(Path(path), "shear waves").splitlines()
     header = _header(lines)
@@ -96,7 +97,7 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
 
 
 def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispersion:
-    """The waves at frequencies from `low` to `high` [Hz]; a note says how many are left out.
+    """The waves at frequencies from `low` to `high` [Hz]. A note tells how many are left out.
 
     Raises:
         InputError: fewer than `FEWEST` frequencies are left.
@@ -120,7 +121,8 @@ def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispers
 
 
 def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | None:
-    """Number and delimiter of the first line that names all needed quantities, with their places and units."""
+    """Index and delimiter of the first line that names frequency and velocity, and the column and unit of each quantity
+    in it."""
     for k, line in enumerate(lines):
         delimiter, cells = split_line(line.lstrip("# "))
         found: dict[str, tuple[int, str]] = {}
@@ -134,7 +136,7 @@ def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | N
 
 
 def _quantity_named(cell: str) -> tuple[str, str] | None:
-    """Quantity and unit of a heading: "Phase velocity (m/s)", "attenuation_Np/m"."""
+    """Quantity and unit of a heading, for example "Phase velocity (m/s)" or "attenuation_Np/m"."""
     parts = re.match(r'^"?([^\[(]*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?"?$', cell.strip())
     if parts is None:
         return None
@@ -162,7 +164,9 @@ def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray
         _, cells = split_line(line, delimiter)
         values = [to_number(cells[p], delimiter) if p < len(cells) else None for p, _ in found.values()]
         if not all(v is not None and np.isfinite(v) for v in values):
-            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r} has a cell that is no number; correct it")
+            raise InputError(
+                f"{path}: line {number}: {line.strip()[:40]!r} has a cell that is not a number; correct it"
+            )
         rows.append(values)
     table = np.array(rows, float).reshape(-1, len(found))
     return {q: table[:, j] * factors[q] for j, q in enumerate(found)}

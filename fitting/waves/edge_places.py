@@ -1,10 +1,10 @@
-"""Places of the edges of labels between the voxels, and their uncertainty.
+"""Positions of the edges of labels between the voxels, and the uncertainty of these positions.
 
-Labels change in steps of a voxel. Smoothed labels give the volume of a region, but the shape of its edge only to a part
-of a voxel: for circles of 2.5 to 8 voxels the mean radius is off by 0.05 to 0.1 voxels, and the edge by another 0.13
-voxels from place to place, with a correlation length of 1.6 voxels. This shape changes the modulus of a stiff cylinder
-of 5 voxels by 3 to 4 % (`tests/test_wave_edges.py`). So the edges are cut into patches, and the shift of each patch
-outwards is an unknown of the fit.
+Labels change in steps of a voxel. Smoothed labels give the volume of a region, but the shape of its edge is known only
+to a part of a voxel. For circles of 2.5 to 8 voxels, the mean radius is wrong by 0.05 to 0.1 voxels. The local position
+of the edge is wrong by another 0.13 voxels, with a correlation length of 1.6 voxels. This changes the modulus of a
+stiff cylinder of 5 voxels by 3 to 4 % (`tests/test_wave_edges.py`). So the edges are cut into patches, and the outward
+shift of each patch is an unknown of the fit.
 """
 
 from typing import NamedTuple
@@ -16,32 +16,32 @@ from fitting.waves.voxels import VoxelBody
 
 #: Standard deviation of the Gaussian that smooths the steps of labels [voxels].
 SMOOTHING = 1.4
-#: Number of parts of a voxel's side for counting volumes.
+#: Number of parts into which the side of a voxel is divided to count volumes.
 FINE = 4
-#: Shift of the edges by which the effect of their place is computed [voxels].
+#: Shift of the edges [voxels] with which the effect of their position is computed.
 FARTHER = 0.1
-#: Side of a patch, and largest distance of an edge from a cut element's node [voxels].
+#: Side of a patch, and maximum distance between an edge and a node of a cut element [voxels].
 SIDE, REACH = 2.0, 2.0
-#: Standard deviations of the place of a whole edge (rounding to a voxel) and of its patches; correlation length of the
-#: patches [voxels].
+#: Standard deviations of the position of a whole edge (rounding to a voxel) and of its patches; correlation length of
+#: the patches. All in voxels.
 WHOLE, PATCH, ALIKE = 1 / np.sqrt(12), 0.13, 1.6
 
 
 class Patches(NamedTuple):
     """P patches of the edges of regions."""
 
-    region: np.ndarray  # (P,) number of the region whose edge it is
+    region: np.ndarray  # (P,) index of the region to which the edge belongs
     centre: np.ndarray  # (P, 3) [voxels]
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (P, P) [voxels^2] of the shifts of the patches outwards, from the labels alone."""
+        """Covariance (P, P) [voxels^2] of the outward shifts of the patches, from the labels alone."""
         apart = np.sum((self.centre[:, None] - self.centre[None]) ** 2, axis=-1)
         same = self.region[:, None] == self.region[None]
         return np.asarray(same * (WHOLE**2 + PATCH**2 * np.exp(-0.5 * apart / ALIKE**2)))
 
     def means(self, values: np.ndarray, regions: int) -> np.ndarray:
-        """Means (regions,) of values (P,) over the patches of each region, 0 if it has none."""
+        """Means (regions,) of values (P,) over the patches of each region; 0 if a region has no patch."""
         count = np.bincount(self.region, minlength=regions)
         return np.asarray(np.bincount(self.region, values, regions) / np.maximum(count, 1))
 
@@ -52,14 +52,14 @@ NO_PATCHES = Patches(np.zeros(0, int), np.zeros((0, 3)))
 def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: float = 0.0) -> np.ndarray:
     """Smoothed indicator functions s_k (R, V) of the labels `known` (R,) at the nodes.
 
-    They are smoothed twice, so that curved edges stay nearly where they are, and shifted so that each region keeps the
-    volume of its label.
+    They are smoothed twice, so that curved edges hardly move. A constant is added, so that each region keeps the volume
+    of its label.
 
     Args:
         labels: (nx, ny, nz).
-        body: labels count at its voxels; every other voxel gets the nearest label.
+        body: the labels at its voxels are used. Every other voxel gets the nearest label.
         known: (R,).
-        farther: how far [voxels] the edges of all regions but the largest are moved outwards.
+        farther: distance [voxels] by which the edges of all regions except the largest are moved outwards.
     """
     measured = np.zeros(labels.shape, bool)
     measured[tuple(body.voxel.T)] = True
@@ -71,7 +71,8 @@ def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: floa
     for k in range(len(known)):
         if k != largest:
             others = np.delete(s, k, axis=0).max(axis=0)
-            # Only near the label: a small label needs a large constant, which would move the edges of the others.
+            # The constant is added only near the label. A small label needs a large constant, which would move the
+            # edges of the other labels.
             apart = ndimage.distance_transform_edt(whole != known[k])
             out[k] += _level(s[k] - others, whole == known[k], counts[k]) * np.clip(2 - 0.5 * apart, 0, 1)
             if farther:
@@ -86,24 +87,24 @@ def _smoothed(place: np.ndarray) -> np.ndarray:
 
 
 def _level(above: np.ndarray, place: np.ndarray, count: int) -> float:
-    """Constant to add to a field near a label, so that it is positive in as much volume as the label has."""
+    """The constant to add to a field near a label, so that the field is positive in the same volume as the label."""
     reach = ndimage.find_objects(place.astype(int))[0]
     box = tuple(slice(max(0, r.start - 2), r.stop + 2) for r in reach)
-    # Values within the voxels, linear between the centres.
+    # Values inside the voxels, by linear interpolation between the centres.
     inside = [np.clip(np.arange(n * FINE) / FINE + (0.5 / FINE - 0.5), 0, n - 1) for n in above[box].shape]
     fine = ndimage.map_coordinates(above[box], np.meshgrid(*inside, indexing="ij"), order=1)
     return -float(np.partition(fine.ravel(), -count * FINE**3)[-count * FINE**3])
 
 
 def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patches, np.ndarray]:
-    """Patches of the edges near nodes, and the patch (V,) that each of these nodes is nearest to, -1 for others.
+    """Patches of the edges near given nodes; and for each node (V,) the nearest patch, -1 for all other nodes.
 
-    The largest region has no edge of its own: its edges are those of the others.
+    The largest region has no patches: its edges are the edges of the other regions.
 
     Args:
         s: `places` (R, V).
         body: its voxels.
-        nodes: numbers of the nodes of cut elements.
+        nodes: indices of the nodes of cut elements.
     """
     of_node = np.full(body.mesh.number_of_nodes, -1)
     if len(s) < 2 or not len(nodes):
@@ -124,7 +125,8 @@ def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patch
 
 
 def _feet(above: np.ndarray, body: VoxelBody) -> np.ndarray:
-    """The nearest point (V, 3) [voxels] to each node where a field (V,) is zero, by its slope, at most `REACH` away."""
+    """For each node, the nearest point (V, 3) [voxels] at which a field (V,) is zero, estimated from the gradient of
+    the field. It is at most `REACH` away."""
     first = body.voxel.min(axis=0)
     at = tuple((body.voxel - first).T)
     grid, known = np.zeros(np.ptp(body.voxel, axis=0) + 1), np.zeros(np.ptp(body.voxel, axis=0) + 1, bool)

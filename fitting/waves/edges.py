@@ -1,15 +1,16 @@
 """Regions with edges inside the elements: at an edge the motion has a kink and the pressure a jump.
 
-Across an edge between two materials displacement and traction are continuous, strain and pressure are not. A quadratic
-element cannot have a kink inside. So it is too stiff, and the modulus of a region of few voxels comes out too low.
-Elements that an edge cuts have one more function L_i psi for each of their corners i, where L_i is the corner's linear
-function and
+Across an edge between two materials, displacement and traction are continuous, but strain and pressure are not. A
+quadratic element cannot have a kink inside. So it is too stiff, and the fitted modulus of a region of few voxels is too
+low. Elements that an edge cuts have one more function L_i psi for each of their corners i, where L_i is the linear
+function of the corner and
 
     psi = sum_a N_a max_k s_k(x_a) - max_k sum_a N_a s_k(x_a).
 
 s_k is the smoothed indicator function of region k. Psi is continuous, has a kink at the edges and is zero at all nodes
 (extended finite elements: Moes et al. 2003, Comput. Methods Appl. Mech. Eng. 192, 3163). Nodes keep the motion of their
-voxels; the amplitudes of the kinks are not measured. Every point has the modulus and the pressure of its own side.
+voxels. The amplitudes of the kinks are not measured. Every point has the modulus and the pressure of its side of the
+edge.
 """
 
 from typing import NamedTuple
@@ -23,22 +24,23 @@ from fitting.waves.edge_places import NO_PATCHES, Patches, patches_of
 from fitting.waves.voxels import VoxelBody
 from liverjax.mesh.adjacency import PAIRS
 
-#: Number of halvings of cut elements, in whose parts edges are planes; number of elements computed at a time.
+#: Number of times that cut elements are halved; in the resulting parts, edges are planes. Then the number of elements
+#: that are computed at once.
 HALVINGS, CHUNK = 3, 60
 
 
 class RegionMatrices(NamedTuple):
-    """Parts of the balance of R regions, with U unknowns: 3 V of the nodes, then those of kinks."""
+    """Parts of the balance of R regions, with U unknowns: 3 V unknowns of the nodes, then the unknowns of the kinks."""
 
     stiffness: np.ndarray  # (R, N) entries of C for a shear modulus of 1 Pa in each region
     mass: np.ndarray  # (N,) entries of C that are multiplied by -omega^2
-    pattern: scipy.sparse.csr_array  # (I, U): places of these entries
+    pattern: scipy.sparse.csr_array  # (I, U): positions of these entries
     forces: scipy.sparse.csr_array  # (I, P) of pressures, each with the same large variance
     pressure: np.ndarray  # their covariance, as in `Matrices`
-    kinks: int  # unknowns that are not measured
+    kinks: int  # number of unknowns that are not measured
     patches: Patches
-    patch: np.ndarray  # (I,) patch of the edges that each row is nearest to, -1: none
-    farther: "RegionMatrices | None" = None  # the same with all edges farther out by `edge_places.FARTHER`
+    patch: np.ndarray  # (I,) the patch of the edges nearest to each row, -1: none
+    farther: "RegionMatrices | None" = None  # the same, with edges moved out by `edge_places.FARTHER`
 
     @property
     def balances(self) -> int:
@@ -46,7 +48,7 @@ class RegionMatrices(NamedTuple):
         return 2 * (self.forces.shape[0] - int(np.sum(np.diff(self.forces.tocsc().indptr) > 0)) - self.kinks)
 
     def rows(self, G: np.ndarray, omega: float) -> scipy.sparse.csr_array:
-        """C (I, U) of moduli (R,) [Pa] at an angular frequency [rad/s]."""
+        """C (I, U) for moduli G (R,) [Pa] at an angular frequency [rad/s]."""
         return self._filled(G @ self.stiffness - omega**2 * self.mass)
 
     def by_moduli(self, u: np.ndarray) -> np.ndarray:
@@ -54,7 +56,7 @@ class RegionMatrices(NamedTuple):
         return np.stack([self._filled(own) @ u for own in self.stiffness], axis=1)
 
     def by_edges(self, here: balance.Balanced, G: np.ndarray, omega: float) -> np.ndarray:
-        """Derivatives (I, P) of C u - B p by the shift of each patch of the edges outwards [voxels]."""
+        """Derivatives (I, P) of C u - B p by the outward shift [voxels] of each patch of the edges."""
         out = np.zeros((len(self.patch), len(self.patches.region)), complex)
         if self.farther is not None:
             p = self.forces.T @ here.multipliers
@@ -72,11 +74,11 @@ class _CutElements(NamedTuple):
     """Some elements with n functions, or the parts of them that lie in one region."""
 
     region: np.ndarray  # (K,)
-    functions: np.ndarray  # (K, n) numbers of the functions
-    shear: np.ndarray  # (K, n, 3, n, 3) of a shear modulus of 1 Pa
-    mass: np.ndarray  # (K, n, n) of a density of 1
+    functions: np.ndarray  # (K, n) indices of the functions
+    shear: np.ndarray  # (K, n, 3, n, 3) for a shear modulus of 1 Pa
+    mass: np.ndarray  # (K, n, n) for a density of 1
     corners: np.ndarray  # (K, 4)
-    divergence: np.ndarray  # (K, n, 3, 4): integrals of the divergence times the corners' linear functions
+    divergence: np.ndarray  # (K, n, 3, 4): integrals of the divergence times the linear functions of the corners
 
 
 def region_matrices(
@@ -85,10 +87,10 @@ def region_matrices(
     """The parts of the balance of regions.
 
     Args:
-        m, body: from `balance.matrices`, and its elements.
+        m, body: the result of `balance.matrices`, and the body for which it was computed.
         density: [kg/m^3].
         s: `places` (R, V).
-        farther: `places` with edges that are `edge_places.FARTHER` farther out.
+        farther: `places` with edges moved outwards by `edge_places.FARTHER`.
     """
     nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
     both = [s] if farther is None else [s, farther]
@@ -113,12 +115,13 @@ def region_matrices(
 
 
 def _nodes_of_elements(body: VoxelBody) -> np.ndarray:
-    """Numbers (10, E) of the nodes of the elements."""
+    """Indices (10, E) of the nodes of the elements."""
     return body.mesh.element_nodes_on_host
 
 
 def _numbers_of_rows(body: VoxelBody, kinked: np.ndarray) -> np.ndarray:
-    """Number of each unknown's row, -1 if it has none; slices of the longest side follow each other."""
+    """Index of the row of each unknown, -1 if it has no row. The rows are ordered slice by slice along the longest
+    side."""
     inner, hidden = np.flatnonzero(body.inner), np.flatnonzero(body.inner[kinked])
     voxel = np.concatenate([body.voxel[inner], body.voxel[kinked[hidden]]])
     functions = np.concatenate([inner, len(body.inner) + hidden])
@@ -145,7 +148,7 @@ def _whole_parts(m: Matrices, body: VoxelBody, region: np.ndarray, chosen: np.nd
 
 
 def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarray) -> list[_CutElements]:
-    """The part of every cut element that lies in each region."""
+    """For each region, the parts of the cut elements that lie in it."""
     corners = _equal_parts(HALVINGS)  # (Q, 4, 4)
     lam = corners.mean(axis=1)
     N, dN = _quadratic_functions(lam)
@@ -163,7 +166,7 @@ def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarr
         functions = np.concatenate([nodes[:, chunk].T, hidden[tets[chunk]]], axis=1)
         weights = _parts_by_region(at) * np.asarray(body.linear.volumes)[chunk, None] / len(lam)
         for region, weight in zip(there, weights, strict=True):
-            # In this region psi is the interpolated maximum minus the region's own function.
+            # In this region, psi is the interpolated maximum minus the function of this region.
             above = highest - own[region]  # (10, K)
             psi = np.einsum("ak,qa->kq", above, N)
             slope = np.einsum("ak,kqaj->kqj", above, plain)
@@ -175,13 +178,14 @@ def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarr
 
 
 def _parts_by_region(at: np.ndarray) -> np.ndarray:
-    """Parts (R, ...) of tetrahedra where each of R linear functions is the largest, by corner values (R, ..., 4)."""
+    """For each of R linear functions, the part (R, ...) of each tetrahedron in which it is the largest; from the values
+    at the corners (R, ..., 4)."""
     if len(at) == 1:
         return np.ones(at.shape[:-1])
     out = []
     for k in range(len(at)):
         g = at[k] - np.delete(at, k, axis=0).max(axis=0)
-        # The formula fails if two corners have equal values: this moves them apart, by about 1e-3.
+        # The formula fails if two corners have equal values. This line moves the values apart, by about 1e-3.
         g = g + 1e-3 * np.abs(g).max(axis=-1, keepdims=True) * np.array([0.0, 1.0, -1.5, 2.5]) + 1e-30
         apart = g[..., :, None] - g[..., None, :] + np.where(np.eye(4, dtype=bool), 1.0, 0.0)
         out.append(np.sum(np.maximum(g, 0) ** 3 / np.prod(apart, axis=-1), axis=-1))
@@ -192,18 +196,19 @@ def _parts_by_region(at: np.ndarray) -> np.ndarray:
 def _integrals(
     values: np.ndarray, gradients: np.ndarray, lam: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shear stiffness, mass and divergence of functions by their values (K, Q, n) and gradients (K, Q, n, 3)."""
+    """Shear stiffness, mass and divergence of functions, from their values (K, Q, n) and gradients (K, Q, n, 3)."""
     K, Q, n = values.shape
     flat = gradients.reshape(K, Q, 3 * n)
     D = np.matmul(np.swapaxes(flat * weights[..., None], 1, 2), flat).reshape(K, n, 3, n, 3)
-    # Twice the deviator of the strain against the strain.
+    # The double contraction of twice the strain deviator with the strain.
     shear = np.einsum("ik,eajbj->eaibk", np.eye(3), D) + np.einsum("eakbi->eaibk", D) - 2 / 3 * D
     mass = np.matmul(np.swapaxes(values * weights[..., None], 1, 2), values)
     return shear, mass, np.einsum("kq,qv,kqaj->kajv", weights, lam, gradients, optimize=True)
 
 
 def _with_forces(parts: list[_CutElements], kinks: int, nodes: int) -> np.ndarray:
-    """Which kink functions (kinks,) bool are not zero: an edge that meets an element only at a node makes none."""
+    """For each kink function (kinks,): whether it is not zero. If an edge meets an element only at a node, the kink
+    function is zero."""
     size = np.zeros(kinks)
     for p in parts:
         np.add.at(size, p.functions[:, 10:] - nodes, np.einsum("eaibi->eab", p.shear)[:, range(10, 14), range(10, 14)])
@@ -218,7 +223,7 @@ def _renumbered(p: _CutElements, alive: np.ndarray, nodes: int) -> _CutElements:
 
 
 def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: float) -> RegionMatrices:
-    """All parts together; rows (U,) of the unknowns."""
+    """The matrices of all parts together. `rows` (U,): the row of each unknown."""
     I, U = int(rows.max()) + 1, len(rows)
     known, ends, at = _pattern(parts, rows)
     stiffness, mass = np.zeros((R, len(known))), np.zeros(len(known))
@@ -241,7 +246,7 @@ def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: 
 def _pattern(
     parts: list[_CutElements], rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-    """Keys of the entries in order, ends of the rows, and for each part the entries that exist, and their places."""
+    """Sorted keys of the entries, ends of the rows, and for each part the entries that exist, with their positions."""
     keys, insides, U = [], [], len(rows)
     for p in parts:
         unknowns, lines = _unknowns_and_rows(p, rows)
@@ -255,7 +260,7 @@ def _pattern(
 
 
 def _unknowns_and_rows(p: _CutElements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (K, n, 3) of the unknowns of functions, and of their rows; -1 if there is none."""
+    """Indices (K, n, 3) of the unknowns of the functions, and of the rows of these unknowns; -1 if there is none."""
     unknowns = np.where(p.functions[..., None] < 0, -1, 3 * p.functions[..., None] + np.arange(3))
     return unknowns, np.where(unknowns < 0, -1, rows[unknowns])
 
@@ -276,7 +281,7 @@ def _pressure_columns(
 
 
 def _corner_gradients(body: VoxelBody) -> np.ndarray:
-    """Gradients (E, 4, 3) of the corners' linear functions."""
+    """Gradients (E, 4, 3) of the linear functions of the corners."""
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
     return np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
 
@@ -292,7 +297,7 @@ def _quadratic_functions(lam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rule_of_four() -> np.ndarray:
-    """Barycentric coordinates of the rule that is exact for quadratic functions."""
+    """Barycentric coordinates of the points of an integration rule that is exact for quadratic functions."""
     low = (5 - np.sqrt(5)) / 20
     return low + (1 - 4 * low) * np.eye(4)
 

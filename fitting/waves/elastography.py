@@ -1,4 +1,4 @@
-"""An organ and its waves: moduli of the whole and of its regions, and the input of a map."""
+"""An organ and its waves: moduli of the whole organ and of its regions, and the input of a map."""
 
 import itertools
 from collections.abc import Callable
@@ -17,13 +17,14 @@ from fitting.waves.wave_field import WaveField
 from liverjax.core.errors import InputError
 
 __all__ = ["Found", "Organ", "body_of", "gigabytes", "organ_of", "plane_wave_biases", "problem_of_map", "regions_of"]
-#: Directions of plane waves: to a voxel's neighbours, of two opposite ones the first. And how sharply waves along other
-#: directions than the data's count for less.
+#: Directions of plane waves: from a voxel to its neighbours, and only one of two opposite directions. SHARPNESS:
+#: exponent with which the weight of directions falls that differ from the directions of the measured waves.
 DIRECTIONS = tuple(n for n in itertools.product((1, 0, -1), repeat=3) if n > (0, 0, 0))
 SHARPNESS = 4
 
 
-#: Fewest equations of one frequency that are left beside the pressures: there are two numbers to find, and noise.
+#: Minimum number of equations of one frequency, after subtraction of the unknown pressures. Two values (storage and
+#: loss) must be found from noisy data.
 FEWEST_BALANCES = 10
 
 
@@ -40,35 +41,37 @@ class Organ(NamedTuple):
 class Found(NamedTuple):
     """Moduli of an organ."""
 
-    whole: Regions  # of one region
+    whole: Regions  # with one region
     labels: np.ndarray | None  # (R,) of the regions
     parts: Regions | None
-    mesh_bias: np.ndarray  # (F,) complex, relative: from plane waves with the modulus of the whole
-    bias_left: np.ndarray  # (F, D) how each direction of these waves adds to the uncertainty of this mean
-    parts_bias: np.ndarray | None = None  # (F, R) the same with the moduli of the regions
+    mesh_bias: np.ndarray  # (F,) complex, relative: from plane waves, with the modulus of the whole
+    bias_left: np.ndarray  # (F, D) uncertainty of this mean, from each direction of these waves
+    parts_bias: np.ndarray | None = None  # (F, R) the same, with the moduli of the regions
     parts_bias_left: np.ndarray | None = None  # (F, R, D)
 
 
 def body_of(field: WaveField) -> VoxelBody:
-    """Elements of the voxels that are measured and in the mask.
+    """The body of elements on the voxels that are measured and in the mask.
 
     Raises:
-        InputError: too few such voxels, or displacements of fewer than three components.
+        InputError: there are too few such voxels, or the displacements have fewer than three components.
     """
     measured = np.all(np.isfinite(field.displacement), axis=0)
     if not np.any(np.all(measured, axis=-1)):
         raise InputError(
-            f"{field.source or 'waves'}: a balance of forces needs three components of the displacement: measure all"
+            f"{field.source or 'waves'}: the balance of forces needs three components of the displacement: measure "
+            "all three"
         )
     return voxels.voxel_body(field.mask & np.all(measured, axis=-1), field.spacing, field.origin)
 
 
-#: Part of the bricks that gaps within the organ must leave, or it is told.
+#: If gaps within the organ leave less than this part of the bricks, a note is given.
 GAPS = 0.8
 
 
 def notes_on_gaps(field: WaveField) -> list[str]:
-    """A note if voxels without displacement within the organ take many elements away: each needs all its 27 voxels."""
+    """A note if voxels without displacement within the organ remove many elements: each brick needs all its 27
+    voxels."""
     inside = field.mask & np.isfinite(field.displacement).all(axis=(0, 4))
     whole = scipy.ndimage.binary_fill_holes(inside)
     left, most = voxels.number_of_bricks(inside), voxels.number_of_bricks(whole)
@@ -76,17 +79,17 @@ def notes_on_gaps(field: WaveField) -> list[str]:
         return []
     return [
         f"{int((whole & ~inside).sum())} voxels within the organ have no displacement or are not in the mask, and "
-        f"{100 * left / most:.2g} % of its elements are left: fill single gaps from their neighbours, and errors "
-        "become smaller"
+        f"{100 * left / most:.2g} % of its elements are left: fill single gaps from their neighbours to get smaller "
+        "errors"
     ]
 
 
-#: Part of the voxels that may lie in a last layer without elements before it is told.
+#: If more than this part of the voxels lies in last layers without elements, a note is given.
 LEFT_OUT = 0.1
 
 
 def notes_on_layers(field: WaveField) -> list[str]:
-    """A note if many voxels lie beyond the last brick along an axis: a brick takes two steps of a voxel."""
+    """A note if many voxels lie beyond the last brick along an axis: a brick is two voxel steps long."""
     inside = field.mask & np.isfinite(field.displacement).all(axis=(0, 4))
     box = scipy.ndimage.find_objects(inside.astype(int))[0]
     odd = tuple(slice(0, n - 1 + n % 2) for n in inside[box].shape)
@@ -95,13 +98,14 @@ def notes_on_layers(field: WaveField) -> list[str]:
     if every - kept < LEFT_OUT * every:
         return []
     return [
-        f"{every - kept} of {every} voxels are in no element, which takes 3 voxels along an axis and shares the last "
-        f"with the next: the last layer along {', '.join(axes)} is left out; measure an odd number of voxels"
+        f"{every - kept} of {every} voxels are in no element. An element takes 3 voxels along an axis and shares the "
+        f"last one with the next element, so the last layer along {', '.join(axes)} is left out: measure an odd "
+        "number of voxels"
     ]
 
 
 def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
-    """The organ of a field, with the equations of its body; density in kg/m^3."""
+    """The organ of a field, with the equations of its body. `density` is in kg/m^3."""
     motion = field.displacement[(slice(None), *body.voxel.T)]
     omega = 2 * np.pi * field.frequencies
     waves = MeasuredWaves(omega, motion.reshape(len(omega), -1), np.maximum(field.noise, 1e-9 * np.abs(motion).max()))
@@ -119,7 +123,7 @@ def regions_of(
     progress: Callable[[int, float], None] = lambda k, cost: None,
     keep: Keep = lambda name, find: find(),
 ) -> Found:
-    """Moduli of the whole organ, and of its regions if labels are given; `keep` as from `kept_regions.kept_in`."""
+    """Moduli of the whole organ, and of its regions if labels are given. `keep`: see `kept_regions.kept_in`."""
     m, waves, body = organ.matrices, organ.waves, organ.body
 
     def of_whole() -> Regions:
@@ -143,12 +147,14 @@ def regions_of(
     return Found(whole, known, parts, bias, left, *_biases(organ, parts.modulus))
 
 
-#: Moduli within this factor of each other share the waves of their bias, which goes with the square of the wave number.
+#: The bias is in proportion to the square of the wave number. So moduli within this factor of each other use the same
+#: plane waves.
 ALIKE = 1.15
 
 
 def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Relative error (F, R) of moduli (F, R) by the elements: a mean over waves, and what is left of it (F, R, D)."""
+    """Relative error (F, R) that the elements cause in moduli (F, R): its mean over plane waves, and the remaining
+    uncertainty (F, R, D) from each direction."""
     bias, left = np.zeros(moduli.shape, complex), np.zeros((*moduli.shape, len(DIRECTIONS)), complex)
     for f, weights in enumerate(directions_of_waves(organ.field)):
         known = 0.0
@@ -157,25 +163,27 @@ def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             if not abs(G) < ALIKE * known:
                 each, known = plane_wave_biases(G, organ.waves.omega[f], organ, weights), abs(G)
             bias[f, r] = each @ weights * known / abs(G)
-            # As many waves as directions that count: their mean is known to the root of the sum of these squares.
+            # Each direction that counts has one wave. The error of the mean is the root of the sum of these squares.
             left[f, r] = weights * (each - each @ weights) * known / abs(G)
     return bias, left
 
 
 def _uniform(m: Matrices, body: VoxelBody, density: float) -> edges.RegionMatrices:
-    """The balance of one region."""
+    """The balance of a uniform organ: one region."""
     return edges.region_matrices(m, body, density, np.ones((1, body.mesh.number_of_nodes)))
 
 
 def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.Course:
-    """Input of `stiffness_map.map_of`: a map about the moduli of the whole, with this correlation length [m]."""
+    """The input of `stiffness_map.map_of` for a map around the moduli of the whole organ, with this correlation length
+    [m]."""
     return stiffness_map.course_of(organ.body, organ.matrices, organ.waves, found.whole.modulus[:, 0], length)
 
 
 def directions_of_waves(field: WaveField) -> np.ndarray:
-    """Weights (F, D) of plane waves along `DIRECTIONS`: the squares of the displacement's slopes along them, sharpened.
+    """Weights (F, D) of plane waves along `DIRECTIONS`: the squared slopes of the displacement along them, to the power
+    `SHARPNESS`.
 
-    The slopes along each axis are those between neighbours, without what the noise adds to them.
+    The slopes along each axis are differences between neighbours. The contribution of the noise is subtracted.
     """
     n = np.array([np.array(d) / np.linalg.norm(d) for d in DIRECTIONS])
     rows = []
@@ -191,16 +199,16 @@ def directions_of_waves(field: WaveField) -> np.ndarray:
 
 
 def plane_wave_biases(G: complex, omega: float, organ: Organ, weights: np.ndarray) -> np.ndarray:
-    """Relative errors (D,) of the modulus that these elements find in plane waves without noise along `DIRECTIONS`.
+    """Relative errors (D,) of the modulus that these elements give for plane waves without noise along `DIRECTIONS`.
 
-    One step of Gauss-Newton from the true modulus, in the organ's own body: edges and holes add to the error of the
-    elements.
+    It takes one Gauss-Newton step from the true modulus, in the body of the organ: its edges and holes add to the error
+    of the elements.
 
     Args:
         G: modulus [Pa].
         omega: angular frequency [rad/s].
         organ: its body and density.
-        weights: of the directions (D,); those that do not count are left out, with an error of 0.
+        weights: weights of the directions (D,). Directions with a weight near 0 are left out, with an error of 0.
     """
     m, X = organ.matrices, np.asarray(organ.body.mesh.points)
     uniform, X = _uniform(m, organ.body, organ.density), X - X.mean(axis=0)

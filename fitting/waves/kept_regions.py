@@ -1,4 +1,4 @@
-"""Moduli of regions in a file: a run that was killed goes on without searching for them again."""
+"""Moduli of regions are kept in a file, so that a run that was killed can go on without searching for them again."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,21 +12,21 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.versions import versions
 
-#: `name` -> what `find` returns, or what was kept under this name.
+#: A function from `name` and `find` to the regions kept under this name, or else to the result of `find`.
 Keep = Callable[[str, Callable[[], Regions]], Regions]
 _NUMBERS = tuple(name for name in Regions._fields if name != "correlations")
 
 
 def kept_in(file: Path, resume: bool, marks: dict[str, object]) -> Keep:
-    """A function that keeps the regions of an organ in `file`, under their names.
+    """Return a function that keeps the regions of an organ in `file`, under their names.
 
     Args:
-        file: it is written completely or not at all, each time new regions are found.
-        resume: regions that the file has are taken from it; else it begins anew.
-        marks: of the organ, by name.
+        file: it is written each time new regions are found, completely or not at all.
+        resume: use the regions that the file has already. Otherwise begin a new file.
+        marks: marks that identify the organ and its data, by name.
 
     Raises:
-        InputError: the file to go on from has other marks, or cannot be read.
+        InputError: the file has other marks, or cannot be read.
     """
     held = _read_regions(file, marks) if resume and file.is_file() else {}
 

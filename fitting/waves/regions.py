@@ -1,4 +1,5 @@
-"""Complex moduli of the regions of an organ from its waves, at each frequency by itself, with their uncertainty."""
+"""Complex moduli of the regions of an organ from its waves, with their uncertainty. Each frequency is fitted by
+itself."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,9 +12,10 @@ from fitting.waves.balance import Balanced, Matrices
 from fitting.waves.correlated_noise import Correlation, correlation
 from fitting.waves.edges import RegionMatrices
 
-#: Moduli [Pa] at which a search begins, and the loss over storage there.
+#: Moduli [Pa] from which the start of a search is chosen, and their ratio of loss to storage.
 STARTS, LOSS = np.geomspace(500.0, 40500.0, 5), 0.3
-#: Most iterations, and step of a modulus over its standard error below which the iteration ends.
+#: Maximum number of iterations. The iteration ends if the step of each modulus, divided by its standard error, is below
+#: the second value.
 ITERATIONS, ENOUGH = 20, 0.1
 
 
@@ -22,7 +24,7 @@ class MeasuredWaves(NamedTuple):
 
     omega: np.ndarray  # (F,) [rad/s]
     motion: np.ndarray  # (F, 3 V) complex [m], x, y, z of a node together
-    sd: np.ndarray  # (F,) [m], of real and of imaginary part of one component
+    sd: np.ndarray  # (F,) [m], standard deviation of real and imaginary part of one component
 
 
 class Regions(NamedTuple):
@@ -30,7 +32,7 @@ class Regions(NamedTuple):
 
     modulus: np.ndarray  # (F, R) complex [Pa]
     covariance: np.ndarray  # (F, 2 R, 2 R) [Pa^2]: storage of all regions, then loss
-    farther: np.ndarray  # (F, R) mean shift of the edges outwards, from those of the labels [voxels]
+    farther: np.ndarray  # (F, R) mean outward shift of the edges against the labels [voxels]
     chi2: np.ndarray  # (F,)
     components: int  # of one frequency
     iterations: np.ndarray  # (F,)
@@ -39,9 +41,10 @@ class Regions(NamedTuple):
 
     @property
     def noise_factor(self) -> np.ndarray:
-        """Factor (F, R), at least 1, by which errors exceed those of white noise with the given deviations.
+        """Factor (F, R), at least 1, by which the errors exceed the errors for white noise with the given standard
+        deviations.
 
-        It is the ratio of residuals to noise, or that of correlated noise.
+        It is the ratio of residuals to noise. If the noise is correlated, it is the factor of correlated noise.
         """
         factor = np.repeat(np.maximum(1.0, np.sqrt(self.chi2 / self.components))[:, None], self.modulus.shape[1], 1)
         for f, own in enumerate(self.correlations):
@@ -58,7 +61,7 @@ class Regions(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The likeliest motion at moduli (R,), with the gradient and the Gauss-Newton Hessian of chi^2 / 2."""
+    """The likeliest motion for moduli (R,), with the gradient and the Gauss-Newton Hessian of chi^2 / 2."""
 
     G: np.ndarray
     here: Balanced
@@ -67,7 +70,7 @@ class _State(NamedTuple):
 
 
 def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
-    """The modulus [Pa] of `STARTS` with the smallest forces out of balance at the lowest frequency."""
+    """The modulus [Pa] of `STARTS` with the lowest chi^2 at the lowest frequency."""
     ones = np.ones(m.rows.shape[-1])
 
     def out_of_balance(G):
@@ -84,16 +87,17 @@ def moduli_of_regions(
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
     voxel: np.ndarray | None = None,
 ) -> Regions:
-    """Moduli by Gauss-Newton, every frequency by itself.
+    """Find the moduli by Gauss-Newton, for every frequency by itself.
 
-    The places of the edges are unknown too (`edge_places`).
+    The positions of the edges are unknowns too (`edge_places`).
 
     Args:
-        m: from `edges.region_matrices`.
+        m: the result of `edges.region_matrices`.
         waves: the measured waves.
         start: complex modulus of each region (R,) [Pa] at the lowest frequency.
         progress: called after every iteration with its number, and with chi^2 per component.
-        voxel: place of each node (V, 3), to find the correlation of the noise; None: noise counts as white.
+        voxel: voxel index of each node (V, 3), from which the correlation of the noise is found; None: the noise counts
+            as white.
     """
     found, G, correlations = [], np.asarray(start, complex), []
     for f in range(len(waves.omega)):
@@ -109,7 +113,8 @@ def moduli_of_regions(
 
 
 def _one_frequency(m, waves, f, G, progress):
-    """Modulus (R,), covariance (2 R, 2 R), places of edges (R,), chi^2, iterations, whether they ended, the state."""
+    """Moduli (R,), covariance (2 R, 2 R), mean shifts of the edges (R,), chi^2, number of iterations, whether the
+    search converged, and the state."""
     R, at = len(G), (waves.omega[f], waves.motion[f], waves.sd[f])
     now, converged, k = _state_of_regions(m, G, *at), False, 0
     labels = _of_labels(m, R)
@@ -118,7 +123,8 @@ def _one_frequency(m, waves, f, G, progress):
         both = step[:R] + 1j * step[R : 2 * R]
         part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # at most by half of its value
         new = None
-        # The likeliest edges change with the moduli, and so does chi^2: within a standard error it cannot judge a step.
+        # The likeliest edges, and with them chi^2, change with the moduli. So chi^2 cannot judge steps within a
+        # standard error.
         close = _in_errors(step, covariance, R) < 1
         for _ in range(8):
             if np.all((now.G + part * both).real > 0):
@@ -140,20 +146,19 @@ def _one_frequency(m, waves, f, G, progress):
 
 
 def _in_errors(step: np.ndarray, covariance: np.ndarray, R: int) -> float:
-    """The largest step of R moduli over its standard error."""
+    """The largest step of the R moduli, divided by its standard error."""
     return float(np.max(np.abs(step[: 2 * R]) / np.sqrt(np.diagonal(covariance)[: 2 * R])))
 
 
 def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Step (2 R + P,) of storage, loss and edges, and their covariance.
 
-    In every step the edges start from the labels, because the equations are nearly linear in the places of the edges.
-    The derivatives by the moduli are taken with these edges too. With the likeliest edges, they would count the errors
-    of the edges
-        twice: cylinders of 2.5 voxels come out a percent stiffer.
+    In every step, the edges start from the labels, because the equations are nearly linear in the positions of the
+    edges. The derivatives by the moduli use these edges too. With the likeliest edges, the errors of the edges would
+    count twice: cylinders of 2.5 voxels would become a percent stiffer.
     """
     H = now.hessian + labels
-    silent = np.diagonal(H) == 0  # a region without an element of its own
+    silent = np.diagonal(H) == 0  # a region without any element
     H[silent, silent] = 1.0
     covariance = np.linalg.inv(H)
     covariance[silent, silent] = np.inf
@@ -161,7 +166,8 @@ def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
-    """Inverse covariance that the labels give: 0 for the moduli, and that of the patches for the edges."""
+    """Inverse covariance from the labels alone: 0 for the moduli, and the inverse covariance of the patches for the
+    edges."""
     P = len(m.patches.region)
     out = np.zeros((2 * R + P, 2 * R + P))
     out[2 * R :, 2 * R :] = np.linalg.inv(m.patches.covariance)
@@ -169,7 +175,7 @@ def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
 
 
 def _least(now: _State, labels: np.ndarray) -> float:
-    """chi^2 with the best places of the edges at these moduli."""
+    """chi^2 with the best positions of the edges for these moduli."""
     R = len(now.G)
     g, H = now.gradient[2 * R :], (now.hessian + labels)[2 * R :, 2 * R :]
     return float(now.here.chi2 - g @ np.linalg.solve(H, g))
@@ -183,7 +189,7 @@ def _state_of_regions(m: RegionMatrices, G: np.ndarray, omega: float, motion: np
     R, J = len(G), np.concatenate([m.by_moduli(here.motion), m.by_edges(here, G, omega)], axis=1)
     g = (J.conj().T @ here.multipliers) / sd**2
     X = here.whitened(scipy.sparse.csc_array(J))
-    # Loss acts as i times storage.
+    # A loss modulus acts like i times a storage modulus.
     X = np.concatenate([X[:, :R], 1j * X[:, :R], X[:, R:]], axis=1)
     gradient = np.concatenate([g[:R].real, g[:R].imag, g[R:].real])
     return _State(G, here, gradient, np.real(X.conj().T @ X) / sd**2)

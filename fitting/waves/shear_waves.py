@@ -8,12 +8,12 @@ import numpy as np
 
 from liverjax.core.struct import Array, Content, Number
 
-#: Default density [kg/m^3]: that of soft tissue.
+#: Default density [kg/m^3]: the density of soft tissue.
 DENSITY = 1060.0
 
 
 def velocity_and_attenuation(storage: Number, loss: Number, omega: Number, density: Number) -> tuple[Array, Array]:
-    """Phase velocity c [m/s] and attenuation alpha [1/m] of the amplitude, from moduli (n,) [Pa]; NumPy or JAX.
+    """Phase velocity c [m/s], and attenuation alpha [1/m] of the amplitude, from moduli (n,) [Pa], in NumPy or JAX.
 
     Args:
         storage, loss: G', G'' [Pa].
@@ -21,13 +21,13 @@ def velocity_and_attenuation(storage: Number, loss: Number, omega: Number, densi
         density: [kg/m^3].
     """
     size = (storage**2 + loss**2) ** 0.5
-    # |G| - G' as G''^2 / (|G| + G'): nothing cancels where the loss is small.
+    # |G| - G' is computed as G''^2 / (|G| + G'): this has no cancellation if the loss is small.
     velocity = size * (2 / (density * (size + storage))) ** 0.5
     return velocity, omega * loss * (density / (2 * (size + storage))) ** 0.5 / size
 
 
 def moduli_of(velocity: Array, attenuation: Array, omega: Array, density: Number) -> tuple[Array, Array]:
-    """G' and G'' [Pa] of waves: the inverse of `velocity_and_attenuation`."""
+    """G' and G'' [Pa] from velocity and attenuation: the inverse of `velocity_and_attenuation`."""
     real, imaginary = omega / velocity, attenuation
     square = (real**2 + imaginary**2) ** 2
     scale = density * omega**2 / square

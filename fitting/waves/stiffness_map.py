@@ -1,18 +1,20 @@
 """A map of the complex modulus from measured waves: a smooth field, with its uncertainty.
 
-At frequency f the modulus of an element is g_f exp(c + l_f). g_f is the modulus that a uniform organ would have; c =
-ln(size) + i (loss angle) is the mean of a complex nodal field (P,), the same for all frequencies. Its real and its
-imaginary part have the prior of `fitting.methods.prior`, with the same standard deviation. The levels l_f are complex
-numbers about 0 with the deviation `LEVEL`: an organ that is not uniform may miss the ratios of the g_f. One frequency
-has no level, for the mean of c does the same. Larger and larger deviations of c are tried. The search
-ends when chi^2 is down to the number of equations (discrepancy principle; Morozov 1966), or when the evidence -(chi^2/n
-+ |z|^2)/2 - ln det H falls. The deviation with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the
-whitened z is sought by Gauss-Newton. The search ends where the next step is shorter than `NEAR` standard deviations.
+At frequency f the modulus of an element is g_f exp(c + l_f). g_f is the modulus that a uniform organ would have. c =
+ln(size) + i (loss angle) is the mean over the element of a complex nodal field (P,). This field is the same for all
+frequencies. Its real and its imaginary part have the prior of `fitting.methods.prior`, with the same standard
+deviation. The levels l_f are complex, with mean 0 and the standard deviation `LEVEL`. They are needed because in an
+organ that is not uniform the ratios of the g_f may be wrong. With only one frequency there is no level: the mean of c
+has the same effect. Larger and larger standard deviations of c are tried. This ends when chi^2 is as low as the number
+of equations (discrepancy principle; Morozov 1966), or when the evidence -(chi^2/n + |z|^2)/2 - ln det H falls. The
+standard deviation with the highest evidence is used. For each one, Gauss-Newton minimises chi^2/2 + |z|^2/2 over the
+whitened field z. A search ends if the next step is shorter than `NEAR` standard deviations.
 
-The uncertainty has two parts. One comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value. The
-other comes from the place of a change in modulus, which is not known exactly. The prior turns a step into a slope over
-its correlation length, or over a brick if that is longer. The step may lie anywhere within the slope. So a place is
-known only to this length w, with the variance w^2/12, which adds |w dc/dx|^2/12 to the variance of c.
+The uncertainty has two parts. The first part comes from the Hessian H = I + J^H J/n, where n is chi^2 divided by its
+expected value. The second part is needed because the position of a change in modulus is not known exactly. The prior
+turns a step into a slope over the correlation length, or over a brick if a brick is longer. The step may lie anywhere
+within the slope. So its position is known only within this length w, with the variance w^2/12. This adds |w dc/dx|^2/12
+to the variance of c.
 """
 
 import time
@@ -34,14 +36,14 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.struct import Content
 
-#: Standard deviations of c to try, from a nearly uniform organ to a free one.
+#: Standard deviations of c to try: from a nearly uniform organ to an organ whose modulus may vary strongly.
 DEVIATIONS = (0.2, 0.4, 0.8)
-#: Standard deviation of both parts of the levels.
+#: Standard deviation of the real and the imaginary part of the levels.
 LEVEL = 0.5
-#: Most steps of Gauss-Newton for each. A search has ended, or at last a map has converged, where the next step is
-#: shorter than this, in standard deviations of the map.
+#: Maximum number of Gauss-Newton steps for each of `DEVIATIONS`. A search ends if the next step is shorter than NEAR,
+#: and a map has converged if it is shorter than FAR (in standard deviations of the map).
 STEPS, NEAR, FAR = 40, 0.1, 0.2
-#: A step that is longer than this part of the step before shows that the Hessian is from too far away.
+#: If a step is longer than this part of the step before, the Hessian was computed too far away and is computed again.
 _SLOW = 0.3
 
 
@@ -49,8 +51,8 @@ class WaveMap(NamedTuple):
     """The map and its uncertainty."""
 
     exponent: np.ndarray  # c + l_f (F, P) complex at the corners
-    sd: np.ndarray  # (F, P) complex: of its real part (logarithm of the size), and of its imaginary part (loss angle)
-    posterior_sd: np.ndarray  # (F, P) of both parts, without the uncertainty of places
+    sd: np.ndarray  # (F, P) complex: sd of the real part (ln of the size) + i sd of the imaginary part (loss angle)
+    posterior_sd: np.ndarray  # (F, P) of both parts, without the uncertainty of positions
     prior_sd: np.ndarray  # (F, P)
     draws: np.ndarray  # (D, F, P) complex: samples of the posterior, displaced within the length w
     modulus: np.ndarray  # (F, P) complex [Pa]
@@ -59,7 +61,7 @@ class WaveMap(NamedTuple):
     chi2: float
     components: int
     reached: bool
-    distance: float  # to the minimum, in standard deviations of the map: the length of the next step
+    distance: float  # distance to the minimum: length of the next step, in standard deviations of the map
     history: list[dict[str, float]]
     seconds: float
 
@@ -70,7 +72,7 @@ class Course(NamedTuple):
     m: Matrices
     waves: MeasuredWaves
     whole: np.ndarray  # (F,) complex
-    exponents: tuple[scipy.sparse.csr_array, ...]  # (F,) of (E, P + L): c + l_f of the elements, from c and the levels
+    exponents: tuple[scipy.sparse.csr_array, ...]  # (F,) of (E, P + L): c and levels -> c + l_f of the elements
     slopes: tuple[scipy.sparse.csr_array, ...]  # (3,) of (P, P): change over the length w along x, y, z
     p: smooth.Prior
     length: float  # [m]
@@ -81,17 +83,17 @@ class Course(NamedTuple):
         return len(self.p.root_mass)
 
     def moduli(self, y: np.ndarray) -> list[np.ndarray]:
-        """Moduli (E,) of the elements at every frequency, from y (P + L,): c at the corners, and the levels."""
+        """Moduli (E,) of the elements at every frequency. y (P + L,) has c at the corners, then the levels."""
         return [g * np.exp(own @ y) for g, own in zip(self.whole, self.exponents, strict=True)]
 
     def at(self, y: np.ndarray) -> list[Balanced]:
-        """The likeliest motions at y (P + L,)."""
+        """The likeliest motion at every frequency, for y (P + L,)."""
         w = self.waves
         each = zip(self.moduli(y), w.omega, w.motion, w.sd, strict=True)
         return [balance.balanced(self.m, *own) for own in each]
 
     def jacobians(self, y: np.ndarray, here: list[Balanced]) -> list[scipy.sparse.csc_array]:
-        """Derivatives (I, P + L) by y of the forces out of balance, divided by the noise."""
+        """Derivatives (I, P + L) of the unbalanced forces by y, divided by the noise."""
         each = zip(self.moduli(y), self.exponents, here, self.waves.sd, strict=True)
         return [
             (balance.by_modulus(self.m, b.motion) @ scipy.sparse.diags_array(G) @ own).tocsc() / sd
@@ -99,11 +101,12 @@ class Course(NamedTuple):
         ]
 
     def scales(self, k: int) -> np.ndarray:
-        """Deviations (P + L,) of y over those of `natural`, for the deviation of number k."""
+        """Factors (P + L,) from the result of `natural` to y, for `DEVIATIONS[k]`."""
         return np.where(np.arange(self.exponents[0].shape[1]) < self.corners, DEVIATIONS[k], 1.0)
 
     def natural(self, z: np.ndarray) -> np.ndarray:
-        """y of whitened complex z, (P + L,) or (P + L, n): c of deviation 1, levels of deviation `LEVEL`."""
+        """y from whitened complex z, (P + L,) or (P + L, n). c has the standard deviation 1, the levels have
+        `LEVEL`."""
         c, levels = z[: self.corners], LEVEL * z[self.corners :]
         return np.concatenate(
             [smooth.field_at_nodes(self.p, c.real) + 1j * smooth.field_at_nodes(self.p, c.imag), levels]
@@ -135,7 +138,7 @@ class Course(NamedTuple):
 
 class _Reached(NamedTuple):
     z: np.ndarray
-    k: int  # number of the deviation
+    k: int  # index in `DEVIATIONS`
     here: list[Balanced]
     chi2: float
     cost: float
@@ -144,8 +147,8 @@ class _Reached(NamedTuple):
 class _Begun(NamedTuple):
     """State of a search."""
 
-    point: _Reached  # of the current deviation
-    visited: list[tuple[_Reached, np.ndarray]]  # end of each earlier deviation, with `_information` there
+    point: _Reached  # for the current deviation
+    visited: list[tuple[_Reached, np.ndarray]]  # end point for each earlier deviation, with its `_information`
     history: list[Content]
 
 
@@ -153,7 +156,7 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
     """The problem of a map.
 
     Args:
-        body, m: the elements and their matrices.
+        body, m: the body and its matrices.
         waves: the measured waves.
         whole: modulus of the whole organ at each frequency (F,) complex [Pa].
         length: correlation length of the prior [m].
@@ -173,13 +176,13 @@ def map_of(
     draws: int = 20,
     progress: Callable[[int, float], None] = lambda weight, chi2: None,
 ) -> WaveMap:
-    """The map that explains the waves.
+    """Find the map from the waves.
 
     Args:
-        course: from `course_of`.
-        file: HDF5 file to which the point of every step is written; None: no file.
+        course: the result of `course_of`.
+        file: HDF5 file into which every step is written; None: no file.
         resume: begin from that file if it exists.
-        draws: samples of the posterior.
+        draws: number of samples of the posterior.
         progress: called after every step with the index of the deviation, and with chi^2 per equation.
 
     Raises:
@@ -222,7 +225,8 @@ def sd_of_modulus(G: np.ndarray, sd: np.ndarray) -> np.ndarray:
 
 
 def _with_place(sd: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Standard deviations (F, P) with the uncertainty of places; slopes (3, P) are changes over the length w."""
+    """Standard deviations (F, P) that contain the uncertainty of positions. `slopes` (3, P): changes of c over the
+    length w."""
     return np.sqrt(sd**2 + np.sum(slopes**2, axis=0) / 12)
 
 
@@ -236,9 +240,10 @@ def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
 def _changes_over_slopes(
     body: VoxelBody, mean: scipy.sparse.csr_array, length: float
 ) -> tuple[scipy.sparse.csr_array, ...]:
-    """Change (P, P) of a field over a length [m], or over a brick's side if that is longer.
+    """For each axis, a matrix (P, P) that gives the change of a field over a length [m], or over the side of a brick if
+    the side is longer.
 
-    At each corner it is the mean of its elements' slopes, by volume.
+    The slope at a corner is the mean over the elements around it, weighted by volume.
     """
     tets, volumes = np.asarray(body.linear.tetrahedra), np.asarray(body.linear.volumes)
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
@@ -262,26 +267,27 @@ def _reached(course: Course, z: np.ndarray, k: int) -> _Reached:
 def _evidences(
     course: Course, visited: list[tuple[_Reached, np.ndarray]], components: int
 ) -> tuple[float, list[float]]:
-    """The factor by which chi^2 is too large, and the evidence of each deviation tried."""
+    """The factor by which chi^2 is too large, and the evidence of each tried deviation."""
     excess = max(1.0, min(p.chi2 for p, _ in visited) / components)
     return excess, [_evidence(course, p, information, excess) for p, information in visited]
 
 
 def _hessian(course: Course, k: int, information: np.ndarray) -> np.ndarray:
-    """The Hessian (P + L, P + L) by whitened z, of the deviation of number k."""
+    """The Hessian (P + L, P + L) by whitened z, for `DEVIATIONS[k]`."""
     scales = course.scales(k)
     return np.eye(len(information)) + scales[:, None] * information * scales
 
 
 def _evidence(course: Course, point: _Reached, information: np.ndarray, excess: float) -> float:
-    """Logarithm of the probability of the data at this deviation, up to a constant."""
+    """Logarithm of the probability of the data for this standard deviation of the prior, up to a constant."""
     H = _hessian(course, point.k, information / excess)
     logarithm = 2 * float(np.sum(np.log(np.real(np.diagonal(np.linalg.cholesky(H))))))
     return -0.5 * (point.chi2 / excess + float(np.vdot(point.z, point.z).real)) - logarithm
 
 
 def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reached, np.ndarray]]:
-    """Try one deviation after another, each from the last field, until chi^2 is down to the noise or evidence falls."""
+    """Try one deviation after another, until chi^2 is as low as the noise or the evidence falls. Each search begins at
+    the last field."""
     components = course.m.balances * len(course.waves.omega)
     point, visited, history = begun
     information, fresh = (visited[-1][1], False) if visited else (_information(course, point), True)
@@ -317,25 +323,25 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
 
 
 def _next_start(course: Course, point: _Reached) -> _Reached:
-    """The same field, written with the next deviation."""
+    """The same field, expressed with the next deviation."""
     return _reached(course, point.z * course.scales(point.k) / course.scales(point.k + 1), point.k + 1)
 
 
 def _information(course: Course, point: _Reached) -> np.ndarray:
-    """J^H J in whitened z of a field of deviation 1, complex (P + L, P + L)."""
+    """J^H J by whitened z for a field of deviation 1, complex (P + L, P + L)."""
     y = course.natural(course.scales(point.k) * point.z)
     H = np.zeros((len(y), len(y)), complex)
     for J, b in zip(course.jacobians(y, point.here), point.here, strict=True):
-        X = b.whitened(J, np.complex64)  # the Hessian only directs steps: it needs no more digits
+        X = b.whitened(J, np.complex64)  # single precision is enough for the direction of steps
         H += X.conj().T @ X
-    # T^T H T, with T the real matrix of `natural`, from both sides.
+    # This is T^T H T, where T is the real matrix of `natural`.
     half = course.whitened(H)
     return course.whitened(half.conj().T).conj().T
 
 
 def _newton_step(course: Course, point: _Reached, information: np.ndarray, excess: float) -> tuple[np.ndarray, float]:
-    """The step of Gauss-Newton (P + L,), and its length in the standard deviations of noise that makes chi^2 `excess`
-    times as large as expected.
+    """The Gauss-Newton step (P + L,), and its length in standard deviations. The noise counts as so large that chi^2 is
+    `excess` times its expected value.
     """
     scales = course.scales(point.k)
     y = course.natural(scales * point.z)
@@ -346,7 +352,8 @@ def _newton_step(course: Course, point: _Reached, information: np.ndarray, exces
 
 
 def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None:
-    """The point after the step, or after a part of it, where the cost is lower; None: it is nowhere lower."""
+    """The point after the step, or after a part of the step, at which the cost is lower; None if it is not lower at any
+    of them."""
     for part in (1.0, 0.5, 0.25, 0.1):
         new = _reached(course, point.z + part * step, point.k)
         if new.cost < point.cost:
@@ -357,7 +364,8 @@ def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None
 def _spread(
     course: Course, point: _Reached, information: np.ndarray, draws: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Standard deviations (F, P) before and after the data, and departures (D, F, P) of samples of the posterior."""
+    """Standard deviations (F, P) without and with the data, and differences (D, F, P) of posterior samples from the
+    map."""
     scales, n = course.scales(point.k)[:, None], len(point.z)
     L = np.linalg.cholesky(_hessian(course, point.k, information))
 
@@ -367,7 +375,8 @@ def _spread(
     before = course.natural(scales * np.eye(n))
 
     def each(y: np.ndarray) -> Iterator[np.ndarray]:
-        """c + l_f at the corners (P, n), one frequency at a time: all together would not fit into the memory."""
+        """c + l_f at the corners (P, n), one frequency at a time: all frequencies together would not fit into the
+        memory."""
         levels = y[course.corners :]
         return (y[: course.corners] + level for level in (levels if len(levels) else [0.0]))
 
@@ -381,7 +390,7 @@ _HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")
 
 
 def _write(file: Path | None, course: Course, begun: _Begun) -> None:
-    """Write the current point; the file is never left half written."""
+    """Write the current point. The file is replaced as a whole, so it is never half written."""
     if file is None:
         return
     with whole(file) as new, h5py.File(new, "w") as f:
@@ -392,7 +401,8 @@ def _write(file: Path | None, course: Course, begun: _Begun) -> None:
 
 
 def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
-    """Begin at a uniform organ, or at the point of an earlier run, whose earlier deviations are evaluated again."""
+    """Begin at a uniform organ, or at the point of an earlier run. The end points of its earlier deviations are
+    evaluated again."""
     if file is None or not file.is_file():
         return _Begun(_reached(course, np.zeros(course.exponents[0].shape[1], complex), 0), [], [])
     try:

@@ -1,4 +1,4 @@
-"""A body of quadratic elements whose nodes are voxels, so that measurements are motions of nodes."""
+"""A body of quadratic elements whose nodes are voxels. So the measured displacements are displacements of nodes."""
 
 import itertools
 from typing import NamedTuple
@@ -11,24 +11,25 @@ from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 
 class VoxelBody(NamedTuple):
-    """Bricks of 3 x 3 x 3 voxels, each cut into six quadratic elements; neighbours share their outer voxels."""
+    """Bricks of 3 x 3 x 3 voxels, each cut into six quadratic elements. Neighbouring bricks share their outer
+    voxels."""
 
-    linear: TetMesh  # of the corners
+    linear: TetMesh  # linear mesh of the corners
     mesh: TetMesh  # quadratic; the nodes of `linear` come first
-    voxel: np.ndarray  # (V, 3) index of each node's voxel
-    inner: np.ndarray  # (V,) bool: nodes with elements all around, where forces must balance
+    voxel: np.ndarray  # (V, 3) index of the voxel of each node
+    inner: np.ndarray  # (V,) bool: nodes with elements on all sides, where forces must balance
 
 
 def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None = None) -> VoxelBody:
-    """The bricks whose 27 voxels are all in the mask.
+    """The body of all bricks whose 27 voxels are in the mask.
 
     Args:
         mask: (nx, ny, nz) bool.
-        spacing: of the voxels (3,) [m].
+        spacing: spacing of the voxels (3,) [m].
         origin: centre of the first voxel (3,) [m]; None: 0.
 
     Raises:
-        InputError: the mask has no room for a brick, or for a node within bricks.
+        InputError: the mask has no room for a brick, or for a node with bricks on all sides.
     """
     first = _corner(mask)
     cells = tuple(int(n) for n in (np.array(mask.shape) - 1 - first) // 2)
@@ -40,7 +41,7 @@ def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None 
     kept = _whole_bricks(mask[tuple(slice(f, None) for f in first)], cells)
     inner = _surrounded(kept)
     if not inner.any():
-        raise InputError("the mask has no voxel that lies two voxels deep on every side: give a larger mask")
+        raise InputError("no voxel has two more voxels of the mask on every side: give a larger mask")
     used, tets = np.unique(_sixths(np.argwhere(kept), kept.shape), return_inverse=True)
     at = 2 * np.stack(np.unravel_index(used, tuple(n + 1 for n in kept.shape)), axis=1)
     start = np.zeros(3) if origin is None else np.asarray(origin)
@@ -58,9 +59,9 @@ def number_of_bricks(mask: np.ndarray) -> int:
 
 
 def _sixths(brick: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
-    """Corners (6 n, 4) of the elements of bricks (n, 3); every second brick is a mirror image along each axis.
+    """Corners (6 n, 4) of the elements of bricks (n, 3). Along each axis, every second brick is a mirror image.
 
-    So diagonals have no common direction, and waves of all directions have about the same speed.
+    So the diagonals have no common direction, and waves in all directions have about the same speed.
     """
     out = []
     for order in itertools.permutations(range(3)):
@@ -76,7 +77,7 @@ def _sixths(brick: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
 def _corner(mask: np.ndarray) -> np.ndarray:
     """First voxel (3,) of the smallest box around the mask."""
     if not mask.any():
-        raise InputError("the mask contains no voxel: give one that is true within the organ")
+        raise InputError("the mask contains no voxel: give a mask that is true within the organ")
     return np.array([np.flatnonzero(mask.any(axis=tuple(b for b in range(3) if b != a)))[0] for a in range(3)])
 
 
@@ -89,7 +90,7 @@ def _whole_bricks(mask: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
 
 
 def _surrounded(kept: np.ndarray) -> np.ndarray:
-    """Voxels (2 cells + 1) all of whose bricks are kept, and that are not at the end of the grid."""
+    """For each voxel (2 cells + 1): whether all its bricks are kept and it is not at the end of the grid."""
     inside = np.ones(tuple(2 * n + 1 for n in kept.shape), bool)
     for offset in np.ndindex(3, 3, 3):
         inside[_every_second(offset, kept.shape)] &= kept
@@ -103,7 +104,7 @@ def _every_second(offset: tuple[int, ...], cells: tuple[int, ...]) -> tuple[slic
 
 
 def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
-    """Values (V,) of a field that is linear in the elements, from its values at their corners."""
+    """Values (V,) at all nodes of a field that is linear in the elements, from its values at the corners."""
     from liverjax.mesh.adjacency import PAIRS
 
     values = np.empty(body.mesh.number_of_nodes, corners.dtype)

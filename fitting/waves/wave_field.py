@@ -23,7 +23,7 @@ class WaveField(NamedTuple):
     spacing: np.ndarray  # (3,) [m]
     origin: np.ndarray  # (3,) [m], centre of the first voxel
     mask: np.ndarray  # (nx, ny, nz) bool: voxels of the organ
-    labels: np.ndarray | None  # (nx, ny, nz) whole numbers of regions; None: none are given
+    labels: np.ndarray | None  # (nx, ny, nz) whole numbers: the region of each voxel; None: not given
     noise: np.ndarray  # (F,) [m] standard deviation of real and of imaginary part of one component
     source: str = ""
     notes: tuple[str, ...] = ()
@@ -40,14 +40,15 @@ def read_waves(
     """Read .npz, .npy, HDF5, CSV or NIfTI (`formats`).
 
     Args:
-        path: of the displacements.
+        path: file of the displacements.
         frequencies: [Hz], if the file does not contain them.
-        mask, labels: files of whole numbers on the same voxels, if the file does not contain them.
-        unit: of the displacements, one of `UNITS`; default: that of the file, or m.
-        spacing: of the voxels (3,) [m], if the file does not contain it.
+        mask, labels: files with whole numbers on the same voxels, if the file of the displacements does not contain
+            them.
+        unit: unit of the displacements, one of `UNITS`. Default: the unit in the file, or else m.
+        spacing: spacing of the voxels (3,) [m], if the file does not contain it.
 
     Raises:
-        InputError: one sentence naming file, field, value and remedy.
+        InputError: one sentence with the file, the field, the value and the remedy.
     """
     name, found = str(path), formats.arrays(Path(path))
     more = {"mask": mask, "labels": labels}
@@ -91,8 +92,8 @@ def read_waves(
 
 
 def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object, spacing_given: bool) -> np.ndarray:
-    """The mask or labels from a separate file, whose voxels must be those of the waves; `place`: `formats.PLACE` of the
-    waves, or None.
+    """Read the mask or the labels from a separate file. It must have the same voxels as the waves. `place`:
+    `formats.PLACE` of the waves, or None.
     """
     values, own, elsewhere = formats.single(file, key, spacing_given)
     if elsewhere is not None and place is not None:
@@ -112,14 +113,14 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object
     return values
 
 
-#: Difference of two places, in voxels, that counts as none.
+#: Two positions count as equal if they differ by less than this (in voxels).
 SAME_PLACE = 0.1
-#: Part of the voxels up to which components of exactly 0 are told.
+#: Components of exactly 0 are reported if they are fewer than this part of the voxels.
 FEW = 0.2
 
 
 def _leave_out_rest(U: np.ndarray) -> list[str]:
-    """Set voxels that do not move to NaN, in place: many programs write 0 where they did not measure. Return notes."""
+    """Set voxels that do not move to NaN, in place. Many programs write 0 where they did not measure. Return notes."""
     notes, nothing = [], (U == 0) | np.isnan(U)
     still = np.all(nothing, axis=(0, 4))
     if np.any(still & np.any(U == 0, axis=(0, 4))):
@@ -130,18 +131,18 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
         if rests.any() and np.any(np.isfinite(u) & (u != 0)):
             u[rests] = np.nan
             notes.append(
-                f"{rests.sum()} voxels do not move in field {f + 1}, but in others: they count as not measured, at all "
+                f"{rests.sum()} voxels do not move in field {f + 1}, but in others: they count as not measured at all "
                 "frequencies"
             )
         several = np.isfinite(u) & np.any(np.isfinite(u) & (u != 0), axis=-1, keepdims=True)
         zeros = (u == 0) & several
-        zeros &= zeros.sum(axis=(0, 1, 2)) < FEW * several.sum(axis=(0, 1, 2))  # more: a wave of a plane symmetry
+        zeros &= zeros.sum(axis=(0, 1, 2)) < FEW * several.sum(axis=(0, 1, 2))  # more: a plane of symmetry
         if zeros.any():
             notes.append(
                 f"field {f + 1} has {zeros.sum()} components that are exactly 0 in voxels that move: write NaN where a "
                 "component was not measured"
             )
-    # A wave may have one direction only, so a component of zeros is kept.
+    # A wave may move in one direction only, so a component that is zero everywhere is kept.
     resting = np.all(nothing, axis=(0, 1, 2, 3)) & np.any(U == 0, axis=(0, 1, 2, 3))
     for axis in np.array(list("xyz"))[resting]:
         notes.append(f"component {axis} is zero everywhere: write NaN where it was not measured")
@@ -149,7 +150,7 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
 
 
 def with_noise(field: WaveField, noise: float | None) -> WaveField:
-    """The field with this noise [m], or with its own noise, which must be above 0."""
+    """The field with this noise [m]. If it is None, the field keeps its noise, which must be above 0."""
     if noise is not None:
         return field._replace(noise=np.full(len(field.frequencies), noise))
     unknown = ~(field.noise > 0)
@@ -162,7 +163,7 @@ def with_noise(field: WaveField, noise: float | None) -> WaveField:
 
 
 def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
-    """Complex displacements (F, nx, ny, nz, 3) in the file's unit, and notes."""
+    """Complex displacements (F, nx, ny, nz, 3) in the unit of the file, and notes."""
     if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, equally spaced
         u = _instants(name, "phases", found["phases"])
         U = 2 * np.fft.fft(u, axis=-5)[..., 1, :, :, :, :] / u.shape[-5]
@@ -205,7 +206,7 @@ def _is_image(name: str) -> bool:
 
 
 def _layout(name: str) -> str:
-    """How a file holds the waves."""
+    """The array layout of the waves in a file, for messages."""
     if _is_image(name):
         return "complex numbers (nx, ny, nz, 3), with several frequencies (nx, ny, nz, F, 3)"
     return "(F, nx, ny, nz, 3), frequencies first, components last"
@@ -229,7 +230,7 @@ def _array_of_numbers(name: str, field: str, values: Numbers) -> np.ndarray:
 
 
 def _plain(name: str, field: str, values: object) -> np.ndarray:
-    """Real numbers as one row."""
+    """Real numbers as a flat array."""
     try:
         return np.asarray(values, float).ravel()
     except (TypeError, ValueError):
@@ -281,16 +282,16 @@ def _whole_numbers(name: str, field: str, values: object, shape: tuple[int, ...]
     return a.astype(int)
 
 
-#: Weights of the fourth difference, whose sum of squares is 70.
+#: Weights of the fourth difference. The sum of their squares is 70.
 _FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 
 
 def noise_of(field: WaveField) -> np.ndarray:
-    """Standard deviation (F,) [m] of real and imaginary part of one component, from the data themselves.
+    """Standard deviation (F,) [m] of the noise in real and imaginary part of one component, estimated from the data.
 
-    It is found from fourth differences along the axis on which they are smallest. A smooth wave adds little to them,
-    and a few bad voxels do not change their median. A wave adds (k h)^4 / 8 of its motion: 0.12 % at 20 voxels per
-    wavelength, 4 % at 8. It is NaN if no five voxels lie in a row.
+    It is computed from fourth differences along the axis on which they are smallest. A few bad voxels do not change
+    their median. A smooth wave adds little: (k h)^4 / 8 of its motion, which is 0.12 % at 20 voxels per wavelength and
+    4 % at 8. The result is NaN if the mask has too few rows of five voxels.
     """
     out = np.full(len(field.frequencies), np.nan)
     for f, U in enumerate(field.displacement):
@@ -306,13 +307,14 @@ def noise_of(field: WaveField) -> np.ndarray:
             if d.size >= 30:
                 parts = np.abs(np.concatenate([d.real, d.imag]))
                 own = np.median(parts) / 0.6745 / np.sqrt(np.sum(_FOURTH**2))
-                best = own if np.isnan(best) else min(best, own)  # the axis on which the wave adds least
+                best = own if np.isnan(best) else min(best, own)  # the wave adds least along this axis
         out[f] = best
     return out
 
 
 def coarsened(field: WaveField, stride: int) -> WaveField:
-    """Means of stride^3 voxels that are all in the mask. In a uniform organ the means are a wave of the same length."""
+    """The field of means over stride^3 voxels that are all in the mask. In a uniform organ, these means are a wave of
+    the same wavelength."""
     if stride == 1:
         return field
     n = np.array(field.mask.shape) // stride
@@ -336,7 +338,8 @@ def coarsened(field: WaveField, stride: int) -> WaveField:
 
 
 def _most_frequent(labels: np.ndarray, stride: int, blocks: tuple[int, ...]) -> np.ndarray:
-    """The label that most voxels of a block have; if two are equally frequent, lower and higher ones in turn."""
+    """The most frequent label in each block. If two labels are equally frequent, the lower and the higher one are used
+    in turn."""
     known = np.unique(labels)
     turn = np.where(np.indices(blocks[::2]).sum(axis=0) % 2, 1.0, -1.0)
     counts = [

@@ -1,8 +1,8 @@
 """The choice between models of several families by their information criteria.
 
-If one model contains another, the general one is at least as close to any data. It is chosen only if the criterion is
-strong evidence for it (Kass and Raftery 1995, J. Am. Stat. Assoc. 90): a general model that the data do not need
-predicts worse outside their band.
+If one model contains another, the general model always follows the data at least as closely. The general model is
+chosen only if the criterion is strong evidence for it (Kass and Raftery 1995, J. Am. Stat. Assoc. 90). If the data do
+not need the general model, its predictions outside the measured band are worse.
 """
 
 from collections.abc import Sequence
@@ -10,15 +10,17 @@ from typing import NamedTuple, Protocol
 
 from fitting.fits.viscoelastic import FLUID, Kind
 
-#: Models that a model becomes for some values of its numbers. `contains` adds three cases: a spectrum can become
-#: any model, `prony` a fluid with at most as many modes, and a Zener model with the exponent 1 a single mode.
+#: For each general model, its special cases: the models that it equals for some values of its parameters. `contains`
+#: adds three cases. A spectrum contains every model. `prony` contains every fluid with at most as many modes. A
+#: fractional Zener model contains a single Prony mode (exponent 1).
 SPECIAL_CASES = {
     "fractional_kelvin_voigt": ("springpot",),
     "fractional_maxwell": ("springpot",),
     "fractional_parallel": ("springpot", "fractional_kelvin_voigt"),
     "fractional_zener": ("springpot", "fractional_kelvin_voigt"),
 }
-#: A model must be better than its special case by this difference of the criterion: strong evidence.
+#: A model is chosen only if its criterion is lower than the criterion of its special case by this difference (strong
+# evidence).
 GENERAL = 6.0
 
 
@@ -30,7 +32,7 @@ class Label(NamedTuple):
 
 
 def contains(general: Label, special: Label) -> bool:
-    """Whether the first model becomes the second for some of its numbers."""
+    """Whether the first model equals the second for some values of its parameters."""
     if general.name == special.name:
         return False
     if general.name == "spectrum" or special.name in SPECIAL_CASES.get(general.name, ()):
@@ -41,7 +43,8 @@ def contains(general: Label, special: Label) -> bool:
 
 
 def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
-    """Index of the model with the lowest criterion among those better than their special cases by `GENERAL`."""
+    """Index of the model with the lowest criterion. A model counts only if it is better than its special cases by
+    `GENERAL`."""
     beaten = {
         j
         for j, general in enumerate(labels)
@@ -53,11 +56,11 @@ def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
 
 
 class OfAKind(Protocol):
-    """Attributes that a fit of any data has."""
+    """Attributes that every fit has, whatever its data."""
 
     @property
     def kind(self) -> Kind:
-        """The meaning of its numbers."""
+        """The model, with the meaning of its parameters."""
 
     @property
     def modes(self) -> int:
@@ -65,5 +68,5 @@ class OfAKind(Protocol):
 
 
 def label_of(fit: OfAKind) -> Label:
-    """The label of a fit; only Prony modes have a number of modes."""
+    """The label of a fit. Only models made of Prony modes have a number of modes."""
     return Label(fit.kind.name, fit.modes if fit.kind.values is None else 0)

@@ -1,4 +1,4 @@
-"""Hyperelastic laws as families of models: their numbers to be fitted, and starts for these."""
+"""Hyperelastic laws as families of models: the parameters to be fitted, and start values for these parameters."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +15,7 @@ from liverjax.laws import Law, gradient_check
 
 
 class Candidate(NamedTuple):
-    """A law to be fitted, and the functions from unconstrained numbers u to its parameters."""
+    """A law to be fitted, and the functions that turn unconstrained variables u into its parameters."""
 
     label: str
     names: tuple[str, ...]
@@ -27,8 +27,8 @@ class Candidate(NamedTuple):
 
 
 def candidates(name: str, terms: int | None = None) -> list[Candidate]:
-    """The law with this name or FILE.py:LAW, or for `all` the laws of this package. Without `terms`, Ogden's law comes
-    with several numbers of terms.
+    """The law with this name or at FILE.py:LAW. The name `all` gives all laws of this package. Without `terms`, Ogden's
+    law is returned several times, with different numbers of terms.
 
     Raises:
         InputError: unknown law, or a law whose energy is not an isochoric energy plus U(J).
@@ -60,7 +60,7 @@ def _candidate(label: str, law: Law) -> Candidate:
 
 def _sum(label: str, parts: list[Candidate]) -> Candidate:
     """The candidate for a sum of laws; parameters are named as in a scene: `1.mu` is mu of the second law."""
-    ends = np.cumsum([len(p.names) for p in parts])[:-1]  # as many unconstrained numbers as parameters
+    ends = np.cumsum([len(p.names) for p in parts])[:-1]  # there are as many unconstrained variables as parameters
 
     def values(u, scale):
         return jnp.concatenate([p.values(v, scale) for p, v in zip(parts, jnp.split(u, ends), strict=True)])
@@ -93,7 +93,7 @@ def _single(label: str, typical: Law) -> Candidate:
     middle = np.array([float(getattr(typical, n)) for n in names])
     positive = np.array([f.metadata.get("above") == 0 for f in fields])
     modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
-    # Higher terms alone have G = 0.
+    # A law with only higher terms has G = 0.
     size = abs(ground_state_modulus(typical)) or np.abs(middle[modulus]).max(initial=0.0)
     middle = middle / np.where(modulus, size, 1.0)
 
@@ -104,7 +104,7 @@ def _single(label: str, typical: Law) -> Candidate:
     def random(rng, n):
         near = np.log(np.abs(middle)) + 1.5 * rng.standard_normal((n, len(names)))
         u = np.where(positive, near, middle * np.exp(rng.standard_normal((n, len(names)))))
-        # An exponent alpha may have either sign; other free numbers are coefficients.
+        # An exponent alpha may be positive or negative. The other parameters without a bound are coefficients.
         alpha = np.array([m == "alpha" for m in names])
         return np.where(alpha, _exponents_of_law(rng, (n, len(names))), u)
 
@@ -115,7 +115,7 @@ def _single(label: str, typical: Law) -> Candidate:
 
 
 def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
-    """Fields to be fitted (their number is not 0), and notes on the others.
+    """The fields to be fitted (their value is not 0), and notes on the fields that are not fitted.
 
     Raises:
         InputError: a parameter is a list, or no parameter is left to be fitted.
@@ -126,8 +126,8 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
     for f in given:
         if isinstance(getattr(law, f.name), Law) or np.ndim(getattr(law, f.name)) > 0:
             raise InputError(
-                f"law {label}: {f.name} of {type(law).__name__} is not one number, which the fit of curves requires: "
-                "give a law whose parameters are numbers"
+                f"law {label}: {f.name} of {type(law).__name__} is not a single number: the fit of curves needs a law "
+                "whose parameters are single numbers"
             )
     zero = [f.name for f in given if float(getattr(law, f.name)) == 0]
     fitted = [f for f in given if f.name not in zero]
@@ -143,7 +143,7 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
 
 
 def ground_state_modulus(law: Law) -> float:
-    """Shear modulus of the ground state [Pa]; if a law does not state it, dP12/dF12 there."""
+    """Shear modulus in the undeformed state [Pa]. If the law does not give it, dP12/dF12 in this state is returned."""
     try:
         return float(law.shear_modulus())
     except InputError:

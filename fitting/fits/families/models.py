@@ -1,7 +1,8 @@
-"""Models beyond free Prony modes, fitted in closed form: springpots, a spectrum on a grid, fluids; and how to choose.
+"""Further models besides free Prony modes (springpots, a spectrum on a grid, fluids), and the choice between them.
+Their moduli are known in closed form, without simulation.
 
-All are compared by the information criterion that also chooses the number of modes. Each is converted to Prony modes
-for the simulation; the fit states the error of this conversion over the band.
+The same information criterion compares all models and chooses the number of modes. For the simulation, each model is
+converted to Prony modes. The fit gives the error of this conversion over the band.
 """
 
 import time
@@ -28,14 +29,14 @@ STRONG = 10.0
 
 #: Distance from 0 and 1 below which an exponent is at its bound.
 BOUND = 1e-3
-#: Distance below which it is at its bound, however well it is known.
+#: Below this distance an exponent is at its bound, even if its standard error is small.
 SHARP = 1e-4
 
 
 def fractional(sweep: Sweep) -> list[Fit]:
-    """Every model of `springpots.FRACTIONAL`, each at the best minimum of 24 starts."""
+    """Fits every model of `springpots.FRACTIONAL`. Each fit is the best minimum from 24 start points."""
     starts = springpots.starting_points(sweep)
-    # A model with as many numbers as data fits anything without a residual, so its fit proves nothing.
+    # A model with as many parameters as data fits any data without residuals. Its fit would prove nothing.
     most = 2 * len(np.unique(sweep.angular_frequency))
     out = []
     for model in springpots.FRACTIONAL:
@@ -69,7 +70,8 @@ def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution,
 
 
 def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = None) -> Fit:
-    """Fit a smooth, non-negative spectrum with 2 or 3 relaxation times per decade; `found`: one computed before."""
+    """Fit a smooth, non-negative spectrum with 2 or 3 relaxation times per decade. `found`: a spectrum computed
+    before."""
     found = found or relaxation_spectrum.fit(sweep)
     solid = int(found.equilibrium > 0)
     strengths = np.concatenate([[found.equilibrium], found.strengths])[1 - solid :]
@@ -127,8 +129,8 @@ def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
     sentences = [_cut_off(fit)] if fit.kind.name != "fractional_zener" and fit.kind.effective is None else []
     if made.error > as_prony_modes.ALLOWED:
         sentences.append(
-            f"{fit.modes} Prony modes follow the model {fit.kind.name} to {100 * made.error:.2g} % only; simulate a "
-            "narrower band with --max-frequency"
+            f"{fit.modes} Prony modes follow the model {fit.kind.name} only within {100 * made.error:.2g} %: simulate "
+            "a narrower band with --max-frequency"
         )
     sentences += limits.limit_sentences(fit.kind.name, fit.uncertainty, fit.model, fit.parameters)
     warnings = (*fit.warnings, *sentences, *undetermined(fit))
@@ -138,24 +140,24 @@ def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
 
 def _cut_off(fit: Fit) -> str:
     return (
-        f"the model {fit.kind.name} has no finite instantaneous modulus: shear_modulus is that of the {fit.modes} "
-        "Prony modes that represent it over the measured band, and is not valid at higher frequencies"
+        f"the model {fit.kind.name} has no finite instantaneous modulus: shear_modulus belongs to the {fit.modes} "
+        "Prony modes that represent the model over the measured band, and is not valid at higher frequencies"
     )
 
 
 def undetermined(fit: Any) -> list[str]:
-    """Sentences on the numbers of a fractional model (of any fit) that the data do not determine."""
+    """Sentences on the parameters of a fractional model that the data do not determine. The fit may be of any kind."""
     if fit.parameters is None or fit.kind.effective is not None:
         return []
     free = [n for n, ok in zip(fit.kind.names, determined(fit.parameters), strict=True) if not ok]
     told = at_bounds(fit.parameters)
     if free:
-        told.append(f"the data leave {' and '.join(free)} of the model {fit.kind.name} free: take a simpler model")
+        told.append(f"the data do not determine {' and '.join(free)} of the model {fit.kind.name}: use a simpler model")
     return told
 
 
 def at_bounds(own: Estimate) -> list[str]:
-    """A sentence for each exponent at its bound, where a standard error says nothing."""
+    """A sentence for each exponent at its bound. The standard error of such an exponent has no meaning."""
     out = []
     for name, value, bound in zip(own.names, own.values, _bounded(own), strict=True):
         if bound:
@@ -168,26 +170,29 @@ def at_bounds(own: Estimate) -> list[str]:
 
 
 def determined(own: Estimate) -> np.ndarray:
-    """Which numbers of a model have an error below half their value; exponents may also be 0 or 1 (spring, dashpot)."""
+    """For each parameter: whether the data determine it. Its error is below half its value, or it is an exponent at 0
+    or 1."""
     return (own.standard_errors < 0.5 * np.abs(own.values)) | _bounded(own)
 
 
 def _bounded(own: Estimate) -> np.ndarray:
-    """Which numbers are exponents at 0 or 1: nearly an elastic solid has a small exponent that is known well."""
+    """For each parameter: whether it is an exponent at 0 or 1. A nearly elastic solid may have a small exponent with a
+    small error; this exponent is not at its bound."""
     off = np.minimum(own.values, 1 - own.values)
     known = (own.standard_errors < 0.1 * np.abs(off)) & (off > SHARP)
     return np.array(["exponent" in name for name in own.names]) & (off < BOUND) & ~known
 
 
 def identifiable(fit: Fit, sweep: Sweep) -> bool:
-    """Whether the fit converged and the data determine every number of the model. A spectrum has a prior."""
+    """Whether the fit converged and the data determine every parameter. A spectrum need only converge: it has a
+    prior."""
     if fit.parameters is None:
         return viscoelastic.identifiable(fit, sweep)
     return fit.converged and (fit.kind.effective is not None or bool(np.all(determined(fit.parameters))))
 
 
 def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
-    """Fit modes without an equilibrium modulus; the criterion chooses their number."""
+    """Fit modes without an equilibrium modulus. The information criterion chooses the number of modes."""
     largest = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
     chosen, failures = None, 0
     for modes in range(1, largest + 1):
@@ -206,7 +211,7 @@ def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
 
 
 def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> list[Fit]:
-    """The fits from which `choose` chooses; arguments as there."""
+    """The fits from which `choose` chooses. The arguments are the same as for `choose`."""
     tried: list[Fit] = []
     if model in ("fractional", "auto"):
         tried += fractional(sweep)
@@ -220,19 +225,19 @@ def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) ->
 
 
 def best_of_models(tried: Sequence[Fit], sweep: Sweep) -> tuple[Fit, list[Fit]]:
-    """The best model, and all models whose numbers the data determine (all of `tried`, if there is none)."""
+    """The best model, and all models whose parameters the data determine. If there is no such model, all of `tried`."""
     able = [fit for fit in tried if identifiable(fit, sweep)] or list(tried)
     return able[preferred([label_of(f) for f in able], [information_criterion(f) for f in able])], able
 
 
 def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
-    """The model of lowest criterion (`preferred`) among those whose numbers the data determine.
+    """The model with the lowest criterion (`preferred`) among the models whose parameters the data determine.
 
     Args:
         sweep: data.
         model: one of `MODELS` except "prony".
-        prony: the best fit of Prony modes, for the comparison of "auto".
-        dense: as in `viscoelastic.closed_form`.
+        prony: the best fit of Prony modes; with "auto" it is compared too.
+        dense: the same argument as in `viscoelastic.closed_form`.
     """
     tried = every_model(sweep, model, prony, dense)
     chosen, able = best_of_models(tried, sweep)
@@ -264,7 +269,8 @@ def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
 
 
 def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
-    """Sentences if another model fits the data about as well, or better but with numbers that they do not determine."""
+    """Sentences if another model fits the data about as well, or if it fits them better but the data do not determine
+    all its parameters."""
     best, out = min(tried, key=information_criterion), []
     if information_criterion(best) < information_criterion(chosen) - STRONG:
         apart = information_criterion(chosen) - information_criterion(best)
@@ -282,7 +288,8 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     return [
         *out,
         f"{second.kind.name} explains the data about as well as {chosen.kind.name} (criterion {apart:.2g} higher; 10 "
-        "is strong evidence): the data do not decide between them, least of all beyond their band",
+        "is strong evidence): the data do not decide between these models, and outside the measured band they may "
+        "differ much",
     ]
 
 

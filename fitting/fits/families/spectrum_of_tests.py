@@ -1,7 +1,7 @@
 """A smooth spectrum on a fixed grid of relaxation times, from a test in time or from several tests together.
 
-Stress is linear in the strengths, so sweeps and relaxation are solved at once (`relaxation_spectrum`). Creep and shear
-waves are not linear in the strengths: for them the linearised problem is solved repeatedly.
+Stress is linear in the strengths, so sweeps and relaxation tests need one solution only (`relaxation_spectrum`). Creep
+and shear waves are not linear in the strengths. For them the linearised problem is solved repeatedly.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,14 +23,16 @@ from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 from liverjax.solvers.blas import one_blas_thread
 
-#: Weights of the second differences that are tried, largest first, and most iterations for each weight.
+#: Weights of the second differences that are tried, largest first; and the maximum number of iterations for each
+# weight.
 WEIGHTS, MOST_TANGENTS = np.logspace(4, -6, 21), 30
-#: Relative decrease of the cost at which a search ends; strength in place of 0, in the unit of the grid.
+#: A search ends if the cost decreases by less than this part (STILL). A strength of 0 is replaced by NONE, in the unit
+# of the grid.
 STILL, NONE = 1e-9, 1e-12
 
 
 class SpectrumFit(NamedTuple):
-    """A spectrum with all numbers that the reports of tests need."""
+    """A spectrum with everything that the reports of tests need."""
 
     kind: Kind
     model: Maxwell  # few Prony modes that represent it
@@ -42,7 +44,7 @@ class SpectrumFit(NamedTuple):
 
 
 def _modes_on_grid(grid: GridOfTimes) -> Callable[[np.ndarray], Maxwell]:
-    """A function: equilibrium modulus and strengths (…, 1 + K) in units of the grid -> Prony modes, in NumPy."""
+    """A NumPy function from equilibrium modulus and strengths (…, 1 + K) in units of the grid to Prony modes."""
 
     def maxwell(x):
         strengths = grid.unit * (x + NONE)
@@ -60,7 +62,8 @@ class _Minimum(NamedTuple):
 
 
 def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> _Minimum:
-    """Least squares with x >= 0 and the grid's smoothness: Gauss-Newton from x, steps halved until the cost falls."""
+    """Least squares with x >= 0 and the smoothness of the grid. Gauss-Newton begins at x and halves each step until the
+    cost falls."""
     L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
     kind = Kind("spectrum", _modes_on_grid(grid))
 
@@ -80,7 +83,7 @@ def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> 
             trial = x + length * (target - x)
             new, length = at(trial), 0.5 * length
         if new is None or not new[2] < cost:
-            return _Minimum(x, r, J, True)  # no step gains: at the minimum, to roundoff
+            return _Minimum(x, r, J, True)  # no step lowers the cost: this is the minimum, up to roundoff
         still = cost - new[2] <= STILL * cost
         x, (r, J, cost) = trial, new
         if still:
@@ -91,11 +94,11 @@ def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> 
 def spectrum_of(
     tests: Sequence[Measured], near: Maxwell, noise: np.ndarray
 ) -> tuple[GridSpectrum, GridOfTimes, _Minimum]:
-    """The spectrum for the grid and the weight of smoothness that have the best evidence.
+    """The spectrum with the grid and the smoothness weight that have the best evidence.
 
     Args:
         tests: one or more.
-        near: Prony modes with about the same moduli; these give the unit of each strength.
+        near: Prony modes with about the same moduli. They give the unit of each strength.
         noise: relative noise of each test.
     """
     low, high = together.resolved_by(tests)
@@ -125,13 +128,14 @@ def _weighed_parts(tests: Sequence[Measured], noise: np.ndarray) -> list:
 def _as_a_fit(
     tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, told: GridSpectrum, over: Callable | None = None
 ) -> SpectrumFit:
-    """The spectrum as a fit; `over` divides the residuals of its minimum by their noise (None: noise is estimated)."""
+    """The spectrum as a fit. `over` divides the residuals at the minimum by their noise; with None, the noise is
+    estimated."""
     low, high = together.resolved_by(tests)
     kept = found.x[1:] > 1e-10 * found.x.max()
     solid = told.equilibrium > 0
     free = np.concatenate([[solid], kept])
     strengths = np.concatenate([[told.equilibrium], told.strengths])[1 - int(solid) :]
-    slopes = (found.J / grid.unit)[:, free] * strengths  # by the logarithms of the strengths
+    slopes = (found.J / grid.unit)[:, free] * strengths  # derivatives by the logarithms of the strengths
     prior = told.prior[:, 1 - int(solid) :] * strengths
 
     def moduli(u, omega):
@@ -156,7 +160,7 @@ def _as_a_fit(
     own = estimated(names, host.exponential, solution, len(found.r), over is not None, told.effective)
     sentences = []
     if made.error > as_prony_modes.ALLOWED:
-        sentences.append(f"{len(made.times)} Prony modes follow the spectrum to {100 * made.error:.2g} % only")
+        sentences.append(f"{len(made.times)} Prony modes follow the spectrum only within {100 * made.error:.2g} %")
     details: Content = {
         "conversion": {"modes": len(spread.values) // 2, "largest_relative_error": made.error},
         "spectrum": {
@@ -183,7 +187,7 @@ def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
 
 
 def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -> Together:
-    """The spectrum of several tests, each with noise of its own; `near`, `noise` as in `spectrum_of`."""
+    """The spectrum of several tests, each with its own noise. `near` and `noise` are the same as in `spectrum_of`."""
     parts = [together.reported_numbers(t) for t in tests]
     for _ in range(2):
         told, grid, found = spectrum_of(tests, near, noise)

@@ -1,7 +1,8 @@
-"""Springpot models of tests in time, and of several tests together; the choice between all models.
+"""Springpot models for tests in time and for several tests together, and the choice between all models.
 
-A springpot model answers through the modes of its own relaxation spectrum (`springpots.as_modes`), so drive, ramp and
-creep are computed as for Prony modes. Its own few numbers are what is fitted and reported.
+The response of a springpot model is computed with many modes of its relaxation spectrum (`springpots.as_modes`). Drive,
+ramp and creep are therefore computed as for Prony modes. The fit varies and reports only the few parameters of the
+springpot model.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,15 +32,17 @@ from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 
-#: Starts of each model, spread of the random starts around the one from Prony modes, and most iterations.
+#: Number of starts for each model; standard deviation of the random starts around the start from Prony modes; maximum
+# number of iterations.
 STARTS, AROUND, MOST_STEPS = 10, 1.0, 80
-#: An exponent is a logistic function of its number. At larger numbers its slope is too small for a search to begin.
+#: An exponent is a logistic function of its variable. For variables above this size, the slope is too small to begin a
+# search.
 MOST_LOGIT = 2.0
 
 
 class Spans(NamedTuple):
-    """Times [s] of the modes that springpots are computed with, and the frequency [rad/s] at which their numbers are
-    stated."""
+    """Times [s] of the modes with which springpots are computed, and the frequency [rad/s] to which their parameters
+    refer."""
 
     low: float  # shortest time [s] that the tests resolve
     high: float
@@ -54,7 +57,7 @@ def spans_of(tests: Sequence[Measured]) -> Spans:
 
 
 def _dense_modes(case: Fractional, spans: Spans) -> Callable[[Array], Maxwell]:
-    """A function: the model's own numbers u -> the Prony modes of its relaxation spectrum, in NumPy or JAX."""
+    """A function, in NumPy or JAX, from the variables u of the model to the Prony modes of its relaxation spectrum."""
 
     def maxwell(u):
         return springpots.as_modes(springpots.full(case, u), case.switches, spans.times, spans.reference)
@@ -63,7 +66,7 @@ def _dense_modes(case: Fractional, spans: Spans) -> Callable[[Array], Maxwell]:
 
 
 def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], jax.Array]:
-    """A function: the model's own numbers u -> residuals (m,) of a relaxation or creep test; in JAX."""
+    """A JAX function from the variables u of the model to the residuals (m,) of a relaxation or creep test."""
     (case,) = (c for c in FRACTIONAL if c.name == name)
     maxwell, (at, measured, scales) = _dense_modes(case, spans_of([test])), together.reported_numbers(test)
 
@@ -76,7 +79,8 @@ def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], j
 def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.ndarray, data: list) -> Solution:
     """The best minimum of a model for tests from starts (S, P).
 
-    `data`: for each test the arrays that predict it, its measured numbers, and the divisors of its residuals.
+    `data`: for each test, the arrays from which it is predicted, its measured values, and the divisors of its
+    residuals.
     """
     kind = Kind(case.name, _dense_modes(case, spans_of(tests)))
     evaluate = partial(together.tests_evaluated, list(map(together.name_of, tests)), kind)
@@ -84,7 +88,8 @@ def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.nda
 
 
 def _starts_near(model: Maxwell, spans: Spans) -> list[np.ndarray]:
-    """Starts (STARTS, P) of each model: the model fitted to the moduli of Prony modes, and points around it."""
+    """Starts (STARTS, P) for each model. The first start fits the model to the moduli of Prony modes; the others lie
+    around it."""
     omega = np.geomspace(1 / spans.high, 1 / spans.low, 24)
     like, rng = Sweep(omega, *generalised_maxwell.moduli(model, omega)), np.random.default_rng(0)
     first = [np.asarray(fit.solution.u) for fit in models.fractional(like)]
@@ -92,7 +97,7 @@ def _starts_near(model: Maxwell, spans: Spans) -> list[np.ndarray]:
 
 
 def _around(u: np.ndarray, case: Fractional, rng: np.random.Generator) -> np.ndarray:
-    """Random starts (STARTS - 1, P) about numbers u (P,) of a model, exponents not near 0 or 1."""
+    """Random starts (STARTS - 1, P) around the variables u (P,) of a model. Exponents do not begin near 0 or 1."""
     near = np.where(np.array(case.free) % 2 == 1, np.clip(u, -MOST_LOGIT, MOST_LOGIT), u)
     return near + AROUND * rng.standard_normal((STARTS - 1, len(u)))
 
@@ -105,13 +110,13 @@ class _Springpot(NamedTuple):
     model: Maxwell  # few Prony modes that represent it
     solution: Solution
     spread: Estimate  # of the Prony modes
-    own: Estimate  # of its own numbers
+    own: Estimate  # of the springpot model's parameters
     sentences: tuple[str, ...]
-    error: float  # largest relative error of these modes over the band
+    error: float  # largest relative error of the few Prony modes over the band
 
 
 def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise: bool) -> _Springpot:
-    """A model at its minimum; `over_noise`: residuals are divided by a known noise, so none is estimated."""
+    """A model at its minimum. `over_noise`: the residuals are divided by a known noise, so no noise is estimated."""
 
     def at(u, omega):
         return springpots.moduli(springpots.full(case, u), case.switches, omega / spans.reference)
@@ -121,7 +126,7 @@ def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise
 
     def moduli(omega):
         storage, loss = at(solution.u, omega)
-        return storage, np.maximum(loss, 1e-12 * np.hypot(storage, loss))  # after a fit that diverged: no loss left
+        return storage, np.maximum(loss, 1e-12 * np.hypot(storage, loss))  # a fit that diverged may have no loss
 
     made = as_prony_modes.convert(moduli, 1 / spans.high, 1 / spans.low, case.solid)
     kind = Kind(case.name, lambda u: as_prony_modes.modes(made, at(u, made.omega)), case.names, case.units, values)
@@ -131,7 +136,9 @@ def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise
     apart = float(np.max(np.abs((storage + 1j * loss) / (real + 1j * imaginary) - 1)))
     for error, what in ((made.error, f"{len(made.times)} Prony modes"), (apart, "the modes used in the fit")):
         if error > as_prony_modes.ALLOWED:
-            sentences.append(f"{what} follow the model {case.name} to {100 * error:.2g} % only: take another --model")
+            sentences.append(
+                f"{what} follow the model {case.name} only within {100 * error:.2g} %: try another --model"
+            )
     own = estimated(case.names, values, solution, len(solution.residuals), over_noise)
     spread = uncertainty.estimate(solution, over_noise, kind.maxwell)
     model = kind.maxwell(solution.u)
@@ -140,14 +147,15 @@ def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise
 
 
 def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
-    """Whether the fit converged and the data determine every number."""
+    """Whether the fit converged and the data determine every parameter."""
     if fit.parameters is not None:
         return fit.converged and (fit.kind.effective is not None or bool(np.all(models.determined(fit.parameters))))
     return fit.converged and not uncertainty.superfluous(data, fit.uncertainty)
 
 
 def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
-    """Every springpot model of a relaxation or creep test; `near`: Prony modes to begin from."""
+    """Fits every springpot model to a relaxation or creep test. `near`: Prony modes from which the starts are
+    computed."""
     spans, data = spans_of([test]), [together.reported_numbers(test)]
     _, answer, scales = data[0]
     out = []
@@ -163,7 +171,7 @@ def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
 
 
 def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> TimeFit:
-    """The model of the lowest criterion among those whose numbers the test determines.
+    """The model with the lowest criterion among the models whose parameters the test determines.
 
     Args:
         test: data.
@@ -217,7 +225,7 @@ TIMES = ("run_time", "compile_time")
 
 
 def _cautions_in_time(fit: TimeFit) -> list[str]:
-    out = [] if fit.converged else ["the fit did not converge; its best point is given: take another --model"]
+    out = [] if fit.converged else ["the fit did not converge; its best point is given: try another --model"]
     assert fit.parameters is not None
     mean = float(fit.relative_errors.mean())
     if mean > 0.05:
@@ -227,7 +235,8 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
 
 
 def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
-    """Every springpot model of several tests, each test with noise of its own; `near`: Prony modes to begin from."""
+    """Fits every springpot model to several tests, each with its own noise. `near`: Prony modes that give the
+    starts."""
     spans, parts = spans_of(tests), [together.reported_numbers(t) for t in tests]
     out = []
     for case, starts in zip(FRACTIONAL, _starts_near(near, spans), strict=True):
@@ -236,7 +245,7 @@ def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
             used, data = noise, [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
             minimum = _minimum_of_case(case, tests, starts, data)
             noise = together.noises(tests, parts, np.asarray(minimum.residuals), noise, len(case.free))
-            starts = np.asarray(minimum.u)[None]  # near the minimum already
+            starts = np.asarray(minimum.u)[None]  # the next round begins near the minimum
         shares, fitted = together.misfits(tests, data, np.asarray(minimum.residuals), noise, len(case.free))
         found = _springpot_at(case, together.over_own_noise(minimum, shares, used / noise), spans, over_noise=True)
         own = (tests, found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
@@ -251,9 +260,9 @@ def choose_together(
     progress: Callable[[str], None] = lambda text: None,
     relative: float = 0.0,
 ) -> Together:
-    """The model of the lowest criterion for several tests; arguments as in `choose_in_time` and `together.fit`.
+    """The model with the lowest criterion for several tests. Arguments: see `choose_in_time` and `together.fit`.
 
-    `relative`: relative error of all moduli of a test by the size of its sample.
+    `relative`: relative error of all moduli of a test that comes from the size of its sample.
     """
     prony = together.fit(tests, modes, progress)
     fit = prony if model == "prony" else _best_of_models(tests, model, prony, progress)
@@ -262,7 +271,7 @@ def choose_together(
 
 
 def _best_of_models(tests: list[Measured], model: str, prony: Together, progress: Callable[[str], None]) -> Together:
-    """The model of the lowest criterion: `prony` and the others that `model` names."""
+    """The model with the lowest criterion among `prony` and the other models that `model` asks for."""
     band = together.ResolvedBand(spans_of(tests)[:2])
     tried = [prony] if model == "auto" else []
     if model in ("fractional", "auto"):
@@ -281,7 +290,7 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
     if best.kind.effective is None:
         progress("what each test adds")
         best = best._replace(shares=_shares_of_springpots(best))
-    out = [*best.warnings] if best.converged else ["the fit did not converge: take another --model", *best.warnings]
+    out = [*best.warnings] if best.converged else ["the fit did not converge: try another --model", *best.warnings]
     out += together.disagreements(best.shares)
     out += together.structured(best)
     out += models.undetermined(best)
@@ -289,7 +298,7 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
 
 
 def _shares_of_springpots(fit: Together) -> list[Share]:
-    """Errors of the model's own numbers without each test, and the misfit of a fit to each test alone."""
+    """Errors of the springpot's parameters without each test, and the misfit of a fit to each test alone."""
     (case,) = (c for c in FRACTIONAL if c.name == fit.kind.name)
     parts = [together.reported_numbers(t) for t in fit.tests]
     assert fit.kind.values is not None and fit.parameters is not None

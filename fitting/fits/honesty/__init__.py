@@ -1,1 +1,1 @@
-"""Errors that a fit states about itself: ends of the band, choice of the model, total error."""
+"""Further errors of a fit: influence of the ends of the band, choice of the model, total error."""

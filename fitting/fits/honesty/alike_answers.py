@@ -1,5 +1,5 @@
-"""Noise that neighbouring answers of a test in time share: the errors of its numbers, which independent noise
-underestimates."""
+"""Noise that neighbouring readings of a test in time share. If the noise is treated as independent, the standard errors
+of the parameters are too small. Here they are corrected."""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,13 +12,14 @@ from fitting.methods.estimate import Estimate, errors_and_correlation
 from fitting.methods.noise.alike_noise import alike_noise
 from fitting.methods.noise.uneven_noise import probability_of_sizes, uneven_root
 
-#: Errors that the residuals of single answers show count from this factor above those of equal noise.
+#: Standard errors computed from the size of each residual are used if they exceed the errors of equal noise by this
+#: factor.
 _UNEVEN_FROM = 1.3
 
 
 def with_own_noise(fit: TimeFit) -> TimeFit:
-    """The fit with the errors of its noise: shared by neighbours (`with_alike_noise`), or of another size at some
-    answers than at others, as where it grows with time.
+    """The fit with standard errors for its real noise. Neighbours may share noise (`with_alike_noise`). The noise may
+    also be larger at some readings than at others, for example if it grows with time.
     """
     own = fit.parameters
     if fit.kind.effective is not None or not np.all(np.isfinite((own or fit.uncertainty).standard_errors)):
@@ -35,7 +36,8 @@ def with_own_noise(fit: TimeFit) -> TimeFit:
 
 
 def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
-    """The estimate with errors as large as those of a square root (P, k) of the covariance, where these are larger."""
+    """The estimate with its errors raised to the errors of a covariance, given by its square root (P, k), where the
+    latter are much larger."""
     ratio = np.linalg.norm(root, axis=1) / np.where(estimate.standard_errors > 0, estimate.standard_errors, np.inf)
     factor = np.where(np.isfinite(ratio) & (ratio > _UNEVEN_FROM), ratio, 1.0)
     return estimate._replace(
@@ -44,15 +46,15 @@ def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
 
 
 def with_alike_noise(fit: TimeFit) -> TimeFit:
-    """The fit with the errors of noise that neighbouring answers share, if its residuals show any.
+    """The fit with standard errors for noise that neighbouring readings share, if the residuals show such noise.
 
-    Neighbours are near each other in time, as in a drift, or in the order of the answers, as where the instrument
-    averages or the model misses a part of the spectrum. The more probable of the two is taken.
+    Neighbours may be near each other in time, for example in a drift. Or they may be near in the order of the readings,
+    for example if the instrument averages or the model misses a part of the spectrum. The more probable case is used.
     """
     r, J = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian)
     numbers = fit.parameters or fit.uncertainty
     if fit.kind.effective is not None or not np.all(np.isfinite(numbers.standard_errors)):
-        return fit  # a spectrum has errors of its prior, not of noise alone
+        return fit  # the errors of a spectrum come from its prior too, not only from noise
     if not fit.uncertainty.noise > 0:
         return fit
     size, constant = _sizes(fit, r, J)
@@ -84,14 +86,15 @@ def _modes_of(fit: TimeFit) -> Callable:
     return partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
 
 
-#: Gain in the logarithm of the probability from which the noise counts as one of constant size.
+#: The noise counts as constant in size if this raises the logarithm of the probability by more than this value.
 _CONSTANT = 3.0
 
 
 def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Deviations of the residuals r (m,), and whether the noise of the answers is of constant size, not in proportion
-    to them: whichever the residuals make more probable."""
-    # The residuals are divided by the measured answers, whose noise would look like an order in J: by the fitted ones.
+    """Standard deviations of the residuals r (m,), and whether the noise has a constant size. Otherwise the noise is in
+    proportion to the readings. The residuals decide which case is more probable."""
+    # The scales contain the measured readings with their noise, and this noise would seem to depend on J. So the fitted
+    # readings are used here.
     lower = fit.scales**2 - fit.measured**2
     relative = np.sqrt(np.maximum(fit.fitted**2 + lower, 1e-300)) / fit.scales
     constant = np.median(fit.scales) / fit.scales
@@ -103,7 +106,7 @@ def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool
 def _of_such_noise(
     estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray, independent: float | None = None
 ) -> Estimate:
-    """The estimate with the errors of a square root (p, k) of the covariance of u."""
+    """The estimate with the errors of a covariance of u, given by its square root (p, k)."""
     root = host.with_jacobian(natural_of, u)[1] @ root
     errors, correlation = errors_and_correlation(root)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)

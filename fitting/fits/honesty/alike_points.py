@@ -1,5 +1,6 @@
-"""Noise that neighbouring frequencies of a sweep share, as in a drift: the errors of its numbers, which independent
-noise underestimates. A model that misses a part of the spectrum leaves such residuals too.
+"""Noise that neighbouring frequencies of a sweep share, for example in a drift. If the noise is treated as independent,
+the standard errors of the parameters are too small. Here they are corrected. A model that misses a part of the spectrum
+leaves residuals of this kind too.
 """
 
 from collections.abc import Callable
@@ -13,18 +14,18 @@ from fitting.methods.estimate import Estimate, errors_and_correlation, wider
 from fitting.methods.noise.alike_noise import LOST, Alike, along_rows
 from fitting.readers.frequency_sweep import Sweep
 
-#: Key in `Fit.details`: numbers of independent noise that would measure as much as the moduli.
+#: Key in `Fit.details`: so many moduli with independent noise would tell as much as the measured moduli.
 INDEPENDENT = "independent_moduli"
-#: Key in `Fit.details`: the standard errors of independent noise, by name.
+#: Key in `Fit.details`: the standard errors that independent noise would give, by name.
 OF_INDEPENDENT = "errors_of_independent_noise"
-#: What a sentence on structured residuals says of the errors then.
+#: If there is such noise, a sentence on structured residuals ends with these words about the standard errors.
 CONTAINED = "the standard errors contain it as noise that neighbours share"
-#: Start of the sentence on such noise.
+#: First words of the sentence on noise that neighbours share.
 SHARED = "neighbouring frequencies share their noise"
 
 
 def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
-    """The fit with the errors of noise that neighbouring frequencies share, if its residuals show any."""
+    """The fit with standard errors for noise that neighbouring frequencies share, if the residuals show such noise."""
     repeated = len(np.unique(sweep.angular_frequency)) < len(sweep.angular_frequency)
     alike = None if repeated else alike_of(fit)
     if alike is None:
@@ -42,9 +43,9 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
 
 
 def alike_of(fit: Fit) -> Alike | None:
-    """The noise that neighbouring frequencies, all different, share; None if the residuals show none.
+    """The noise that neighbouring frequencies share; None if the residuals show none. No frequency may occur twice.
 
-    Spectra, whose errors are those of a prior, and exact data are not looked at.
+    The result is also None for spectra, because their errors come from a prior, and for exact data.
     """
     r, J, n = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian), len(fit.storage)
     numbers = fit.parameters or fit.uncertainty
@@ -58,8 +59,8 @@ def alike_of(fit: Fit) -> Alike | None:
 
 
 def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray) -> Estimate:
-    """The estimate with errors by noise at least as large as those of a square root (p, k) of the covariance of u. What
-    all points share is added as before.
+    """The estimate with its errors from noise raised to the errors of a covariance of u, where the latter are larger.
+    `root`: square root (p, k) of this covariance. Errors that all points share are added again unchanged.
     """
     shared = np.zeros((len(estimate.values), 0)) if estimate.shared is None else estimate.shared
     noise = np.asarray(estimate.root)[:, : np.shape(estimate.root)[1] - shared.shape[1]]
@@ -68,7 +69,7 @@ def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.
     factor = np.maximum(1.0, size / np.where(before > 0, before, np.inf))
     noise = factor[:, None] * noise
     errors, correlation = errors_and_correlation(noise)
-    errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)  # chosen, or not determined
+    errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)  # infinite errors stay infinite
     found = estimate._replace(root=noise, standard_errors=errors, correlation=correlation, shared=None)
     for direction in shared.T:
         found = wider(found, direction)

@@ -1,4 +1,4 @@
-"""How far noise alone moves the numbers of a fit when points at an end of the band are left out."""
+"""How far noise alone moves the parameters of a fit if points at one end of the band are left out."""
 
 from functools import partial
 
@@ -13,18 +13,19 @@ from fitting.methods.noise.uneven_noise import grouped_sizes
 from fitting.readers import frequency_sweep
 from fitting.readers.rheometer import Sweep
 
-#: Chance that noise alone moves one of the numbers of a fit far enough to be told.
+#: Probability that noise alone moves a parameter far enough to be reported.
 CHANCE = 0.05
-#: Where points scatter about a smooth curve by less than this part of the residuals, the model causes the residuals.
-#: Then the fewest points whose scatter is looked at.
+#: SMOOTH: if the points scatter about a smooth curve by less than this part of the residuals, the model causes the
+#: residuals. ENOUGH: minimum number of points for this comparison.
 SMOOTH, ENOUGH = 0.5, 16
 
 
 def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]:
-    """Standard deviation by noise alone of the change of each number of `edges.values`, if only the points `kept` (n,)
-    are fitted; to the first order of the noise.
+    """For each parameter of `edges.values`: standard deviation of its change by noise alone, if only the points `kept`
+    (n,) are fitted. It is of first order in the noise.
 
-    Both fits share the points that are kept: the change has the variance of the difference, not of the new fit.
+    Both fits share the kept points. The variance of the change is therefore the variance of the difference between the
+    two fits, not the variance of the new fit.
     """
     J, names, slope = np.asarray(fit.solution.jacobian), *_slopes_of_reported(fit)
     points = 2 * len(kept)
@@ -39,17 +40,17 @@ def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]
 
 
 def farthest_by_chance(fit: Fit | TimeFit, numbers: int) -> float:
-    """Quantile of Student's t that the largest of the changes at two ends exceeds by chance in `CHANCE` of fits.
+    """Quantile of Student's t: in a part `CHANCE` of all fits, the largest change at the two ends exceeds it by chance.
 
     Args:
-        fit: whose residuals give the noise.
-        numbers: how many numbers are compared at each end.
+        fit: the fit whose residuals give the noise.
+        numbers: how many parameters are compared at each end.
     """
     return float(scipy.special.stdtrit(max(1.0, fit.uncertainty.freedom), 1 - CHANCE / (4 * max(1, numbers))))
 
 
 def _slopes_of_reported(fit: Fit) -> tuple[list[str], np.ndarray]:
-    """Names of the numbers and their derivatives by u (P, p), of a compressed sample too."""
+    """Names of the reported parameters, and their derivatives by u (P, p). This also holds for a compressed sample."""
     u = np.asarray(fit.solution.u)
     if fit.parameters is not None:
         assert fit.kind.values is not None
@@ -67,16 +68,18 @@ def _slopes_of_reported(fit: Fit) -> tuple[list[str], np.ndarray]:
 
 
 def _as_reported(slope: np.ndarray, natural: np.ndarray, reported: np.ndarray) -> np.ndarray:
-    """Slopes (P, p) of the reported numbers: those of the fit times a factor, if the sample was compressed."""
+    """Derivatives (P, p) of the reported parameters. If the sample was compressed, they are the fit's derivatives times
+    a factor."""
     return slope * np.divide(reported, natural, out=np.ones_like(natural), where=natural != 0)[:, None]
 
 
 def _noise_of_residuals(fit: Fit, sweep: Sweep, J: np.ndarray) -> np.ndarray:
-    """Noise of each residual (2n,), over its scale; residuals that are smooth from point to point are no noise."""
+    """Noise of each residual (2n,), divided by its scale. Residuals that are smooth from point to point are not
+    noise."""
     r, n = np.asarray(fit.solution.residuals)[: len(J)], len(J) // 2
     own = None if fit.kind.effective is not None else grouped_sizes(J, r, np.arange(2 * n) >= n)
     sizes = np.full(2 * n, fit.uncertainty.noise) if own is None else own
-    if len(np.unique(sweep.angular_frequency)) < max(n, ENOUGH):  # a few points say too little of their scatter
+    if len(np.unique(sweep.angular_frequency)) < max(n, ENOUGH):  # a few points do not show their scatter well enough
         return sizes
     columns = ((sweep.storage, slice(0, n)), (sweep.loss, slice(n, 2 * n)))
     for (modulus, rows), deviation in zip(columns, sweep.deviations, strict=True):

@@ -1,7 +1,7 @@
-"""Tests that contradict each other: would they agree if all moduli of one of them had a common factor?
+"""Tests that contradict each other: would they agree if all moduli of one test were multiplied by one factor?
 
-Another temperature, a sample of another size than stated, or a wrong calibration change all moduli of a test alike. A
-common fit lies between such tests and follows none of them. Here the factor is one more number of the fit.
+Another temperature, a wrong size of the sample or a wrong calibration changes all moduli of a test by the same factor.
+A common fit lies between such tests and follows none of them. Here this factor is one more parameter of the fit.
 """
 
 from collections.abc import Callable
@@ -15,15 +15,17 @@ from fitting.methods.estimate import spread
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, from_starts
 
-#: A factor is named if it differs from 1 by so many standard errors, and by more than this.
+#: A factor is reported if its logarithm differs from 0 by more than CERTAIN standard errors and by more than LEAST.
 CERTAIN, LEAST = 4.0, 0.005
 
 
 def told(fit: Together, relative: float = 0.0) -> list[str]:
-    """A sentence on the test whose factor makes all tests agree; none if the tests agree, or if no factor helps.
+    """A sentence on the test whose factor makes all tests agree. No sentence if the tests agree already, or if no
+    factor helps.
 
-    A factor of a few percent hides in ratios and times: each test is then followed nearly as well as by itself. Sizes
-    of samples, with an error `relative` of the moduli of each test, explain a small one.
+    Ratios and times can compensate a factor of a few percent: the common fit then follows each test nearly as well as a
+    fit to this test alone. Wrong sizes of the samples explain a small factor; `relative` is the relative error of the
+    moduli of each test from these sizes.
     """
     if fit.kind.effective is not None:
         return []
@@ -35,21 +37,25 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
     factor, error, _ = known[k]
     said = (
         f"the tests agree if all moduli of {fit.shares[k].source or fit.shares[k].name} are {factor:.3g} ± {error:.1g} "
-        "times those of the others: "
+        "times the moduli of the other tests: "
     )
     if abs(np.log(factor)) < 2 * np.sqrt(2) * relative:
-        return [said + "errors in the sizes of the samples explain this, and the errors with these sizes contain it"]
+        return [
+            said + "errors in the sizes of the samples explain this factor, and the errors that include these "
+            "sizes contain it"
+        ]
     return [
         said
-        + "look for another temperature, another sample, or a wrong size of it, and fit the tests one by one until "
-        "then"
+        + "look for another temperature, another sample, or a wrong size of the sample; until this is clear, fit the "
+        "tests one by one"
     ]
 
 
 def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
-    """Factor of all moduli of test k [1], its standard error, and the largest misfit left over that of a test alone.
+    """Factor of all moduli of test k [1], its standard error, and the largest remaining misfit of a test, divided by
+    the misfit of a fit to this test alone.
 
-    None if the factor is 1 within its error, or if a test is still missed.
+    None if the factor is 1 within its error, or if the fit still misses a test.
     """
     names = list(map(together.name_of, fit.tests))
     parts = [together.reported_numbers(t) for t in fit.tests]
@@ -65,9 +71,9 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
         return np.concatenate(r, axis=-1), np.concatenate(J, axis=-2)
 
     counts, common = [len(y) for _, y, _ in data], np.append(np.asarray(fit.solution.u), 0.0)[None]
-    if fit.kind.values is not None:  # a springpot: starts of modes are none of its own
+    if fit.kind.values is not None:  # a springpot: it cannot begin at starts of modes
         return _certain(from_starts(evaluate, common), counts)
-    # A common fit of tests that contradict each other may have too few modes.
+    # If tests contradict each other, their common fit may have too few modes.
     more, answer = together.MORE if together.disagreements(fit.shares) else 0, None
     for modes in range(fit.modes, fit.modes + 1 + more):
         starts = _starts_at_the_others(fit, k, modes)
@@ -79,7 +85,7 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
 
 
 def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] | None:
-    """The result of `factor_of` from the solution for tests with so many numbers."""
+    """The result of `factor_of` from the solution. `counts`: the number of residuals of each test."""
     left = np.split(np.asarray(found.residuals), np.cumsum(counts)[:-1])
     worst = max(float(np.sqrt(np.mean(r**2))) for r in left)
     last = np.eye(len(found.u))[-1:]
@@ -91,8 +97,8 @@ def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] |
 
 
 def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
-    """Starts that follow the other tests, with the factor that moves their prediction to test k; a large factor is far
-    from the common fit.
+    """Starts that follow the other tests, with the factor that moves their prediction to test k. The common fit is no
+    good start for a large factor.
     """
     others = [t for j, t in enumerate(fit.tests) if j != k]
     band = together.ResolvedBand(together.resolved_by(others))
@@ -102,7 +108,7 @@ def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
     with np.errstate(all="ignore"):
         apart = np.abs(np.log(np.abs(measured / (residuals * scales + measured))))
     size = np.nan_to_num(np.median(apart, axis=-1), nan=0.0, posinf=0.0)
-    # A compliance falls where moduli grow: one of both signs is right.
+    # A compliance falls if moduli grow, so the sign of the logarithm is not known: one of both signs is right.
     return np.concatenate([np.column_stack([found, sign * size]) for sign in (1, -1)])
 
 

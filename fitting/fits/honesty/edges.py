@@ -16,13 +16,14 @@ from fitting.methods.least_squares import from_starts
 from fitting.readers.rheometer import Sweep, some
 
 HALF_DECADE = float(np.sqrt(10))
-#: Name of the check of the data in its sentences, and names of the two repeated fits in the report.
+#: Name of the check of the data, as its sentences contain it; and names of the two repeated fits in the report.
 KRAMERS_KRONIG = "Kramers-Kronig"
 PARTS = ("without_first_half_decade", "without_last_half_decade")
 
 
 def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
-    """Add to the fit: the influence of the ends, the structure of its residuals, and the checks of the data alone."""
+    """Add to the fit the influence of the ends, the structure of its residuals, and the checks that need only the
+    data."""
     wider = with_alike_points(fit, sweep)
     if wider is not fit:
         own = {name: error for name, (_, error) in values(fit).items()}
@@ -42,7 +43,7 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
         )
         details["residuals"] = runs
         told += structured
-        if structured and INDEPENDENT in details:  # one sentence on one thing
+        if structured and INDEPENDENT in details:  # do not report the same fact twice
             warnings = [w for w in warnings if not w.startswith(SHARED)]
             told = [w.replace(kramers_kronig.NOT_CONTAINED, CONTAINED) for w in told]
     if found.far and any(w.startswith(MISSES) for w in warnings):
@@ -59,20 +60,20 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
 
 
 def _with_long_times(fit: Fit, sweep: Sweep) -> Fit:
-    """The interval of the equilibrium modulus, if the unknowns of the fit are those of Prony modes alone."""
+    """Adds the interval of the equilibrium modulus, if the unknowns of the fit are only those of Prony modes."""
     if fit.parameters is not None or len(fit.solution.u) != 2 * fit.modes + (fit.kind.name != FLUID.name):
         return fit
     fluid = fit.kind.name == FLUID.name
     natural = generalised_maxwell.natural_fluid if fluid else generalised_maxwell.natural
     own = natural(np.asarray(fit.solution.u))
-    # Numbers of a compressed sample are those of the data times a factor.
+    # For a compressed sample, each parameter is the value from the data times a factor.
     of = "shear_modulus" if fluid else "equilibrium_modulus"
     factor = float(getattr(fit.model, of) / max(float(getattr(own, of)), 1e-300))
     return with_interval(fit, [sweep], [fit.uncertainty.noise], factor) if factor > 0 else fit
 
 
 def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
-    """A sentence that no model can fit much better, because most of the misfit lies in the data."""
+    """A sentence: no model can fit much better, because most of the misfit comes from the data."""
     errors, closer = fit.relative_errors(sweep), fit.kind.effective is None
     return (
         f"{MISSES} by {100 * errors.mean():.2g} % on average and by {100 * errors.max():.3g} % at most; the best "
@@ -82,7 +83,7 @@ def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
 
 
 def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
-    """Change of each parameter, by name, without the first and without the last half decade.
+    """Change of each parameter, by name, if the first or the last half decade is left out.
 
     The entry is None if too few points are left. For a spectrum, only the equilibrium modulus is compared.
     """
@@ -90,14 +91,14 @@ def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
 
 
 def _points_left(sweep: Sweep) -> dict[str, np.ndarray]:
-    """Which points (n,) are left without the first and without the last half decade."""
+    """For each point (n,): whether it is kept if the first half decade is left out, and if the last one is left out."""
     omega = sweep.angular_frequency
     kept = (omega > omega[0] * HALF_DECADE * (1 + 1e-9), omega < omega[-1] / HALF_DECADE * (1 - 1e-9))
     return dict(zip(PARTS, kept, strict=True))
 
 
 def values(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
-    """Parameters that are compared, with their standard errors, by the names of the report."""
+    """Parameters that are compared, with their standard errors, by their names in the report."""
     from fitting.methods.uncertainty import equilibrium_error
 
     if fit.parameters is not None:
@@ -116,12 +117,12 @@ def moved(fit: Fit) -> set[str]:
 
 
 def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
-    """Parameters that change without one of the `PARTS`, by more than their standard error and by more than noise
-    explains: the change over the larger of the two.
+    """Parameters that change by more than their standard error and by more than noise explains, if the half decade of
+    `part` is left out. The value is the change divided by the larger of these two limits.
     """
     changes, known = (fit.details.get("band_sensitivity") or {}).get(part) or {}, values(fit)
     by_noise = (fit.details.get("band_scatter") or {}).get(part) or {}
-    # Smooth residuals of a model that misses the data are no noise that explains a change.
+    # If a model misses the data, its smooth residuals are not noise. They do not explain a change.
     known |= {name: (known[name][0], e) for name, e in fit.details.get(OF_INDEPENDENT, {}).items() if name in known}
     far, out = chance_of_ends.farthest_by_chance(fit, len(changes)), {}
     for name, change in changes.items():
@@ -133,24 +134,25 @@ def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
 
 
 def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None:
-    """New values minus old ones of a fit to the points kept."""
+    """New values minus old values, where the new values are fitted to the kept points."""
     if len(np.unique(sweep.angular_frequency[kept])) <= max(2, len(fit.solution.u) // 2 + 1):
         return None
-    # The points left keep the weights that they had among all: curves and deviations are smoothed once.
+    # Each kept point keeps its weight from the whole sweep: curves and standard deviations are smoothed only once.
     storage_sd, loss_sd = sweep.deviations
     part = some(sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd), kept)
     old = {name: value for name, (value, _) in values(fit).items()}
     if fit.kind.effective is not None:
         found = fit.details["spectrum"]
         grid = relaxation_spectrum.at(part, found["times_per_decade"], found["smoothing"])
-        # Numbers of a compressed sample are those of the data times a factor.
+        # For a compressed sample, each parameter is the value from the data times a factor.
         factor = {name: value / float(np.exp(fit.solution.u[0])) for name, value in old.items()}
         return {name: factor[name] * grid.equilibrium - value for name, value in old.items()}
     if fit.parameters is not None:
         (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)
         starts = springpots.starting_points(part)[:, list(model.free)]
         starts[-1] = np.asarray(fit.solution.u)
-        # The numbers u have the middle of the whole band as their unit of frequency: points left out have no weight.
+        # The variables u use the middle of the whole band as unit of frequency. So the sweep stays whole, and points
+        # left out have no weight.
         scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
         found = springpots.best_minimum(model, sweep, starts, scales)
         assert fit.kind.values is not None
@@ -170,7 +172,7 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
 
 
 def _moved_most(fit: Fit) -> list[str]:
-    """A sentence for each end, with the three numbers that it moves most."""
+    """A sentence on both ends. For each end it names the three parameters that change most."""
     known, told = values(fit), []
     for part, end in zip(PARTS, ("first", "last"), strict=True):
         beyond = decided_by(fit, part)
@@ -188,7 +190,7 @@ def _moved_most(fit: Fit) -> list[str]:
     ]
 
 
-#: Relative change above which a number is not determined by the other points, so that its new value means nothing.
+#: Above this relative change, the other points do not determine the parameter, and its new value has no meaning.
 RUNS_AWAY = 10.0
 
 

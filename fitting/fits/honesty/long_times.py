@@ -1,9 +1,10 @@
-"""What a test leaves open of the equilibrium modulus: parts of the material may relax after its end.
+"""Interval of the equilibrium modulus that a test leaves open, because parts of the material may relax after its end.
 
-The standard error is that of a straight line through the minimum, for the modes that were chosen. A mode whose time is
-near the end of the test, or beyond it, is hardly told from the equilibrium modulus. So the equilibrium modulus is held,
-and all else is fitted again, with times up to `BEYOND` times the longest one that the test resolves (a profile
-likelihood). If one more mode follows the data much more closely, the interval is that of the model with this mode.
+The standard error is a linear estimate at the minimum, for the chosen modes. The data hardly distinguish a mode from
+the equilibrium modulus if its relaxation time is near the end of the test or beyond it. So the equilibrium modulus is
+held at several values, and all other parameters are fitted again (a profile likelihood). Relaxation times may be up to
+`BEYOND` times the longest time that the test resolves. If one more mode follows the data much more closely, the
+interval is computed with this mode.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,19 +24,20 @@ from fitting.methods.least_squares import Solution, from_starts
 from fitting.methods.uncertainty import equilibrium_error
 from liverjax.core.struct import Content
 
-#: Longest and shortest relaxation time, over the ends of what the test resolves.
+#: Factor by which relaxation times may lie beyond the shortest and the longest time that the test resolves.
 BEYOND = 10.0
-#: Fall of the sum of squares, over the noise's variance, from which one more mode is needed.
+#: One more mode is needed if it lowers the sum of squares, divided by the variance of the noise, by more than this.
 CLOSER = 10.0
-#: Times of this mode at the start, over the longest that the test resolves.
+#: Start values for the relaxation time of this additional mode, divided by the longest time that the test resolves.
 SLOW = (0.3, 1.0, 3.0)
-#: Strength of this mode at the start in a fluid, over G0.
+#: Start value for the strength of the additional mode in a fluid, divided by the sum of all strengths (G0).
 SLOW_PART = 0.1
-#: Bisections of each end, and iterations of each fit.
+#: Number of bisections for each end, and maximum number of iterations of each fit.
 BISECTIONS, ITERATIONS = 6, 60
-#: Distance of the farther end that is told, over that of the 95 % interval of the standard error, and over the number.
+#: An interval is reported if the distance of its farther end exceeds two limits: WIDER times the half width of the 95 %
+#: interval from the standard error, and LARGE times the modulus.
 WIDER, LARGE = 2.0, 0.05
-#: Half width of a 95 % interval over the standard error, of many independent residuals.
+#: Half width of a 95 % interval, divided by the standard error, for many independent residuals.
 NORMAL = 1.96
 
 
@@ -49,7 +51,8 @@ class Interval(NamedTuple):
 
 
 class _Family(NamedTuple):
-    """Prony modes with a given equilibrium modulus, as functions of logs of strengths and bounded times."""
+    """Prony modes with a given equilibrium modulus. Their unknowns are logs of strengths and logits of bounded log
+    times."""
 
     evaluate: Callable[[float, np.ndarray], Solution]
     ends: tuple[float, float]  # logs of the shortest and the longest time
@@ -66,11 +69,11 @@ def equilibrium_interval(
     """The 95 % interval of the equilibrium modulus of Prony modes; None if no fit succeeded.
 
     Args:
-        tests: that were fitted, one or more.
-        noises: factors on their scales, known or from the fit.
+        tests: the fitted tests, one or more.
+        noises: a factor for the scales of each test, known or from the fit.
         model: the modes that were chosen.
         error: standard error [Pa] of the equilibrium modulus; it may be infinite.
-        independent: part of the residuals that are independent.
+        independent: number of independent residuals, divided by the number of all residuals.
     """
     low, high = together.resolved_by(tests)
     family = _family(tests, noises, (low / BEYOND, high * BEYOND))
@@ -118,12 +121,12 @@ def _family(tests: Sequence[Measured], noises: Sequence[float], times: tuple[flo
 def _with_one_more(
     family: _Family, model: tuple[float, np.ndarray, np.ndarray], longest: float, found: Solution
 ) -> tuple[float, Solution]:
-    """The equilibrium modulus and the fit at the minimum, of one more slow mode if the data need it."""
+    """The equilibrium modulus and the fit at the minimum; with one more slow mode if the data need this mode."""
     rest, strengths, times = model
     noise = max(1.0, 2 * float(found.cost) / max(1, len(found.residuals) - len(found.u) - 1))
     best = (rest, found)
-    slow = rest or SLOW_PART * float(np.sum(strengths))  # a fluid leaves nothing of which a part could relax
-    for part in (0.8, 0.5, 0.2, 0.0):  # of the equilibrium modulus that is left; the rest relaxes slowly
+    slow = rest or SLOW_PART * float(np.sum(strengths))  # a fluid has no equilibrium modulus to divide
+    for part in (0.8, 0.5, 0.2, 0.0):  # this part of the equilibrium modulus stays; the rest relaxes slowly
         more = np.append(strengths, (1 - part) * slow)
         starts = np.stack([family.unknowns(more, np.append(times, k * longest)) for k in SLOW])
         trial = family.evaluate(part * rest, starts)
@@ -133,7 +136,7 @@ def _with_one_more(
 
 
 def _end(family: _Family, modulus: float, found: Solution, limit: float, step: float, whole: float) -> float:
-    """The farthest equilibrium modulus on one side whose fit reaches the limit of the sum of squares."""
+    """The equilibrium modulus on one side of the minimum at which the sum of squares reaches its limit."""
     u, inside, outside = np.asarray(found.u), modulus, None
     while outside is None:
         trial = max(0.0, inside + step)
@@ -160,13 +163,13 @@ AFit = TypeVar("AFit", Fit, TimeFit, Together)
 
 
 def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float], factor: float = 1.0) -> AFit:
-    """The fit of Prony modes with the interval of its equilibrium modulus, and a warning if this is much wider than the
-    standard error says. Other models are returned as they are.
+    """The fit of Prony modes with the interval of its equilibrium modulus, and a warning if this interval is much wider
+    than the standard error says. Fits of other models are returned unchanged.
 
     Args:
-        fit: of these tests.
-        tests, noises: as in `equilibrium_interval`.
-        factor: equilibrium modulus of the fit over that of the data (of a compressed sample).
+        fit: the fit of these tests.
+        tests, noises: see `equilibrium_interval`.
+        factor: equilibrium modulus in the fit divided by that in the data; not 1 if the sample was compressed.
     """
     if fit.parameters is not None or not fit.converged:
         return fit
@@ -189,9 +192,10 @@ def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float],
 
 
 def _told_interval(ends: tuple[float, float, float], error: float, found: Interval, whole: float) -> list[str]:
-    """A sentence if the `ends` (low, value, high) are much farther away than two standard errors.
+    """A sentence if an end of (low, value, high) lies much farther from the value than two standard errors.
 
-    It does not count that Student's t of few independent residuals is larger: a reader takes ± for a standard error.
+    The comparison uses the factor `NORMAL` even for few independent residuals, where Student's t is larger: a reader
+    takes the number after ± as a standard error.
     """
     low, rest, high = ends
     where = f"if parts of the material relax in up to {found.longest:.3g} s"
@@ -200,11 +204,11 @@ def _told_interval(ends: tuple[float, float, float], error: float, found: Interv
             return []
         return [
             f"a solid follows the data as well as the fluid: {where}, its equilibrium modulus is 0 to {high:.3g} Pa "
-            "(95 %); a longer test decides"
+            "(95 %): only a longer test can decide"
         ]
     if max(rest - low, high - rest) <= max(WIDER * NORMAL * error, LARGE * rest):
         return []
     return [
         f"{SHORT}: {where}, the equilibrium modulus is {low:.3g} to {high:.3g} Pa (95 %); {rest:.4g} ± "
-        f"{error:.2g} Pa is that of the modes that were chosen"
+        f"{error:.2g} Pa holds only for the chosen modes"
     ]

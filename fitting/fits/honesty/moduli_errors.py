@@ -1,8 +1,8 @@
 """Errors of the fitted moduli, with the error from the choice of the model.
 
-Models that explain the data about equally well differ in their moduli. Each gets its Akaike weight, and the differences
-between the models are part of the error (Buckland, Burnham and Augustin 1997, Biometrics 53, 603; for few data Hurvich
-and Tsai 1989, Biometrika 76, 297).
+Models that explain the data about equally well differ in their moduli. Each model gets its Akaike weight, and the
+weighted differences between the models become part of the error (Buckland, Burnham and Augustin 1997, Biometrics 53,
+603; for few data Hurvich and Tsai 1989, Biometrika 76, 297).
 """
 
 import numpy as np
@@ -21,7 +21,8 @@ NEGLIGIBLE = 1e-4
 def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
     """G' then G'' (2n,) [Pa] of a fit in closed form, by the delta method.
 
-    The errors come from noise, from gap and instrument if the fit has their errors, and from the choice of the model.
+    The errors come from noise and from the choice of the model. They also contain the errors of gap and instrument if
+    the fit has these.
 
     Args:
         fit: the fit; `rivals` has the other models if it was chosen from several.
@@ -44,7 +45,8 @@ def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
 
 
 def model_weights(fit: Fit) -> dict[str, float]:
-    """Weight of each model [1] in the errors of the moduli, by its name: the chosen one first; empty without others."""
+    """Weight of each model [1] in the errors of the moduli, by name, with the chosen model first. Empty if there is no
+    other model."""
     others = {other.kind.name: weight for weight, other in _weighed(fit)}
     return {fit.kind.name: 1 - sum(others.values())} | others if others else {}
 

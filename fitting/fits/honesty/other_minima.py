@@ -1,7 +1,9 @@
-"""Other numbers of a law that follow the tests as well: does the law then say the same of tension?
+"""Other parameters of a law that follow the tests equally well: do they predict the same stress in tension and
+compression?
 
-In simple shear and pure shear one principal stretch is 1 and the other two are l and 1/l. There one term (mu, alpha) of
-Ogden's law is the same as (-mu, -alpha), but in tension and compression they differ several times.
+In simple shear and pure shear one principal stretch is 1 and the other two are l and 1/l. In these tests, one term (mu,
+alpha) of Ogden's law equals the term (-mu, -alpha). In tension and compression, the stresses of the two terms differ by
+a factor of several.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,23 +13,25 @@ import numpy as np
 
 from liverjax.laws import Law, homogeneous
 
-#: Stretches at which stresses in tension and compression are compared, at most; ratio of stresses that is told.
+#: Widest range of stretches over which stresses are compared; and the ratio of stresses above which a sentence is
+#: given.
 _STRETCHES, _RATIO = (0.7, 1.4), 1.1
-#: Relative difference of numbers that are the same; the most sets of numbers that are compared.
+#: Parameters within this relative difference are the same; maximum number of parameter sets that are compared.
 _SAME, _MOST = 0.02, 12
 
 
 def of_other_minima(
     names: Sequence[str], law_of: Callable[..., Law], values: np.ndarray, every: np.ndarray, F: np.ndarray
 ) -> list[str]:
-    """A sentence if starts with the cost of the best one have another stress in tension or compression.
+    """A sentence if another minimum has the same cost as the best one, but another stress in tension or compression.
 
     Args:
-        names: of the law's numbers (P,).
-        law_of: the law with some numbers.
-        values: numbers (P,) of the fit.
-        every: those of all starts that reached its cost (S, P).
-        F: deformation gradients (n, 3, 3) of the tests; the stretches compared are not beyond theirs.
+        names: names of the parameters of the law (P,).
+        law_of: function from parameters (P,) to the law with these parameters.
+        values: fitted parameters (P,).
+        every: parameters (S, P) from all starts that reached the cost of the fit.
+        F: deformation gradients (n, 3, 3) of the tests. The compared stretches stay within the stretches of the tests,
+            or within 1 % of 1.
     """
     far = float(np.clip(np.max(np.linalg.norm(F, 2, axis=(1, 2))), 1.01, _STRETCHES[1]))
     stretches = np.array([max(1 / far, _STRETCHES[0]), far])

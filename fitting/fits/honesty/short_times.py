@@ -1,8 +1,10 @@
-"""What relaxes before a test in time shows it is not in G0: how much that may be, by how the stress begins to fall.
+"""Stress that relaxes before the first reading of a test in time is missing in G0. The way in which the stress begins
+to fall tells how much may be missing.
 
-If the fall of half a decade is a part r < 1 of that of the next half decade, the falls of all half decades before the
-record are r, r^2, … of its first one. One relaxation time that is far longer than the first time of the record has
-r = 0.32, and nothing is missing in G0. A stress that falls at a power of time has r >= 1: nothing bounds G0.
+Let r be the fall in one half decade divided by the fall in the next one. If r < 1 stays the same, the falls before the
+record are r, r^2, … times the fall in its first half decade. One relaxation time far longer than the first time of the
+record gives r = 0.32, and nothing is missing in G0. A stress that falls as a power of time gives r >= 1, and G0 has no
+upper bound.
 """
 
 import numpy as np
@@ -14,16 +16,17 @@ from fitting.readers.time_tests import TimeTest
 HALF_DECADE = float(np.sqrt(10))
 #: Key in `TimeFit.details`: part of G0 [Pa] that the record does not show.
 MISSING = "relaxed_before_the_record"
-#: Above this ratio of two falls, what is before the record is not bounded.
+#: Above this ratio of two falls, the fall before the record has no bound.
 LEAST_SLOWING = 0.9
-#: Standard errors of G0 by which the stress must fall, or be missing, to be told.
+#: The fall, or the missing part of G0, is reported if it exceeds this many standard errors of G0.
 SHOWN = 2.0
 
 
 def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
-    """The fit of Prony modes with what may be missing in G0, and a sentence if that is more than its standard error.
+    """The fit of Prony modes with the part that may be missing in G0, and a sentence, if this part exceeds `SHOWN`
+    standard errors of G0.
 
-    Other models, and records of less than a decade, are returned as they are.
+    Fits of other models, and fits of records shorter than a decade, are returned unchanged.
     """
     first, last = test.resolved
     if fit.parameters is not None or not fit.converged or last < HALF_DECADE**2 * first:
@@ -46,8 +49,9 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
     if missing <= SHOWN * error:
         return fit
     told = (
-        f"G0 may be {missing:.2g} Pa larger, if the modulus fell before {first:.3g} s as it falls after: the chosen "
-        "modes do not contain it (it is in the total error); begin earlier, or compare --model auto"
+        f"G0 may be {missing:.2g} Pa larger, if the modulus fell before {first:.3g} s in the same way as after it. "
+        "The chosen modes do not contain this part (it is in the total error): begin the record earlier, or compare "
+        "--model auto"
     )
     return fit._replace(warnings=(*fit.warnings, told), details=fit.details | {MISSING: float(missing)})
 

@@ -1,7 +1,8 @@
-"""Several tests: the error of the numbers by the sizes of the samples, with which each test has a factor of its own.
+"""Several tests: the errors of the parameters that come from errors in the sizes of the samples.
 
-Torque over twist is G pi R^4 / 2 h: a gap or a radius that is off multiplies all moduli of a test. In one test the
-factor is that of G0 alone. Between tests that are fitted together it also moves ratios and times.
+Torque over twist is G pi R^4 / 2 h, so a wrong gap h or radius R multiplies all moduli of a test by a factor. In one
+test this factor changes G0 alone. If tests are fitted together and each has another factor, ratios and times change
+too.
 """
 
 from functools import partial
@@ -16,17 +17,17 @@ from fitting.waves.dispersion import Dispersion
 
 
 def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, float]]:
-    """Errors of each number by noise and by the sizes of the samples; without the strengths of a spectrum.
+    """Errors of each parameter from noise and from the sizes of the samples. The strengths of a spectrum are left out.
 
     Args:
         fit: the common fit.
-        relative: standard deviation of the factor of a test, `total_error.of_geometry`.
+        relative: relative standard deviation of a test's factor, see `total_error.of_geometry`.
     """
     own = fit.uncertainty if fit.parameters is None else fit.parameters
     names = [n for n in own.names if not n.startswith("strengths[")]
     kept = [own.names.index(n) for n in names]
     by_size = _by_sizes(fit)[kept] * relative
-    # Samples of their own have independent factors; one sample, mounted once, has one factor for all its tests.
+    # Different samples have independent factors. One sample that is mounted once has one factor for all its tests.
     both = np.maximum(np.linalg.norm(by_size, axis=1), np.abs(by_size.sum(axis=1)))
     shares = {"noise": own.standard_errors[kept], "geometry": both}
     found = {source: dict(zip(names, part.tolist(), strict=True)) for source, part in shares.items()}
@@ -38,7 +39,7 @@ def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, flo
 
 
 def _by_sizes(fit: Together) -> np.ndarray:
-    """Change (P, K) of each number by a factor of 1 + 1 of the moduli of each test, to first order."""
+    """Derivative (P, K) of each parameter by the logarithm of the factor of each test's moduli."""
     J, u = np.asarray(fit.solution.jacobian), fit.solution.u
     of = fit.kind.values if fit.parameters is not None else None
     _, slope = with_slope(of or partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)
@@ -47,7 +48,7 @@ def _by_sizes(fit: Together) -> np.ndarray:
     moved, first = np.zeros((len(J), len(fit.tests))), 0
     for k, (test, share) in enumerate(zip(fit.tests, fit.shares, strict=True)):
         _, measured, scales = together.reported_numbers(test)
-        if not isinstance(test, Dispersion):  # waves have no size of a sample
+        if not isinstance(test, Dispersion):  # waves do not depend on the size of the sample
             sign = -1.0 if together.name_of(test) == "creep" else 1.0  # a stiffer sample creeps less
             moved[first : first + share.points, k] = sign * measured / (scales * share.noise)
         first += share.points

@@ -1,7 +1,7 @@
-"""The total error of every number: the share of noise, and the shares of other sources.
+"""The total error of every parameter: the share from noise, and the shares from other sources.
 
-Shares are independent of each other, so the total is the root of the sum of their squares. The spread between samples
-is not among them: the numbers describe the measured curve, not the material.
+The shares are independent of each other, so the total is the root of the sum of their squares. The scatter between
+samples is not included: the parameters describe the measured curve, not the material.
 """
 
 import numpy as np
@@ -14,14 +14,14 @@ from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.uncertainty import equilibrium_change
 
-#: Usual standard deviations [m] of the gap that an instrument states, and of the radius of the plates.
+#: Usual standard deviations [m] of the gap that the instrument displays, and of the radius of the plates.
 GAP, RADIUS = 50e-6, 10e-6
 
 
 def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
-    """Relative error of all moduli by the size of the sample between its plates; torque over twist is G pi R^4 / 2 h.
+    """Relative error of all moduli from the size of the sample between its plates. Torque over twist is G pi R^4 / 2 h.
 
-    If a `gap_error` [m] is given, the standard errors contain it already.
+    If a `gap_error` [m] is given, the standard errors contain it already, and it is not counted here.
     """
     gap = 0.0 if gap_error is not None else GAP / simulation.height
     return float(np.hypot(gap, 4 * RADIUS / simulation.radius))
@@ -30,10 +30,11 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     """Errors by their source, then by the names of `edges.values`.
 
-    The share of the band's ends is the larger of the two changes, if noise does not explain it (`edges.decided_by`);
-    the square of what noise causes is subtracted from its square. If a number runs away, its share is its own size. The
-    share of long times is that of the farther end of `long_times.equilibrium_interval`, as a standard deviation. That
-    of short times is what `short_times` says.
+    The share `band` is the larger change of a parameter if one end of the band is left out. It counts only if noise
+    does not explain the change (`edges.decided_by`); the square of the change by noise is subtracted from its square.
+    If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter. The share `long_times`
+    comes from the farther end of `long_times.equilibrium_interval`, as a standard deviation. The share `short_times` is
+    the part of G0 that `short_times` finds to be missing.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -48,7 +49,8 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
         for name in edges.decided_by(fit, part):
             change, scatter = (fit.details[key][part][name] for key in ("band_sensitivity", "band_scatter"))
             beyond = np.sqrt(max(0.0, change**2 - max(noise[name], scatter) ** 2))
-            # A number that the other points do not determine may run away: it is unknown by its own size.
+            # If the other points do not determine a parameter, its change may have any size. Then its error is its
+            # size.
             own = max(abs(known[name][0]), noise[name])
             out["band"][name] = max(out["band"][name], float(own if beyond > edges.RUNS_AWAY * own else beyond))
     for source, moved in (("mesh", fit.uncertainty.mesh_bias), ("time_step", fit.uncertainty.time_step_bias)):
@@ -82,7 +84,7 @@ def _moduli(fit: Fit | TimeFit) -> set[str]:
 
 
 def _of_modes(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
-    """Size of the changes `moved` (P,) of G0, ratios and times, and of that of the equilibrium modulus, by name."""
+    """Absolute changes by name: `moved` (P,) of G0, ratios and times, and the change of the equilibrium modulus."""
     out = {name: abs(float(d)) for name, d in zip(fit.uncertainty.names, moved, strict=True)}
     out["equilibrium_modulus"] = abs(float(equilibrium_change(fit.uncertainty.values, moved)))
     return {name: out[name] for name in edges.values(fit)}

@@ -1,5 +1,5 @@
-"""What the columns of a stress-stretch curve may hold instead of stretch and nominal stress, if its misfit has
-structure."""
+"""If the misfit of a stress-stretch curve has structure: what its columns may contain instead of stretch and nominal
+stress."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,17 +14,19 @@ from fitting.methods.kramers_kronig import CHANCE, runs_probability
 from fitting.readers.curves import Curve
 from liverjax.laws import Law, homogeneous
 
-#: Fewest points of a curve whose residuals are tested, and the misfit below which they are roundoff.
+#: Minimum number of points of a curve whose residuals are tested; below the second value, residuals are roundoff.
 _FEWEST, _EXACT = 8, 1e-6
-#: A cause is named if it lowers the criterion by more than this, and leaves residuals that look random.
+#: A cause is reported if it lowers the criterion by more than _BETTER and if the order of the remaining residuals has a
+#: probability above _RANDOM.
 _BETTER, _RANDOM = 10.0, 0.05
 _stress = jax.jit(homogeneous.nominal_stress)
 
 
 class _Cause(NamedTuple):
-    """Another meaning of a curve's columns: (driven, number) -> driven, and (nominal stress, driven, number) -> column.
+    """Another meaning of the columns of a curve, as two functions: (driven, number) -> true driven quantity, and
+    (nominal stress, driven, number) -> stress column.
 
-    Numbers are in units of the range of `driven`, or of the curve's stress.
+    The fitted number is in units of the range of `driven`, or in units of the stress scale of the curve.
     """
 
     words: str
@@ -50,7 +52,7 @@ def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> 
         fit: the best fit.
         every: whether all laws were tried.
     """
-    # A factor of a test's own, which the fit has named already, is no error of the law.
+    # If the fit has reported a factor for each test already, this factor is not an error of the law.
     named = any(sentence.startswith(OWN_FACTORS) for sentence in fit.warnings)
     misfit = [(c, (_model(fit.law, c) * _nearest_factor(fit.law, c, named) - c.stress) / c.scale) for c in curves]
     runs = {c.label: runs_probability(np.sign(r)) for c, r in misfit}
@@ -66,7 +68,7 @@ def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> 
     cause = _named_cause(curves, odd, fit)
     if cause:
         return [f"{said}; {cause}"]
-    return [f"{said}; the law misses something" + ("" if every else ": try others (LAW = all)")]
+    return [f"{said}; the law misses something" + ("" if every else ": try other laws (LAW = all)")]
 
 
 def _model(law: Law, curve: Curve, F: np.ndarray | None = None) -> np.ndarray:
@@ -75,7 +77,7 @@ def _model(law: Law, curve: Curve, F: np.ndarray | None = None) -> np.ndarray:
 
 
 def _nearest_factor(law: Law, curve: Curve, named: bool) -> float:
-    """The factor of a curve's stress that is nearest to the law; 1 if the curves have none."""
+    """The factor with which the law is nearest to the curve's stress; 1 if the fit reported no factors."""
     P = _model(law, curve) / curve.scale
     return float(P @ (curve.stress / curve.scale) / (P @ P)) if named and P @ P > 0 else 1.0
 
@@ -99,13 +101,13 @@ def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
 
 class _Refit(NamedTuple):
     value: float  # Akaike's criterion, corrected for few points
-    chance: float  # of the residuals' order, the smallest of all odd curves
+    chance: float  # probability of the order of the residuals, the smallest among the odd curves
     number: float
     law: Law
 
 
 def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | None) -> _Refit:
-    """Refit a law from its best numbers, with another meaning of the columns of the odd curves."""
+    """Fit the law again from its best parameters, with another meaning of the columns of the odd curves."""
     leaves, tree = jax.tree.flatten(law)
     every = np.array([float(leaf) for leaf in leaves])
     start = every[every != 0]

@@ -1,1 +1,1 @@
-"""What residuals say of their noise: shared by neighbours, or not the same at all points."""
+"""Noise that residuals show: noise that neighbours share, or noise of different size at different points."""

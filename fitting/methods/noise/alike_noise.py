@@ -1,12 +1,12 @@
-"""Noise of neighbouring points that is alike: how much larger errors are than those of independent noise.
+"""Noise that neighbouring points share: the standard errors for such noise.
 
-Registration and image correlation smooth, so neighbours share their noise, and fewer independent numbers are measured
-than there are points. The covariance of two components of the same direction, instant and scene is taken to be s^2 (a
-k(d / l) + (1 - a) [same row]), with d the distance of their points and k the Matérn function of order 3/2 (noise that
-was smoothed) or 1/2 (noise that drifts). Order, length l, part a and level s are those that make the residuals most
-probable (restricted maximum likelihood: Patterson and Thompson 1971), because a fit takes the part of the noise that
-looks like its parameters out of the residuals. The numbers remain those of the fit. Their covariance is J^+ C (J^+)^T
-instead of s^2 J^+ (J^+)^T.
+Registration and image correlation smooth the data. So neighbours share their noise, and there are fewer independent
+values than points. Consider two components of the same direction, instant and scene. Their covariance is assumed to be
+s^2 (a k(d / l) + (1 - a) [same row]), where d is the distance of their points. k is the Matérn function of order 3/2
+(smoothed noise) or 1/2 (drifting noise). Order, length l, part a and level s are chosen so that the residuals are most
+probable (restricted maximum likelihood: Patterson and Thompson 1971). The likelihood is restricted because a fit
+removes from the residuals the part of the noise that looks like its parameters. The fitted parameters do not change.
+Their covariance is J^+ C (J^+)^T instead of s^2 J^+ (J^+)^T.
 """
 
 import itertools
@@ -19,47 +19,52 @@ import scipy.spatial
 
 from liverjax.solvers.blas import one_blas_thread
 
-#: Parts a that are tried, and how many lengths between a third of the distance of neighbours and the body's size.
+#: Parts a that are tried; and number of lengths that are tried, between a third of the distance of neighbours and the
+#: size of the body.
 PARTS, LENGTHS = (0.3, 0.6, 0.9, 0.99), 8
-#: Orders of Matérn's function: noise that was smoothed, noise that drifts.
+#: Orders of the Matérn function: for smoothed noise, and for drifting noise.
 ORDERS = ("3/2", "1/2")
-#: Groups whose probability is computed, and points of each: as many near each other as scattered over the body.
+#: Maximum number of groups for the probability, and maximum number of points in each. Half of the points are near each
+#: other, half are scattered over the body.
 FEW, MOST = 12, 400
-#: Gain in the logarithm of the probability from which noise counts as alike: chance reaches it once in a thousand.
+#: Noise counts as shared if this raises the logarithm of the probability by more than this. Chance reaches it once in a
+#: thousand cases.
 GAIN = 7.0
-#: Root mean square below which the residuals are not the stated noise: synthetic data without noise, say.
+#: If the root mean square of the residuals is below this, they are not the stated noise, for example in synthetic data
+#: without noise.
 LEAST = 0.2
-#: A residual beyond so many typical ones counts as one of this size: a single wrong point is no order of many.
+#: Residuals are clipped at this many robust standard deviations: a single wrong point must not look like noise that
+#: many points share.
 OUTLIER = 5.0
-#: Part of an unknown's derivatives that the chosen groups must have.
+#: The chosen groups must have at least this part of the derivatives by an unknown.
 SHOWN = 1e-9
-#: Singular value of the scaled derivatives, over the largest, of a direction that is lost.
+#: If a singular value of the scaled derivatives, divided by the largest, is below this, its direction is left out.
 LOST = 1e-6
-#: Rows of C that are made at a time.
+#: Number of rows of C that are computed at once.
 ROWS = 500
 
 
 class Alike(NamedTuple):
-    """What the residuals say of noise that neighbours share."""
+    """What the residuals tell about noise that neighbours share."""
 
     length: float  # [m]
-    part: float  # of the variance
-    level: float  # deviation, over the stated one
+    part: float  # shared part of the variance
+    level: float  # standard deviation / stated standard deviation
     root: np.ndarray  # (p, p) square root of the covariance of the unknowns
-    gain: float  # in the logarithm of the probability, over independent noise
-    independent: float  # residuals of independent noise that would measure as much
+    gain: float  # gain in the logarithm of the probability, against independent noise
+    independent: float  # number of residuals with independent noise that would tell as much
 
 
 def alike_noise(
     places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray, inverse: np.ndarray | None = None
 ) -> Alike | None:
-    """The noise that neighbours share; None if they share none that is more than chance.
+    """The noise that neighbours share; None if it is no more than chance.
 
     Args:
-        places: of each residual (n, 3) [m].
-        group: residuals of different numbers (n,) share no noise: other directions, instants, scenes.
-        r: residuals (n,) of a fit, over the stated deviations.
-        J: their derivatives (n, p), of full rank.
+        places: position of each residual (n, 3) [m].
+        group: index (n,) of the group of each residual. Different groups (directions, instants, scenes) share no noise.
+        r: residuals (n,) of a fit, divided by the stated standard deviations.
+        J: derivatives of the residuals (n, p), of full rank.
         inverse: derivatives of the unknowns by r (p, n); default J^+.
     """
     with one_blas_thread():  # the matrices are small
@@ -78,7 +83,7 @@ def _alike_noise(
     if not 0 < neighbour < size or len(r) <= 2 * J.shape[1]:
         return None
     lengths = np.geomspace(neighbour / 3, size, LENGTHS)
-    # Unknowns that the chosen groups do not show take nothing out of their residuals.
+    # If the chosen groups do not depend on an unknown, this unknown removes nothing from their residuals.
     shown = np.linalg.norm(J[np.concatenate(chosen)], axis=0) > SHOWN * np.linalg.norm(J, axis=0)
     if sum(map(len, chosen)) <= shown.sum():
         return None
@@ -90,7 +95,8 @@ def _alike_noise(
     choices = itertools.product(ORDERS, lengths, PARTS)
     tried = [(*_probability_at(data, far, order, l, a), order, l, a) for order, l, a in choices]
     best, level, order, length, part = max(tried)
-    # Not larger: nor is it if both are -inf. The level says less: it is small for noise smoother than the function.
+    # The test is `not best > ...`, so that it is also right if both are -inf. The level is not tested: it is small if
+    # the noise is smoother than the Matérn function.
     if not np.isfinite(alone) or not best > alone + GAIN or np.sqrt(np.mean(r**2)) < LEAST:
         return None
     parts = [_of_unknowns(places[own], (order, length, part), inverse[:, own]) for own in groups]
@@ -100,8 +106,8 @@ def _alike_noise(
 
 
 def _determined(J: np.ndarray) -> np.ndarray:
-    """Directions (p, k) of the unknowns that the derivatives J (n, p) determine. A number at its bound loses one, and a
-    determinant of roundoff would decide then.
+    """Directions (p, k) of the unknowns that the derivatives J (n, p) determine. If a parameter is at its bound, one
+    direction is not determined, and its determinant would be only roundoff.
     """
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
@@ -110,18 +116,19 @@ def _determined(J: np.ndarray) -> np.ndarray:
 
 
 def along_rows(counts: list[int], r: np.ndarray, J: np.ndarray, deviation: float, inverse: np.ndarray) -> Alike | None:
-    """`alike_noise` of series that were measured one after another; lengths are in rows.
+    """The result of `alike_noise` for series that were measured row after row. Lengths are in rows.
 
     Args:
-        counts: rows of each series, which share no noise.
+        counts: number of rows of each series. Different series share no noise.
         r, J: residuals (n,) and their derivatives (n, p).
-        deviation: of a residual.
+        deviation: standard deviation of a residual.
         inverse: derivatives of the unknowns by r (p, n).
     """
     if not (deviation > 0 and np.all(np.isfinite(J))):
         return None
     places = np.concatenate([np.arange(n) for n in counts])[:, None] * np.array([1.0, 0.0, 0.0])
-    # Noise of what is given (depth, stretch) is in J and in the residuals, and would look like an order: J is smoothed.
+    # Noise of the imposed quantity (depth, stretch) is in J and in the residuals, and would look like shared noise. So
+    # J is smoothed.
     parts = np.split(J, np.cumsum(counts)[:-1])
     smooth = [scipy.signal.savgol_filter(p, max(3, len(p) // 10 | 1), 1, axis=0) if len(p) > 3 else p for p in parts]
     group = np.repeat(np.arange(len(counts)), counts)
@@ -129,14 +136,14 @@ def along_rows(counts: list[int], r: np.ndarray, J: np.ndarray, deviation: float
 
 
 def _to_neighbours(distance: np.ndarray) -> float:
-    """Mean distance to the nearest other place; a place may have several rows."""
+    """Mean distance to the nearest other position. Several rows may have one position."""
     nearest = np.where(distance > 0, distance, np.inf).min(axis=1)
     known = np.isfinite(nearest)
     return float(nearest[known].mean()) if known.any() else 0.0
 
 
 def _subset(places: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """At most `MOST` of the residuals `own` (m,): half of them around one point, half of them from everywhere."""
+    """At most `MOST` of the residuals `own` (m,): half of them around one point, the other half from everywhere."""
     if len(own) <= MOST:
         return own
     rng = np.random.default_rng(0)
@@ -154,7 +161,7 @@ def _matern(distance: np.ndarray, order: str, length: float) -> np.ndarray:
 
 
 def _probability_at(data: list, far: list[np.ndarray], order: str, length: float, part: float) -> tuple[float, float]:
-    """Logarithm of the restricted likelihood, up to a constant, and the level s that it takes."""
+    """Logarithm of the restricted likelihood, up to a constant, and the most probable level s."""
     p = data[0][1].shape[1]
     determinant, squares, b, A = 0.0, 0.0, np.zeros(p), np.zeros((p, p))
     for (r, J), distance in zip(data, far, strict=True):
@@ -171,7 +178,8 @@ def _probability_at(data: list, far: list[np.ndarray], order: str, length: float
 
 
 def _of_unknowns(places: np.ndarray, shape: tuple[str, float, float], inverse: np.ndarray) -> tuple[np.ndarray, float]:
-    """J^+ C (J^+)^T (p, p) of one group, a few rows of C at a time, and its n^2 / sum(C) independent residuals.
+    """J^+ C (J^+)^T (p, p) of one group, computed a few rows of C at a time; and its number of independent residuals,
+    n^2 / sum(C).
 
     `shape`: order, length and part.
     """

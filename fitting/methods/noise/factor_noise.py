@@ -1,4 +1,5 @@
-"""A factor that each series has of its own, as by the size of its sample: errors of least squares that contain it."""
+"""Standard errors of least squares if each series has another unknown factor, for example from the size of its
+sample."""
 
 from typing import NamedTuple
 
@@ -6,45 +7,47 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-#: Gain in the logarithm of the restricted likelihood from which series have factors; chance reaches it in 1 of 140.
+#: Series have factors if this raises the logarithm of the restricted likelihood by this value. Chance reaches it in 1
+#: of 140 cases.
 _GAIN = 3.0
-#: Fall of this logarithm to the end of a 95 % interval of the factors' deviation.
+#: At the end of a 95 % interval of the factors' standard deviation, this logarithm is lower by this value.
 _FALL = 1.92
-#: The largest deviation of factors that is asked for where the residuals do not show it: sizes of samples.
+#: Maximum standard deviation of factors that is considered if the residuals do not show the factors. It is typical for
+#: sizes of samples.
 HIDDEN = 0.1
-#: Singular values below this part of the factors' size are roundoff: the unknowns take up all factors.
+#: Singular values below this part of the size of the factors are roundoff: the unknowns can compensate all factors.
 _ROUNDOFF = 1e-8
-#: Least part of the squared residuals beside the factors: what exact repeats leave is roundoff, of any size.
+#: Lower bound for the part of the squared residuals that the factors do not explain. Exact repeats leave only roundoff
+#: there.
 _SAME = 1e-12
 
 
 class FactorNoise(NamedTuple):
     """Factors of series."""
 
-    deviation: (
-        float  # the most probable standard deviation of a factor [1]; it may be 0, and at most `HIDDEN` if not shown
-    )
-    root: np.ndarray  # (P, n + K) square root of the covariance of the numbers
-    shown: bool  # independent noise alone does not explain the residuals
-    hidden: float  # deviation, at most `HIDDEN`, of factors that the residuals do not exclude [1]
-    moves: np.ndarray  # (P,) standard deviations of the numbers by such factors
+    deviation: float  # most probable standard deviation of a factor [1]; it may be 0; at most `HIDDEN` if not shown
+    root: np.ndarray  # (P, n + K) square root of the covariance of the parameters
+    shown: bool  # whether independent noise alone does not explain the residuals
+    hidden: float  # largest standard deviation of factors that the residuals do not exclude [1], at most `HIDDEN`
+    moves: np.ndarray  # (P,) standard deviations of the parameters by such factors
 
 
 def factors_of_series(
     counts: list[int], J: np.ndarray, r: np.ndarray, fitted: np.ndarray, slope: np.ndarray
 ) -> FactorNoise | None:
-    """Noise of variance s^2 (I + q^2 f_k f_k^T) of each series k; None for one series, or too few residuals.
+    """Fit noise with the covariance s^2 (I + q^2 f_k f_k^T) to each series k. None for a single series, or for too few
+    residuals.
 
-    The factors are few, so a deviation that is shown is not known well: it is enlarged by Student's t of K - 1 degrees
-    of freedom. One that chance may have made is not. If the unknowns can take up most of the factors, the residuals
-    hardly show them: `hidden` and `moves` tell what they leave open.
+    There are few factors, so their standard deviation is not known well. If it is shown, it is enlarged by Student's t
+    with K - 1 degrees of freedom. If chance may explain it, it is not enlarged. If the unknowns can compensate most of
+    the factors, the residuals hardly show them. `hidden` and `moves` tell which factors the residuals do not exclude.
 
     Args:
-        counts: rows of each of K series.
+        counts: number of rows of each of the K series.
         J: derivatives of the residuals by unknowns u (n, p).
         r: residuals (n,).
-        fitted: the numbers f (n,) that a factor multiplies, over the scales of the residuals.
-        slope: derivatives of P numbers by u (P, p).
+        fitted: the values f (n,) that a factor multiplies, divided by the scales of the residuals.
+        slope: derivatives (P, p) of the P parameters by u.
     """
     (n, p), K = J.shape, len(counts)
     if K < 2 or n <= p + K or not (p and np.all(np.isfinite(J)) and np.all(np.isfinite(r))):

@@ -1,23 +1,24 @@
-"""Noise that is not the same at all points, as where it grows with the stress: errors of least squares that hold."""
+"""Standard errors of least squares that stay right if the noise differs between points, for example if it grows with
+the stress."""
 
 import numpy as np
 import scipy.linalg
 import scipy.special
 
-#: Smallest noise, over the largest, of noise in proportion to a size.
+#: For noise in proportion to a size: minimum of smallest noise / largest noise.
 _LEAST = 1e-6
-#: Least part of a residual that the fit cannot have taken up.
+#: Lower bound of 1 - leverage, the part of the noise of a point that stays in its residual.
 _LEFT = 0.05
 
 
 def uneven_root(J: np.ndarray, r: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Square root (P, n) of the covariance of P numbers, each residual with its own variance (HC3: MacKinnon and White
-    1985).
+    """Square root (P, n) of the covariance of P parameters, if each residual has its own variance (HC3: MacKinnon and
+    White 1985).
 
     Args:
         J: derivatives of the residuals by unknowns u (n, p), of full rank.
         r: residuals of the fit (n,).
-        slope: derivatives of the numbers by u (P, p).
+        slope: derivatives (P, p) of the parameters by u.
     """
     if not np.all(np.isfinite(J)) or J.size == 0:
         return np.zeros((len(slope), len(r)))
@@ -27,10 +28,11 @@ def uneven_root(J: np.ndarray, r: np.ndarray, slope: np.ndarray) -> np.ndarray:
 
 
 def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Square root (P, n) of the covariance of P numbers for noise in proportion to `size` (n,); 0 if the residuals make
-    equal noise more probable, by restricted likelihood.
+    """Square root (P, n) of the covariance of P parameters for noise in proportion to `size` (n,). It is 0 if equal
+    noise has a higher restricted likelihood.
 
-    `uneven_root` does not see the noise of a point with a leverage near 1: the fit goes through it.
+    This is needed because `uneven_root` cannot use the noise of a point with a leverage near 1: the fit passes through
+    this point.
     """
     (n, p), largest, none = J.shape, np.abs(size).max(initial=0.0), np.zeros((len(slope), len(r)))
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(r)) and p and n > p + 1 and largest > 0):
@@ -41,7 +43,8 @@ def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarr
 
 
 def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tuple[float, float]:
-    """Restricted likelihood of independent noise with deviations in proportion to `size` (n,), and their factor."""
+    """Logarithm of the restricted likelihood of independent noise with standard deviations in proportion to `size`
+    (n,), and the most probable factor."""
     beside = scipy.linalg.null_space(J.T)
     try:
         L = np.linalg.cholesky(beside.T @ (size[:, None] ** 2 * beside))
@@ -51,24 +54,27 @@ def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tupl
     return -float(np.sum(np.log(np.diagonal(L)))) - len(L) * np.log(max(level, 1e-300)), level
 
 
-#: Chance below which two groups of residuals have noise of their own; smallest condition of J at which it is tried.
+#: Below this probability, two groups of residuals have noise of different size. The test is made only if the smallest
+#: singular value of J, divided by the largest, exceeds _CONDITION.
 _CHANCE, _CONDITION = 1e-3, 1e-8
 
 
 def grouped_root(J: np.ndarray, r: np.ndarray, second: np.ndarray, slope: np.ndarray) -> np.ndarray | None:
-    """Square root (P, n) of the covariance of P numbers with the noise of `grouped_sizes`; None if that is None.
+    """Square root (P, n) of the covariance of P parameters with the noise from `grouped_sizes`; None if this noise is
+    None.
 
     Args:
-        J, r, slope: as in `uneven_root`.
-        second: which residuals are of the second group (n,).
+        J, r, slope: see `uneven_root`.
+        second: whether each residual (n,) belongs to the second group.
     """
     sizes, scale = grouped_sizes(J, r, second), np.linalg.norm(J, axis=0)
     return None if sizes is None else slope @ (np.linalg.pinv(J / scale) / scale[:, None] * sizes)
 
 
 def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarray | None:
-    """Deviations (n,) of two groups of residuals, G' and G'' say, that have noise of their own; None if they differ no
-    more than by chance, or if some combination of u is hardly determined. Arguments as in `grouped_root`.
+    """Standard deviations (n,) if two groups of residuals (for example G' and G'') have noise of different size. None
+    if the sizes differ no more than by chance, or if some combination of u is hardly determined. Arguments: see
+    `grouped_root`.
     """
     scale = np.linalg.norm(J, axis=0)
     if not (np.all(np.isfinite(J)) and np.all(scale > 0)):

@@ -3,9 +3,9 @@
 The likelihood is raised to a power that grows from 0 to 1. Each step gives the particles weights, resamples them by
 these weights, and moves them by differential evolution until they are nearly independent of their earlier positions
 (Del Moral, Doucet and Jasra 2006, J. R. Stat. Soc. B 68, 411; ter Braak and Vrugt 2008, Statistics and Computing 18,
-435). Runs begin at the prior. So they agree only if each has found the whole posterior, with its tails and all of its
-maxima. The method needs only a density that can be computed at many points at once: there is no derivative, and nothing
-to tune or to compile.
+435). Every run begins at the prior. So the runs agree only if each has found the whole posterior, with its tails and
+all its maxima. The method needs only a density that can be computed at many points at once. It needs no derivatives, no
+tuning and no compilation.
 """
 
 from collections.abc import Callable
@@ -16,11 +16,12 @@ import scipy.special
 
 #: Number of independent runs, and smallest number of particles in each.
 CHAINS, FEWEST = 4, 500
-#: Part of the particles that is effective after a step of the power.
+#: The power rises in each step so far that this part of the particles stays effective.
 EFFECTIVE = 0.5
-#: Correlation with the positions before a step at which its moves end; that of the last step; most moves of a step.
+#: The moves of a step end if the correlation with the positions before the step is below FORGOTTEN, or below
+#: FORGOTTEN_LAST in the last step; and maximum number of moves in a step.
 FORGOTTEN, FORGOTTEN_LAST, MOST = 0.6, 0.2, 30
-#: Part of the moves by the whole difference of two particles, which can lead from one maximum to another.
+#: Part of the moves that use the whole difference of two particles. Such moves can lead from one maximum to another.
 LONG = 0.1
 
 
@@ -28,7 +29,7 @@ class Density(NamedTuple):
     """A posterior; the functions take u (W, P)."""
 
     log_likelihood: Callable[[np.ndarray], np.ndarray]  # -> (W,), up to a constant
-    log_prior: Callable[[np.ndarray], np.ndarray]  # -> (W,), minus infinity outside of its support
+    log_prior: Callable[[np.ndarray], np.ndarray]  # -> (W,), -inf outside of its support
     from_prior: Callable[[np.random.Generator, int], np.ndarray]  # (generator, W) -> (W, P)
 
 
@@ -53,7 +54,7 @@ class _Particles(NamedTuple):
 
 
 def run(density: Density, count: int, seed: int = 0) -> Chains:
-    """`CHAINS` runs of `count` draws.
+    """Make `CHAINS` independent runs with `count` draws each.
 
     Args:
         density: the posterior.
@@ -92,7 +93,7 @@ def _finite_only(values: np.ndarray) -> np.ndarray:
 
 
 def _rise(likelihood: np.ndarray, left: float) -> float:
-    """Largest increase of the power, by bisection on the effective number of particles."""
+    """Maximum increase of the power, by bisection on the effective number of particles."""
 
     def effective(rise: float) -> float:
         w = np.exp(rise * (likelihood - likelihood.max()))
@@ -117,7 +118,8 @@ def _resampled(log_weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _moved(
     density: Density, start: _Particles, power: float, limit: float, rng: np.random.Generator
 ) -> tuple[_Particles, int, float, float]:
-    """The particles after moves that keep the tempered density; then number of moves, acceptance and correlation."""
+    """The particles after moves that do not change the tempered density; then the number of moves, the acceptance and
+    the correlation."""
     half = len(start.u) // 2
     halves = slice(0, half), slice(half, 2 * half)
     now = _Particles(*(field.copy() for field in start))
@@ -132,9 +134,10 @@ def _moved(
 def _half_moved(
     density: Density, now: _Particles, power: float, halves: tuple[slice, slice], rng: np.random.Generator
 ) -> float:
-    """Move the first half in place by differences of the second; return the accepted fraction.
+    """Move the first half of the particles in place, by differences of particles in the second half. Return the
+    accepted fraction.
 
-    These differences do not depend on the particles that they move, so the moves do not change the density.
+    The differences do not depend on the moved particles, so the moves do not change the density.
     """
     own, other = now.u[halves[0]], now.u[halves[1]]
     half, size = own.shape
@@ -153,7 +156,7 @@ def _half_moved(
 
 
 def _correlation(before: np.ndarray, after: np.ndarray) -> float:
-    """Largest correlation of a coordinate with its value before."""
+    """Largest correlation between a coordinate and its earlier value."""
     a, b = before - before.mean(axis=0), after - after.mean(axis=0)
     size = np.sqrt(np.sum(a * a, axis=0) * np.sum(b * b, axis=0))
     return float(np.max(np.sum(a * b, axis=0) / np.maximum(size, 1e-300)))

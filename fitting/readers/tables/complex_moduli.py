@@ -1,4 +1,4 @@
-"""Storage and loss moduli from the columns that a file has: the moduli themselves, |G*|, the phase, tan(delta)."""
+"""Storage and loss moduli from the columns of a file: storage or loss modulus, |G*|, phase, tan(delta)."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from fitting.readers.tables.sweep_headings import UNITS, known_unit
 from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS, PER_SECOND
 from liverjax.core.errors import InputError
 
-#: Units that a column may name, for a sentence.
+#: Units that a column may have, for error messages.
 OFFERED = {"frequency": "Hz or rad_s", "phase": "deg or rad", "tangent": "1, or none"}
 NAMES = {"storage": "G'", "loss": "G''", "complex": "|G*|", "phase": "the phase", "tangent": "tan(delta)"}
 
 
 def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str]) -> np.ndarray:
-    """A column (n,) converted to rad/s, Pa, rad or 1; moduli of tension are not divided by 3 here.
+    """A column (n,), converted to rad/s, Pa, rad or 1. Moduli of tension are not divided by 3 here.
 
     Raises:
         InputError: the unit is not known, or its meaning is ambiguous.
@@ -30,7 +30,7 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
                     f"{path}: column {column.name} may be in degrees or radians; name it phase_deg or phase_rad"
                 )
             unit = "deg"
-        notes.append(f"column {column.name!r} states no unit; {unit} is taken")
+        notes.append(f"column {column.name!r} states no unit; {unit} is assumed")
     if not known_unit(quantity, unit):
         known = OFFERED.get(quantity, "Pa, kPa or MPa")
         raise InputError(f"{path}: unit {unit!r} of column {column.name} is not known; use {known}")
@@ -60,7 +60,8 @@ def _of_frequency(path: str, column: Column, unit: str) -> float:
 
 
 def fault_of(column: Column, written: float, value: float, smallest: float, largest: float) -> tuple[str, str] | None:
-    """The fault of a value (in SI), quoted as the file writes it, and the remedy; None if it has no fault."""
+    """The fault of a value (in SI) and the remedy; None if the value has no fault. The text quotes the value as the
+    file has it."""
     if not np.isfinite(value):
         if np.isnan(written):
             return f"{column.name} is empty", "fill it in or remove the line"
@@ -77,7 +78,7 @@ def fault_of(column: Column, written: float, value: float, smallest: float, larg
 
 
 def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
-    """Divide moduli of tension or bending by 3, in place; a note says so."""
+    """Divide moduli of tension or bending by 3, in place. The returned note says so."""
     moduli = [q for q in columns if q.split("_")[0] in MODULI]
     tensile = [q for q in moduli if is_tensile(columns[q][0])]
     if tensile:  # "tensile_storage_modulus, loss_modulus": both are of tension
@@ -97,8 +98,8 @@ def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
 
 
 def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
-    """Storage and loss moduli [Pa] (n,), and their deviations if the file has them, from SI columns. Deviations of
-    |G*|, phase or tan(delta) are converted to first order and assumed to be independent.
+    """Storage and loss moduli (n,) [Pa] from columns in SI units, and their standard deviations if the file has them.
+    Standard deviations of |G*|, phase or tan(delta) are converted to first order; they are assumed to be independent.
     """
     pair = pair_of(values)
     assert pair is not None
@@ -108,7 +109,8 @@ def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[st
     delta = np.arctan(angle) if pair[1] == "tangent" else angle
     s, c = np.sin(delta), np.cos(delta)
     notes.append(f"G' and G'' are computed from {NAMES[pair[0]]} and {NAMES[pair[1]]}")
-    # Each modulus is the measured one times a function of the angle: this function, then its derivative.
+    # Each modulus is the measured modulus times a function of the angle. For G' and G'': this function, then its
+    # derivative.
     by_angle = {
         "complex": ((c, -s), (s, c)),
         "storage": ((1 + 0 * c, 0 * c), (s / c, 1 / c**2)),
@@ -121,5 +123,5 @@ def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[st
         for name, (factor, slope) in zip(("storage", "loss"), by_angle, strict=True):
             out[f"{name}_sd"] = np.hypot(factor * of_size, size * slope * of_angle)
     elif any(f"{q}_sd" in values for q in pair):
-        notes.append("only one of the two has deviations: they are not used")
+        notes.append("only one of these two columns has standard deviations: they are not used")
     return out

@@ -1,4 +1,4 @@
-"""Columns of a frequency sweep: which of a file's headings are needed, and in which order."""
+"""Columns of a frequency sweep: which headings of a file are used, and in which order."""
 
 import re
 from collections.abc import Collection
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from fitting.readers.tables.sweep_headings import known_unit, quantity_of
 
-#: The pairs of columns that give storage and loss moduli, the best one first.
+#: The pairs of columns that give storage and loss moduli, with the best pair first.
 PAIRS = (
     ("storage", "loss"),
     ("complex", "phase"),
@@ -28,12 +28,12 @@ class Column(NamedTuple):
 
     place: int  # index in the line, from 0
     name: str
-    quantity: str  # frequency, storage, loss, complex, phase, tangent, viscosity; some of them also with "_sd"
+    quantity: str  # frequency, storage, loss, complex, phase, tangent, viscosity; some also with "_sd"
     unit: str | None
 
 
 def pair_of(quantities: Collection[str]) -> tuple[str, str] | None:
-    """The pair of quantities that gives both moduli; None if there is none."""
+    """The best pair of quantities that gives both moduli; None if there is none."""
     return next((pair for pair in PAIRS if set(pair) <= set(quantities)), None)
 
 
@@ -63,8 +63,9 @@ def is_angular(column: Column) -> bool:
 
 
 def header_columns(cells: list[str]) -> list[Column]:
-    """The columns of a sweep. For each quantity the first column with a known unit comes first, rad/s before Hz; the
-    others follow, for comparison. If they are enough for a sweep, columns that it does not need are left out.
+    """The columns of a sweep. Columns with a known unit come before the others, and angular frequencies before
+    frequencies. The first column of a quantity is used; further columns of it are compared with the first. If the
+    columns are enough for a sweep, columns that it does not need are left out.
     """
     found = [(k, cell, quantity_of(cell)) for k, cell in enumerate(cells)]
     columns = [Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]
@@ -79,11 +80,12 @@ def header_columns(cells: list[str]) -> list[Column]:
 
 
 def columns_beside(cells: list[str], units: list[str], used: list[Column]) -> list[Column]:
-    """Columns of |G*|, phase, tan(delta) and |eta*| that a sweep does not need, with known units; the first of each.
+    """Columns of |G*|, phase, tan(delta) and |eta*| that the sweep does not need: for each quantity, the first column
+    with a known unit.
 
     Args:
         cells: headings.
-        units: units from a line of their own; may be empty.
+        units: units from a separate line of the file; may be empty.
         used: the columns that are read.
     """
     needed = {c.quantity for c in used}
@@ -117,11 +119,11 @@ _TEMPERATURE = {"c": (1.0, 273.15), "k": (1.0, 0.0), "f": (5 / 9, 459.67 * 5 / 9
 
 
 def condition_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float, float]]:
-    """Place, factor and offset to SI of `temperature` [K] and `shift_factor`, from the headings that name them.
+    """Column index, factor and offset to SI of `temperature` [K] and `shift_factor`, if the headings name them.
 
     Args:
         cells: headings.
-        units: units from a line of their own; may be empty.
+        units: units from a separate line of the file; may be empty.
     """
     found: dict[str, tuple[int, float, float]] = {}
     for k, cell in enumerate(cells):

@@ -1,13 +1,15 @@
-"""Meaning of a column's heading in a frequency sweep: a quantity and its unit, in the words that instruments use."""
+"""Meaning of a column heading in a frequency sweep: its quantity and its unit. The words are those of common
+instruments."""
 
 import re
 
 from fitting.readers.units import ANGLE_UNITS, FREQUENCY_UNITS, MODULUS_UNITS, TANGENT_UNITS, VISCOSITY_UNITS
 
 DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
-#: Words that add nothing: kinds of the same quantity, and symbols after a name.
+#: Words that do not change the meaning: kinds of the same quantity, and symbols after a name.
 IDLE_WORDS = {"standard", "mean", "value", "g'", "g''", "g*", "e'", "e''", "e*", "delta", "omega", "f", "w"}
-#: First words of a heading, and the quantity. Words of `UNCERTAIN` count only with a known unit, or without a unit.
+#: Quantities, and the words with which their headings begin. Words in `UNCERTAIN` count only with a known unit or
+#: without a unit.
 WORDS = {
     "frequency": (
         *("angular frequency", "ang frequency", "angular freq", "ang freq", "angular velocity", "angular", "omega"),
@@ -39,19 +41,19 @@ WORDS = {
     ),
     "viscosity": ("complex viscosity", "eta*", "komplexe viskosität", "viscosité complexe"),
 }
-#: Words before the name of a modulus.
+#: Words that may stand before the name of a modulus.
 KINDS = ("shear", "dynamic", "tensile", "flexural", "bending", "compressive", "young's", "youngs", "young")
 UNCERTAIN = {"storage", "loss", "f", "w", "phase", "delta", "angular"}
 _LONGEST_FIRST = sorted(
     ((words.split(), quantity) for quantity, names in WORDS.items() for words in names),
     key=lambda row: -len(row[0]),
 )
-#: Typographic characters, and the plain ones that replace them.
+#: Typographic characters, and the plain characters that replace them.
 _PLAIN = {"′": "'", "’": "'", "`": "'", "´": "'", "″": "''", "”": "''", '"': "''", "δ": "delta", "ω": "omega"}
 _PLAIN["η"] = "eta"
 
 
-#: Units of what is no modulus and no frequency.
+#: Units of quantities that are neither a modulus nor a frequency.
 UNITS: dict[str, dict[str, float]] = {
     "phase": ANGLE_UNITS,
     "tangent": TANGENT_UNITS,
@@ -60,7 +62,7 @@ UNITS: dict[str, dict[str, float]] = {
 
 
 def known_unit(quantity: str, unit: str | None) -> bool:
-    """Whether the unit can be converted; a column without a unit gets the default unit."""
+    """Whether the unit can be converted. A column without a unit gets the default unit."""
     if unit is None:
         return True
     if quantity == "frequency":
@@ -69,7 +71,7 @@ def known_unit(quantity: str, unit: str | None) -> bool:
 
 
 def quantity_of(cell: str) -> tuple[str, str | None] | None:
-    """(quantity, unit) that a header cell names, or None. Deviations end in "_sd"."""
+    """The (quantity, unit) of a header cell, or None. The quantity of a standard deviation ends in "_sd"."""
     name = cell
     for sign, plain in _PLAIN.items():
         name = name.replace(sign, plain)

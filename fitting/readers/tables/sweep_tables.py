@@ -1,4 +1,4 @@
-"""Tables of frequency sweeps in the lines of a file: where each begins, and its rows of numbers."""
+"""Tables of frequency sweeps in the lines of a file: where each table begins, and its rows of numbers."""
 
 import re
 from collections.abc import Callable
@@ -31,14 +31,14 @@ COMMENTS = ("#", "%")
 class Table(NamedTuple):
     """A table of a file, before its units are converted."""
 
-    name: str  # name in the file, may be empty
+    name: str  # name in the file; may be empty
     columns: list[Column]
     rows: list[list[float]]  # in the order of the columns
     numbers: list[int]  # line numbers in the file
     raw: dict[str, np.ndarray]  # raw measurements of the instrument, one value per row
-    strain_unit: str = ""  # unit of the strain column, as the file states it
+    strain_unit: str = ""  # unit of the strain column, as in the file
     beside: tuple[tuple[Column, np.ndarray], ...] = ()  # columns that the sweep does not need, for comparison
-    notes: tuple[str, ...] = ()  # on headings and numbers of two meanings
+    notes: tuple[str, ...] = ()  # on headings and numbers with two possible meanings
 
     @property
     def frequencies(self) -> int:
@@ -54,8 +54,8 @@ def choose_table(
     what: str = "frequencies",
     size: Callable[[Table], int] = lambda table: table.frequencies,
 ) -> tuple[int, list[str]]:
-    """Index of the table to read, and a note if there are several. Without `wanted` it is the table with most
-    frequencies, or with the largest `size`.
+    """Index of the table to read, and a note if there are several. Without `wanted`, the table with the largest `size`
+    is read; by default, this is the table with the largest number of frequencies.
     """
     names = [f"{k} {t.name!r}" if t.name else str(k) for k, t in enumerate(tables, 1)]
     if wanted is not None:
@@ -71,7 +71,7 @@ def choose_table(
 
 
 def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int:
-    """Index of the table with this number or name, or of the only table whose name contains the text."""
+    """Index of the table with the number or name `wanted`, or of the only table whose name contains this text."""
     wanted = str(wanted)
     if wanted.isdecimal() and 1 <= int(wanted) <= len(tables):
         return int(wanted) - 1
@@ -86,7 +86,7 @@ def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int
 
 
 def tables_of(path: str, lines: list[str]) -> list[Table]:
-    """Every table that has numbers; if there is none, an `InputError` says what is missing."""
+    """Every table that has numbers. If there is none, an `InputError` tells what is missing."""
     for uncomment in (False, True):  # np.savetxt writes its header as a comment
         tables, headers = _search(path, [line.lstrip("#% ") for line in lines] if uncomment else lines)
         if tables:
@@ -147,24 +147,25 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
 
 
 def _nameless_deviations(cells: list[str]) -> list[str]:
-    """A note on headings such as "SD" and "±", which do not say of which modulus."""
+    """A note on headings such as "SD" and "±": they do not tell to which modulus they belong."""
     words = [re.sub(r"[^a-z±]", " ", cell.lower()).split() for cell in cells]
     spread = {*DEVIATION_WORDS, "±"}
     found = [c for c, own in zip(cells, words, strict=True) if spread & set(own) and set(own) <= spread | {"pa", "kpa"}]
     if not found:
         return []
     return [
-        f"columns {', '.join(map(repr, found))} are not used: they do not say of what they are the deviations; name "
-        "them storage_modulus_sd_Pa and loss_modulus_sd_Pa"
+        f"columns {', '.join(map(repr, found))} are not used: their headings do not tell to which modulus they "
+        "belong; name them storage_modulus_sd_Pa and loss_modulus_sd_Pa"
     ]
 
 
-#: Words of headings that a DMA writes, whose samples are stretched, pressed or bent, and a rheometer does not.
+#: Words in headings of a DMA, which stretches, compresses or bends its samples. A rheometer does not write them.
 _OF_DMA = re.compile(r"(static|dynamic|dyn\.?) (force|strain|stress|displacement)|^(sample )?length\b|stiffness", re.I)
 
 
 def _perhaps_tensile(cells: list[str], columns: list[Column]) -> list[str]:
-    """A note if the moduli state neither shear nor tension, and another heading is one of tests in tension."""
+    """A note if the headings of the moduli tell neither shear nor tension, and another heading belongs to tests in
+    tension."""
     moduli = [c for c in columns if c.quantity in MODULI]
     sign = next((c for c in cells if _OF_DMA.search(c.replace("_", " ").strip('" '))), None)
     turned = any(re.search(r"torque|angle|drehmoment|winkel|m/rad", cell.lower()) for cell in cells)
@@ -178,18 +179,20 @@ def _perhaps_tensile(cells: list[str], columns: list[Column]) -> list[str]:
 
 
 def _perhaps_thousands(rows: list[list[str]], columns: list[Column], sign: str | None) -> list[str]:
-    """A note if each number that has a comma may be one with separated thousands: "410,382"."""
+    """A note if the commas in numbers may separate thousands, for example "410,382"."""
     cells = [row[c.place].strip('" ') for row in rows for c in columns if c.place < len(row)]
     shown = next((cell for cell in cells if re.fullmatch(r"[1-9]\d{0,2},\d{3}", cell)), None)
     if sign is not None or shown is None:
         return []
-    return [f"{shown} is read as {shown.replace(',', '.')}: if thousands are separated, write the numbers without"]
+    return [
+        f"{shown} is read as {shown.replace(',', '.')}: if the comma separates thousands, write the numbers without it"
+    ]
 
 
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
-    """Raw torque, angle, phase, strain and temperature in SI for the rows of a table; NaN for an empty cell.
+    """Raw torque, angle, phase, strain and temperature in SI units, for the rows of a table; an empty cell is NaN.
 
-    A column of temperatures with a gap is left out.
+    A temperature column with an empty cell is left out.
 
     `sign` is the table's decimal sign.
     """
@@ -198,7 +201,7 @@ def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
     for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():
         values = _cells_of(place, rows, delimiter, sign)
         known = np.isfinite(values)
-        # Readers of the other columns leave out points without them.
+        # For the other columns, later steps leave out points without a value.
         if known.all() if quantity == "temperature" else known.any():
             found[quantity] = factor * values + offset
     return found
@@ -211,7 +214,8 @@ def _cells_of(place: int, rows: list[list[str]], delimiter: str, sign: str | Non
 
 
 def _title(above: list[str]) -> str:
-    """Name of a table from the lines above its header: TRIOS's step, RheoCompass's result, else the nearest line."""
+    """Name of a table from the lines above its header: the step of TRIOS, the result of RheoCompass, or else the
+    nearest line."""
     cells = [[c.strip("#\"' ") for c in line.split("\t")] for line in above]
     cells = [[c for c in row if c] for row in cells]
     for row in reversed(cells):
@@ -223,7 +227,8 @@ def _title(above: list[str]) -> str:
 
 
 def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: str) -> tuple[list[Column], int]:
-    """The columns with the units of the unit line, if one of the next two lines is one; and the line after it."""
+    """The columns, and the index of the next line to read. If one of the next two lines is a line of units, the columns
+    get these units."""
     for ahead in range(k, min(k + 2, len(lines))):
         cells = split_cells(lines[ahead], delimiter)
         units = {c.place: cells[c.place].strip('"[]() ') for c in columns if c.place < len(cells)}
@@ -236,7 +241,8 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
 
 
 def _rows_below(path, columns, lines, k, delimiter, width):
-    """Rows of numbers below a header, their line numbers, and the line after them. An empty cell is NaN."""
+    """Rows of numbers below a header, their line numbers, and the index of the line after them. An empty cell is
+    NaN."""
     needed = [c for c in columns if not c.quantity.endswith("_sd")]
     kept, numbers = [], []
     while k < len(lines):
@@ -244,7 +250,7 @@ def _rows_below(path, columns, lines, k, delimiter, width):
         if line.lstrip().startswith(COMMENTS) or not line.strip(f"{delimiter} \t-=+:"):
             k += 1
             if kept and not line.strip() and any(later.startswith("[") or _complete(later) for later in lines[k:]):
-                break  # the next table of an instrument's export
+                break  # the next table of an export begins
             continue
         cells = split_cells(line, delimiter)
         words = _is_words(cells, needed)
@@ -267,7 +273,7 @@ def _is_words(cells: list[str], needed: list[Column]) -> bool:
 
 
 def _goes_on(lines: list[str], k: int, delimiter: str, needed: list[Column]) -> bool:
-    """Whether numbers of the same table follow line k, which has words only."""
+    """Whether numbers of the same table follow after line k, which has only words."""
     for line in lines[k:]:
         if _complete(line):
             return False

@@ -10,12 +10,13 @@ from pathlib import Path
 from fitting.readers import trios_json, workbook
 from liverjax.core.errors import InputError
 
-#: Longest line of a table; Python's reader of CSV refuses longer cells.
+#: Maximum length of a line: Python's CSV reader refuses longer cells.
 LONGEST_LINE = 131072
 
 
 def text_of(path: Path, what: str = "a frequency sweep") -> str:
-    """Content of a text file of any encoding, or of a workbook. `InputError` if it is neither; it names `what`."""
+    """Content of a text file of any encoding, or of a workbook. If the file is neither, an `InputError` says so, with
+    the name `what`."""
     try:
         if path.is_dir():
             raise InputError(f"{path} is a folder: give the CSV file of {what}")
@@ -45,7 +46,7 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
 def _decoded(path: Path, data: bytes) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
-    start = data[:200]  # UTF-16 without its mark: every second byte of plain text is 0
+    start = data[:200]  # UTF-16 without a byte order mark: every second byte of plain text is 0
     for name, zeros in (("utf-16-le", start[1::2]), ("utf-16-be", start[::2])):
         if len(start) > 20 and not any(zeros):
             return data.decode(name, errors="replace")
@@ -58,14 +59,14 @@ def _decoded(path: Path, data: bytes) -> str:
 
 
 def find_delimiter(line: str) -> str:
-    """Delimiter of the cells of a line: the most frequent of tab, semicolon, comma and bar, else spaces."""
-    plain = re.sub(r"\|\s*\w+\s*\*?\s*\|", "", line) if "*|" in line else line  # the bars of |G*| separate no cells
+    """Delimiter between the cells of a line: the most frequent of tab, semicolon, comma and bar; or else spaces."""
+    plain = re.sub(r"\|\s*\w+\s*\*?\s*\|", "", line) if "*|" in line else line  # the bars of |G*| are not delimiters
     best = max("\t;,|", key=plain.count)
     return best if best in plain else ("  " if "  " in line.strip() else " ")
 
 
 def split_line(line: str, delimiter: str | None = None) -> tuple[str, list[str]]:
-    """The delimiter of a line and its cells; without a given delimiter it is found."""
+    """The delimiter of a line, and its cells. If no delimiter is given, it is found from the line."""
     delimiter = delimiter or find_delimiter(line)
     return delimiter, split_cells(line, delimiter)
 
@@ -77,15 +78,17 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
-#: Texts of a cell without a measurement.
+#: Texts in cells without a measurement.
 EMPTY = {"", "-", "--", "---", "–", "—", "*", "n/a", "#n/a", "na", "n.a.", "none", "null", "nan", "?"}
-#: Spaces and apostrophes that separate thousands, and patterns of numbers by their separator of thousands.
+#: Spaces and apostrophes that separate thousands; and, for comma and point as separator of thousands, the pattern of
+#: such numbers.
 _GROUPED = re.compile(r"(?<=\d)['’ \u00a0\u2009\u202f](?=\d{3}(\D|$))")
 _THOUSANDS = {sign: re.compile(rf"[-+]?[1-9]\d{{0,2}}(\{sign}\d{{3}})+(\{other}\d*)?") for sign, other in (",.", ".,")}
 
 
 def decimal_sign(cells: Iterable[str]) -> str | None:
-    """The decimal sign of a table, "." or ",", None if its cells do not show it; the other sign separates thousands."""
+    """The decimal sign of a table: "." or ",", or None if the cells do not show it. The other sign separates
+    thousands."""
     found = set()
     for cell in cells:
         text = _GROUPED.sub("", cell.strip().strip('"').lower())
@@ -99,12 +102,13 @@ def decimal_sign(cells: Iterable[str]) -> str | None:
 
 
 def to_number(text: str, delimiter: str, sign: str | None = None) -> float | None:
-    """A number, also with a decimal comma or with separated thousands; NaN for an empty cell; None for any other text.
+    """The number in a cell; a decimal comma and separated thousands are allowed. NaN for an empty cell, None for any
+    other text.
 
     Args:
         text: a cell.
         delimiter: delimiter of the cells.
-        sign: `decimal_sign` of the table; if it is None, a single comma or point is the decimal sign.
+        sign: `decimal_sign` of the table. If it is None, a single comma or point is the decimal sign.
     """
     text = text.strip().strip('"').strip()
     if text.lower() in EMPTY:
@@ -123,5 +127,5 @@ def to_number(text: str, delimiter: str, sign: str | None = None) -> float | Non
 
 
 def means_nothing(cells: Iterable[str]) -> bool:
-    """Whether no cell begins like a number: a line of words."""
+    """Whether no cell begins like a number. Then the line has only words."""
     return not any(re.match(r"[-+]?[.,]?\d|nan|[-+]?inf", cell.strip('" ').lower()) for cell in cells)

@@ -1,6 +1,7 @@
-"""Columns of tests in time, in SI units: time with a modulus, a compliance, or two measured quantities.
+"""Columns of tests in time, in SI units: the time, and a modulus, a compliance, or two measured quantities.
 
-Files have the forms of sweeps: plain CSV, TRIOS and RheoCompass text, units in the header or below it.
+The files have the same formats as for sweeps: plain CSV, TRIOS and RheoCompass text, with units in the header or below
+it.
 """
 
 import os
@@ -13,7 +14,8 @@ from fitting.readers.tables.text_tables import EMPTY, decimal_sign, means_nothin
 from fitting.readers.units import TIME_TEST_UNITS
 from liverjax.core.errors import InputError
 
-#: Words that begin a heading, and the quantity; the longer ones come first.
+#: Words with which a heading begins, and its quantity. If one entry begins with the words of another, the longer entry
+#: comes first.
 WORDS = (
     ("relaxation modulus e(t)", "tensile modulus"),
     ("young's modulus e(t)", "tensile modulus"),
@@ -90,7 +92,7 @@ WORDS = (
     ("time", "time"),
     ("t", "time"),
 )
-#: Quantities that a file must have in addition to the time, best first.
+#: Combinations of quantities, best first. A file must have one combination in addition to the time.
 FORMS = (
     ("strain", "stress"),
     ("tensile strain", "tensile stress"),
@@ -101,7 +103,7 @@ FORMS = (
     ("tensile modulus",),
     ("tensile compliance",),
 )
-#: Factors that make quantities of tension those of shear, for a sample that keeps its volume.
+#: For each quantity of tension: the quantity of shear and the factor to it, for a sample that keeps its volume.
 TENSILE = {
     "tensile modulus": ("modulus", 1 / 3),
     "tensile compliance": ("compliance", 3.0),
@@ -110,17 +112,18 @@ TENSILE = {
 }
 
 
-#: No soft tissue is sheared or stretched so far [1] in a test of its viscoelasticity.
+#: In tests of viscoelasticity, soft tissue is not strained beyond this [1].
 LARGE = 1.0
-#: TRIOS writes two times, since the test began and since the experiment began. The time of the test is used.
+#: TRIOS writes two times: one counts from the begin of the test, one from the begin of the experiment. The time of the
+#: test is used.
 OWN_TIME = "step time"
 
 
 def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns of a test by quantity, in SI units, at rising times from 0 s or later; then notes.
+    """The columns of a test by quantity, in SI units, and notes. The times rise and begin at 0 s or later.
 
     Raises:
-        InputError: one sentence naming file, column or line, value and remedy.
+        InputError: one sentence with the file, the column or line, the value and the remedy.
     """
     columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
     time = columns["time"]
@@ -142,7 +145,7 @@ def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[s
 
 
 def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns, in SI units, of the first table that has time and an answer; then notes."""
+    """The columns, in SI units, of the first table that has the time and one of `FORMS`; and notes."""
     for k, line in enumerate(lines):
         delimiter, cells = split_line(line.lstrip("# "))
         found = _heading(cells)
@@ -163,7 +166,7 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
 
 
 def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Quantities of tension as those of shear, with a note."""
+    """The columns with quantities of tension converted to shear, and a note on this."""
     tensile = [name for name in TENSILE if name in columns]
     for name in tensile:
         shear, factor = TENSILE[name]
@@ -176,29 +179,30 @@ def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[st
     return columns, notes
 
 
-#: Deviation [1] of the force from a straight line from which it is told.
+#: A note is given if the force deviates from a straight line by more than this [1].
 BENT = 0.02
 
 
 def beyond_small(strain: float) -> list[str]:
-    """A note if the force of a neo-Hookean sample, stretched or compressed so far, is not in proportion."""
+    """A note if the force of a neo-Hookean sample at this strain is no longer in proportion to the strain."""
 
     def off(stretch: float) -> float:
-        """The force over that of the straight line, less 1."""
+        """The force divided by the force of the straight line, minus 1."""
         return (stretch - stretch**-2) / (3 * (stretch - 1)) - 1
 
     if not strain > 0 or -off(1 + strain) < BENT:
         return []
     shorter = f"{100 * off(1 - strain):.2g} % too large in compression, " if strain < 1 else ""
     return [
-        f"the sample is strained by {100 * strain:.2g} %, where the force of neo-Hookean tissue is no straight line: "
-        f"moduli come out {shorter}{-100 * off(1 + strain):.2g} % too small in tension. Describe the test in a TOML "
-        "file to have this computed"
+        f"the sample is strained by {100 * strain:.2g} %, where the force of neo-Hookean tissue is not in proportion "
+        f"to the strain: moduli come out {shorter}{-100 * off(1 + strain):.2g} % too small in tension. To have this "
+        "computed, describe the test in a TOML file"
     ]
 
 
 def _unknown_unit(line: str) -> tuple[str, str] | None:
-    """Quantity and unit of a heading whose unit is not known, in a line that names the time and an answer so."""
+    """Quantity and unit of a heading whose unit is not known. The line must be a header: it names the time, and with
+    this quantity one of `FORMS`."""
     cells = split_line(line.lstrip("# "))[1]
     found = _heading(cells)
     for cell in cells if "time" in found else []:
@@ -216,11 +220,11 @@ def _known_units(quantity: str) -> str:
 
 
 def _told_of_tables(below: list[str]) -> list[str]:
-    """A note if further tables of tests are below the first one."""
+    """A note if further tables of tests follow below the first table."""
     more = sum(map(_begins_a_table, below))
     if not more:
         return []
-    return [f"the file holds {more + 1} tables of a test: the first is read; give each a file of its own"]
+    return [f"the file holds {more + 1} tables of a test: the first is read; give each table a separate file"]
 
 
 def _begins_a_table(line: str) -> bool:
@@ -229,7 +233,8 @@ def _begins_a_table(line: str) -> bool:
 
 
 def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """Quantity -> place and unit of the first cell that names it; a step time comes before other times."""
+    """For each quantity: column index and unit of the first cell that names it. A step time comes before other
+    times."""
     found: dict[str, tuple[int, str | None]] = {}
     for k, cell in sorted(enumerate(cells), key=lambda each: not _is_own_time(each[1])):
         text = cell.strip().strip('"')
@@ -242,7 +247,7 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
                 if rest and not _known_column(quantity, rest):
                     break  # "strain rate", "stress (step)"
                 if word in ("e(t)", "d(t)") and name[0].islower():
-                    break  # e(t) is a strain, d(t) a displacement
+                    break  # in small letters, e(t) is a strain and d(t) a displacement
                 if word == "t" and not (name[0] == "t" and (unit or rest) and _known_column("time", unit or rest)):
                     break  # T is a temperature
                 found.setdefault(quantity, (k, unit or rest or None))
@@ -250,12 +255,12 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
     return _all_tensile(found, cells)
 
 
-#: Words of a heading that is of shear in a table of tension too.
+#: Words of a heading that means shear even in a table of tension.
 _SHEAR = re.compile(r"shear|g\(t\)|j\(t\)|schub|scher|cisail", re.IGNORECASE)
 
 
 def _all_tensile(found: dict[str, tuple[int, str | None]], cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """Beside a column of tension the other quantities are those of tension, if their headings do not name shear."""
+    """If one column is of tension, the other quantities are of tension too, unless their headings name shear."""
     if not TENSILE.keys() & found.keys():
         return found
     return {
@@ -269,7 +274,7 @@ def _is_own_time(cell: str) -> bool:
 
 
 def _told_of_times(cells: list[str]) -> list[str]:
-    """A note if the header has two times."""
+    """A note if the header has two time columns."""
     if not any(map(_is_own_time, cells)) or not any("time" in _heading([c]) and not _is_own_time(c) for c in cells):
         return []
     return ["the times are those of the column Step time; the column Time counts from another beginning"]
@@ -284,7 +289,7 @@ def _known_column(quantity: str, unit: str) -> bool:
 
 
 def _rows_in_time(path, lines, k, delimiter, found):
-    """Numbers below the header, the units of a unit line, and notes. An empty cell is NaN."""
+    """Numbers below the header, the units from a line of units, and notes. An empty cell is NaN."""
     kept, numbers, units, notes = [], [], {}, []
     needed = {q: place for q, (place, _) in found.items()}
     while k < len(lines):
@@ -297,7 +302,7 @@ def _rows_in_time(path, lines, k, delimiter, found):
             numbers.append(k)
             continue
         named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known_column(q, cells[p])}
-        if not kept and named:  # unknown units are kept here, and refused later
+        if not kept and named:  # unknown units are kept here and refused later
             units = {q: cells[p].strip('[]() "') for q, p in needed.items() if p < len(cells) and cells[p].strip()}
         elif kept and _begins_a_table(line):
             break
@@ -317,7 +322,7 @@ def _rows_in_time(path, lines, k, delimiter, found):
 
 
 def _rows_follow(below: list[str], delimiter: str, places: list[int]) -> bool:
-    """Whether numbers of the same table follow."""
+    """Whether numbers of the same table follow below."""
     for line in below:
         if _begins_a_table(line):
             return False
@@ -333,7 +338,7 @@ def _in_si(path, found, rows, units):
         unit = units.get(quantity) or unit
         if unit is None:
             unit = next(iter(TIME_TEST_UNITS[quantity]))
-            notes.append(f"the column of {quantity} states no unit; {unit} is taken")
+            notes.append(f"the column of {quantity} states no unit; {unit} is assumed")
             most = float(np.nanmax(np.abs(rows[:, j]), initial=0.0))
             if quantity.endswith("strain") and most > LARGE:
                 notes[-1] += f", so that the strain reaches {100 * most:.4g} %: if it is in percent, name it strain_%"

@@ -1,4 +1,4 @@
-"""Sentences about a fit to waves that its user should know: they are printed, and are `warnings` in waves.json."""
+"""Warnings about a fit to waves. They are printed, and they are `warnings` in waves.json."""
 
 import itertools
 
@@ -12,18 +12,20 @@ from fitting.waves.shear_waves import velocity_and_attenuation
 from fitting.waves.stiffness_map import FAR, WaveMap
 from fitting.waves.wave_field import WaveField
 
-#: Radius [voxels] below which the modulus of a region is a guess: cylinders of this radius came out within 8 %.
+#: Below this radius [voxels], the modulus of a region is only a guess. In tests, the moduli of cylinders of this radius
+#: were right within 8 %.
 LEAST_RADIUS = 2.5
-#: chi^2 per equation above which there is a warning that the model misses something.
+#: Above this chi^2 per equation, a warning says that the model misses something.
 TOO_FAR = 1.5
-#: Standard deviations of the chi^2 of a map above which it is told, and the part of it that the noise's estimate costs.
+#: The chi^2 of a map is reported if it exceeds 1 per equation by more than ROUGH plus BY_CHANCE standard deviations.
+#: ROUGH is for the error of the estimated noise.
 BY_CHANCE, ROUGH = 5.0, 0.03
-#: The same, above which the moduli themselves may be wrong.
+#: Above this chi^2 per equation, the moduli may be wrong by more than their errors.
 WRONG = 10.0
 
 
 def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
-    """One sentence for each. The arguments are those of `fitting.reports.waves.report.write`."""
+    """All warnings, one sentence each. The arguments are the same as for `fitting.reports.waves.report.write`."""
     told, each = _sign(organ, found), found.whole if found.parts is None else found.parts
     told += _of_scales(organ, found)
     any_coarse = False
@@ -57,7 +59,8 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
         told.append(
             f"the map stopped {drawn.distance:.2g} standard deviations away from its minimum: compare it with regions"
         )
-    # The mean of n squares scatters by the root of 2/n; the noise that divides them is an estimate.
+    # The mean of n squares has the standard deviation sqrt(2/n). The noise that divides the residuals is only an
+    # estimate.
     if drawn is not None and drawn.chi2 / drawn.components > 1 + ROUGH + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(
             f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: "
@@ -70,7 +73,8 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
 
 
 def _of_small_regions(field: WaveField, labels: np.ndarray) -> list[str]:
-    """A sentence on regions without a voxel that is `LEAST_RADIUS` from other regions; the organ's own end is none."""
+    """A sentence on regions in which no voxel is `LEAST_RADIUS` or more away from other regions. The surface of the
+    organ does not count as another region."""
     assert field.labels is not None
     small = []
     for label in labels:
@@ -86,8 +90,8 @@ def _of_small_regions(field: WaveField, labels: np.ndarray) -> list[str]:
     ]
 
 
-#: Root mean square of the motion over the noise, below which nothing but noise is seen: the two add up as squares, so
-#: that the motion itself is smaller than two thirds of the noise.
+#: Below this ratio of the measured motion (root mean square) to the noise, the data contain hardly more than noise. The
+#: squares of motion and noise add up, so the true motion is then below two thirds of the noise.
 NO_MOTION = 1.2
 
 
@@ -103,32 +107,32 @@ def _of_no_motion(field: WaveField, f: int) -> list[str]:
     ]
 
 
-#: Relative standard error of a modulus above which its interval is not symmetric.
+#: Above this relative standard error, the interval of a modulus is not symmetric.
 SKEW = 0.15
 
 
 def _of_long_waves(hertz: float, found: Found, f: int) -> list[str]:
-    """The interval of each modulus that is known so badly that its error is not the same on both sides.
+    """The interval of each modulus whose error is so large that it is not the same on both sides.
 
-    Waves that are long beside the organ determine the compliance 1/G, whose error is symmetric.
+    Waves much longer than the organ determine the compliance 1/G. The error of 1/G is symmetric.
     """
     each, told = found.whole if found.parts is None else found.parts, []
     for r, (G, e) in enumerate(zip(np.abs(each.modulus[f]), each.standard_errors[f].real, strict=True)):
-        told_already = found.parts is not None and e >= G  # a region has a sentence of its own
+        told_already = found.parts is not None and e >= G  # another sentence reports this region
         if told_already or not (np.isfinite(e) and e > SKEW * G):
             continue
         half = 2 * e / G**2
         top = f"{1 / (1 / G - half):.3g} Pa" if half < 1 / G else "any value above"
         told.append(
-            f"{hertz:g} Hz: {_modulus_named(found, r)} has an error of {100 * e / G:.2g} %. Where waves are long "
-            f"beside the organ the data determine 1/G, so its size may be {1 / (1 / G + half):.3g} Pa to {top} "
+            f"{hertz:g} Hz: {_modulus_named(found, r)} has an error of {100 * e / G:.2g} %. If waves are much longer "
+            f"than the organ, the data determine 1/G. So the size of G may be {1 / (1 / G + half):.3g} Pa to {top} "
             "(95 %): measure at a higher frequency"
         )
     return told
 
 
 def _of_voxel_size(hertz: float, found: Found, f: int) -> list[str]:
-    """A sentence if the size of the voxels changes a modulus by more than its standard error."""
+    """A sentence if the size of the voxels changes a modulus by more than the standard error of this modulus."""
     each, biases = found.whole, found.mesh_bias[:, None]
     if found.parts is not None and found.parts_bias is not None:
         each, biases = found.parts, found.parts_bias
@@ -138,7 +142,7 @@ def _of_voxel_size(hertz: float, found: Found, f: int) -> list[str]:
         return []
     return [
         f"{hertz:g} Hz: the size of the voxels changes {_modulus_named(found, r)} by {100 * bias[r]:.2g} % (standard "
-        f"error {100 * error[r]:.2g} %): subtract mesh_bias, or measure smaller voxels"
+        f"error {100 * error[r]:.2g} %): subtract mesh_bias, or measure with smaller voxels"
     ]
 
 
@@ -149,9 +153,10 @@ def _modulus_named(found: Found, r: int) -> str:
 
 
 def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: bool) -> list[str]:
-    """Sentences on residuals that are too large, or alike in neighbouring voxels.
+    """Sentences on residuals that are too large, or that neighbouring voxels share.
 
-    `coarse`: the size of the voxels changes a modulus by more than its error. Then it comes first among the causes.
+    `coarse`: the size of the voxels changes a modulus by more than its error. Then the size of the voxels is named
+    first among the causes.
     """
     told, ratio = [], each.chi2[f] / each.components
     alike = f < len(each.correlations) and each.correlations[f].seen
@@ -182,7 +187,8 @@ SLOW, FAST = 0.4, 15.0
 
 
 def _in_radians(hertz: np.ndarray) -> bool:
-    """Whether no frequency is a whole number, and all are whole numbers times 2 pi, to the digits of a table."""
+    """Whether all frequencies are whole numbers times 2 pi, and none is a whole number, within the digits of a
+    table."""
 
     def whole(x: np.ndarray) -> np.ndarray:
         return np.abs(x - np.round(x)) < 5e-4
@@ -191,9 +197,9 @@ def _in_radians(hertz: np.ndarray) -> bool:
 
 
 def _of_scales(organ: Organ, found: Found) -> list[str]:
-    """Sentences on speeds that no soft tissue has, and on moduli that change with frequency as no material's do.
+    """Sentences on wave speeds that no soft tissue has, and on moduli whose change with frequency no material has.
 
-    The balance of forces has no scale of its own, so that a wrong unit leaves its chi^2 as it is.
+    The balance of forces does not depend on the units, so chi^2 does not show a wrong unit.
     """
     told, omega = [], organ.waves.omega
     G, errors = found.whole.modulus[:, 0], np.abs(found.whole.standard_errors[:, 0])
@@ -223,9 +229,10 @@ def _of_scales(organ: Organ, found: Found) -> list[str]:
 
 
 def _sign(organ: Organ, found: Found) -> list[str]:
-    """A sentence if every loss modulus that the data determine is negative, which no passive material has.
+    """A sentence if every loss modulus that the data determine is negative. No passive material has a negative loss
+    modulus.
 
-    Where regions are given, theirs count: one modulus for several materials may have any loss.
+    If regions are given, the moduli of the regions are checked: one modulus for several materials may have any loss.
     """
     wrong, each = [], found.whole if found.parts is None else found.parts
     for hertz, G, error in zip(organ.field.frequencies, each.modulus, each.standard_errors, strict=True):
@@ -241,5 +248,5 @@ def _sign(organ: Organ, found: Found) -> list[str]:
 
 
 def chi2_text(chi2: float) -> str:
-    """chi^2 as text with two decimals; in scientific form from 1e4 on."""
+    """chi^2 as text with two decimals; from 1e4 on in scientific notation."""
     return f"{chi2:.2f}" if chi2 < 1e4 else f"{chi2:.1e}"

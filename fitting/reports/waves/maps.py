@@ -25,7 +25,7 @@ def at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
 
 
 def write_at_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.ndarray) -> None:
-    """Write waves.h5: the mask, the direct inversion (F, nx, ny, nz) [Pa], and the map with its deviations."""
+    """Write waves.h5: the mask, the direct inversion (F, nx, ny, nz) [Pa], and the map with its standard deviations."""
     with h5py.File(path, "w") as file:
         for name in ("frequencies", "spacing", "origin", "mask"):
             file[name] = getattr(organ.field, name)
@@ -53,7 +53,8 @@ def write_for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
 
 
 def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
-    """Middle slice across the shortest side at the highest frequency: map, its deviation, the direct inversion."""
+    """The middle slice, normal to the shortest side, at the highest frequency: the map, its standard deviation and the
+    direct inversion."""
     f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
     k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))
     G, sd = at_voxels(organ, drawn.modulus[f]), at_voxels(organ, drawn.sd[f].real)
@@ -66,7 +67,7 @@ def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
     size = 1e3 * organ.field.spacing * np.array(organ.field.mask.shape)
     across = [a for a in range(3) if a != axis]
     fig, axes = pyplot().subplots(1, 4, figsize=(13, 4.2), layout="constrained")
-    top = np.nanquantile(panels[0][1], 0.995)  # one voxel shall not set the scale
+    top = np.nanquantile(panels[0][1], 0.995)  # a single voxel must not set the colour scale
     for ax, (title, values, colours) in zip(axes, panels, strict=True):
         limits = {"vmin": 0.0, "vmax": top} if "storage" in title else {"vmin": 0.0}
         shown = np.take(values, k, axis).T
@@ -75,7 +76,7 @@ def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
         )
         ax.set(title=title, xlabel=f"{'xyz'[across[0]]} [mm]", ylabel=f"{'xyz'[across[1]]} [mm]")
         ax.title.set_fontsize(9)
-        if not np.isfinite(shown).any():  # the organ is thinner than the differences of the direct inversion are wide
+        if not np.isfinite(shown).any():  # the organ is too thin for the differences of the direct inversion
             ax.text(0.5, 0.5, "no voxel is far enough\nfrom an edge", ha="center", transform=ax.transAxes, fontsize=8)
         fig.colorbar(picture, ax=ax, shrink=0.8)
     return fig

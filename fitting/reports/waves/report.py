@@ -1,4 +1,4 @@
-"""Results of a fit to waves: waves.json, the sweeps of the regions, and the table that is printed."""
+"""Results of a fit to waves: waves.json, the sweeps of the regions, and the printed table."""
 
 import json
 from pathlib import Path
@@ -17,16 +17,17 @@ from liverjax.core.plotting import save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 
-#: Fewest frequencies of a sweep.
+#: Minimum number of frequencies of a sweep.
 FEWEST = 3
-#: A node of the map counts as different from the organ's mean beyond this many standard deviations.
+#: A node of the map counts as different from the mean of the organ if it differs by more than this many standard
+#: deviations.
 TOLD = 3.0
-#: Mean relative distance of the springpot from the moduli of the frequencies that is told.
+#: A warning is given if the springpot misses the moduli over the frequencies by more than this on average (relative).
 MISSED = 0.03
 
 
 def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: np.ndarray) -> Content:
-    """Write all files into the folder `out`; returns the content of waves.json.
+    """Write all files into the folder `out` and return the content of waves.json.
 
     Args:
         out: folder.
@@ -61,9 +62,9 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
 
 
 def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) -> list[Content]:
-    """One dictionary per region, with lists over the frequencies. Errors contain noise, the uncertainty of the edges'
-    places, and the error of the elements: its mean `bias` (F, R) over the directions of waves, and what is `left` of
-    it (F, R, D) for each direction.
+    """One dictionary per region, with lists over the frequencies. The errors contain the noise, the uncertain position
+    of the edges, and the error of the elements. This error has two parts (relative): its mean `bias` (F, R) over the
+    directions of waves, and the rest `left` (F, R, D) for each direction.
     """
     omega, rows = organ.waves.omega, []
     for r in range(own.modulus.shape[1]):
@@ -94,8 +95,8 @@ def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) 
 
 
 def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
-    """The springpot model that `models.best_of_models` chooses per sweep, with its numbers, None without sweeps; then
-    warnings.
+    """For each sweep: the springpot model that `models.best_of_models` chooses, with its parameters (None if there are
+    no sweeps); and warnings.
     """
     if not sweeps:
         return None, []
@@ -129,7 +130,8 @@ def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
 
 
 def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
-    """A frequency sweep of the whole and of every region, for ``python -m fitting``, if frequencies are enough."""
+    """Write a frequency sweep of the whole and of every region, for ``python -m fitting``, if there are enough
+    frequencies. Return the files."""
     if len(organ.field.frequencies) < FEWEST:
         return {}
     files = {}
@@ -158,7 +160,7 @@ def _by_label(organ: Organ, found: Found) -> Content | None:
 
 
 def _direct(organ: Organ, found: Found, usual: np.ndarray) -> Content:
-    """Medians of the direct inversion over the whole and over the regions; None if no voxel has a value."""
+    """Medians of the direct inversion over the whole organ and over each region; None if no voxel has a value."""
     labels = organ.field.labels
     places = {"whole": organ.field.mask}
     if found.labels is not None and labels is not None:
@@ -192,7 +194,7 @@ def _error_cell(x: float | None) -> str:
 
 
 def table(content: Content) -> str:
-    """Moduli of the whole and of the regions at every frequency, and the direct inversion for comparison."""
+    """Moduli of the whole organ and of the regions at every frequency, and the direct inversion for comparison."""
     rows = [f"{'':12s}{'Hz':>8s}{'G_storage [Pa]':>22s}{'G_loss [Pa]':>22s}{'c [m/s]':>9s}{'chi2':>9s}   direct [Pa]"]
     for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
         direct = content["direct_inversion"][name]

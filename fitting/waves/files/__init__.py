@@ -1,1 +1,1 @@
-"""Formats of files of waves, and phases made continuous."""
+"""File formats of waves, and unwrapping of phases."""

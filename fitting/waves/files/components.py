@@ -1,7 +1,8 @@
-"""Whether the components of a wave's displacement follow the axes of its voxels, from the data alone.
+"""Check, from the data alone, whether the components of the displacement follow the axes of the voxels.
 
-Shear waves keep the volume, so the divergence of the displacement is small. It is not if two components are exchanged
-or one has the other sign, as it happens between programs that count rows first and programs that count columns first.
+Shear waves keep the volume, so the divergence of the displacement is small. The divergence is large if two components
+are exchanged, or if one has the wrong sign. This happens between programs that count rows first and programs that count
+columns first.
 """
 
 import itertools
@@ -10,18 +11,18 @@ import numpy as np
 
 from fitting.waves.wave_field import WaveField
 
-#: Fewest voxels with all six neighbours.
+#: Minimum number of voxels with all six neighbours.
 FEWEST = 100
-#: Part of the mean square divergence below which another order or sign of the components is the better one.
+#: Another order or sign of the components is better if its mean square divergence is below this part of the given one.
 SMALLER = 0.8
 
 
 def other_order(field: WaveField) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-    """Component and sign along each axis that have much less divergence than those given; None if there are none."""
+    """Component and sign for each axis that give much less divergence than the given ones; None if there are none."""
     slopes = _central_differences(field)
     if slopes.shape[2] < FEWEST:
         return None
-    # Products of all slopes d_a u_c give the mean square divergence of every order and sign.
+    # The products of all slopes d_a u_c give the mean square divergence for every order and sign.
     flat = slopes.reshape(9, -1)
     products = (flat @ flat.conj().T).real.reshape(3, 3, 3, 3)
     best: tuple[tuple[int, ...], tuple[int, ...]] = ((0, 1, 2), (1, 1, 1))
@@ -41,7 +42,7 @@ def order_sentence(field: WaveField) -> str | None:
     if found is None:
         return None
     order, signs = found
-    whole = -1 if sum(signs) < 0 else 1  # the sign of all together does not matter
+    whole = -1 if sum(signs) < 0 else 1  # a common sign of all components does not matter
     names = ", ".join(("-" if whole * s < 0 else "") + "xyz"[c] for c, s in zip(order, signs, strict=True))
     return (
         f"the components of the displacement do not follow the axes of the voxels: as ({names}) they change the volume "
@@ -50,7 +51,8 @@ def order_sentence(field: WaveField) -> str | None:
 
 
 def _central_differences(field: WaveField) -> np.ndarray:
-    """Central differences d_a u_c (3, 3, n) at voxels with six measured neighbours; each frequency has a size of 1."""
+    """Central differences d_a u_c (3, 3, n) at voxels with six measured neighbours, scaled to a root mean square of 1
+    at each frequency."""
     U, rows = field.displacement, []
     middle = tuple(slice(1, -1) for _ in range(3))
     for u in U:

@@ -1,7 +1,7 @@
-"""Files of waves on voxels: .npz, .npy, HDF5, MATLAB, CSV and NIfTI, each as named arrays.
+"""Files of waves on voxels (.npz, .npy, HDF5, MATLAB, CSV and NIfTI), read as named arrays.
 
-Names are displacement (complex; or real and imag, or phases: instants of a period), frequencies [Hz], spacing [m],
-origin [m], mask, labels and unit.
+The names are displacement (complex), frequencies [Hz], spacing [m], origin [m], mask, labels and unit. In place of
+displacement, a file may have real and imag, or phases (real values at instants of a period).
 """
 
 import re
@@ -32,9 +32,10 @@ NAMES = (
     "unit",
 )
 WAVES = ("displacement", "real", "imag", "phases", "wrapped")
-#: Place of NIfTI's voxels in space (3, 4) [m]: axes, then the corner; no array of another file has this name.
+#: Name for the position of NIfTI's voxels in space (3, 4) [m]: the axes, then the corner. No array of another file has
+#: this name.
 PLACE = "(place)"
-#: A sentence, if a file contradicts itself about the size of its voxels.
+#: Name for a sentence that is given if a file contradicts itself about the size of its voxels.
 CONFLICT = "(conflict)"
 HDF5 = (".h5", ".hdf5")
 
@@ -43,7 +44,7 @@ def arrays(path: Path) -> Content:
     """The named arrays of a file.
 
     Raises:
-        InputError: no such file, or one that cannot be read.
+        InputError: the file does not exist or cannot be read.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file of waves: give .npz, .npy, .h5, .mat, .csv, .nii or .nii.gz")
@@ -69,14 +70,15 @@ def arrays(path: Path) -> Content:
     except (OSError, ValueError, KeyError, EOFError) as error:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: cannot be read as {ending} ({reason}): write it again") from None
-    except Exception as error:  # a damaged archive has many names: zip, zlib, header errors of NIfTI
+    except Exception as error:  # damaged files raise many kinds of errors: zip, zlib, NIfTI headers
         raise InputError(f"{path}: is damaged ({type(error).__name__}): write it again") from None
 
 
 def single(path: Path, name: str, spacing_given: bool = False) -> tuple[np.ndarray, object, object]:
-    """One array (nx, ny, nz): the array of this name, or the only one of the file; the file's spacing and `PLACE`.
+    """One array (nx, ny, nz): the array of this name, or the only array of the file; and the spacing and `PLACE` of the
+    file.
 
-    A file that contradicts itself about its spacing has neither, if the spacing is given.
+    If a file contradicts itself about its spacing, but the spacing is given, its spacing and `PLACE` are None.
     """
     found = arrays(path)
     if CONFLICT in found and not spacing_given:
@@ -98,13 +100,14 @@ def _numpy(path: Path) -> Content:
             return {"displacement": np.load(path, allow_pickle=False)}
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file}
-    except ValueError:  # NumPy's message is about pickled objects then, even for text
+    except ValueError:  # NumPy's message is about pickled objects here, even for a text file
         raise InputError(f"{path}: has no arrays of numbers: write it again with numpy.save or numpy.savez") from None
     return _with_plain_unit(found)
 
 
 def _matlab(path: Path) -> Content:
-    """A .mat file, in the shapes that MATLAB shows: version 7.3 is HDF5 with the axes in reverse order."""
+    """The arrays of a .mat file, in the shapes that MATLAB shows. Version 7.3 is HDF5, with the axes in reverse
+    order."""
     import h5py
 
     if h5py.is_hdf5(path):
@@ -115,7 +118,7 @@ def _matlab(path: Path) -> Content:
 
 
 def _with_plain_unit(found: Content) -> Content:
-    """The unit as text: programs store it as bytes, or as an array of one word."""
+    """The arrays with the unit as text. Programs may store the unit as bytes, or as an array of one word."""
     if found.get("unit") is None:
         return found
     word = np.ravel(found["unit"])[0] if np.size(found["unit"]) else ""
@@ -127,14 +130,14 @@ def _hdf5(path: Path) -> Content:
 
     with h5py.File(path) as file:
         found: Content = {name: _values(file[name]) for name in NAMES if name in file}
-        # Attributes of the file, or of the waves.
+        # Attributes of the file or of its waves count too.
         for own in (file, *(file[name] for name in WAVES if name in file)):
             found = {name: own.attrs[name] for name in NAMES if name in own.attrs} | found
     return _with_plain_unit(found)
 
 
 def _values(dataset: "h5py.Dataset") -> object:
-    """The content of a dataset; if MATLAB wrote it, as MATLAB shows it."""
+    """The content of a dataset. If MATLAB wrote it, the content is as MATLAB shows it."""
     kind, values = dataset.attrs.get("MATLAB_class"), dataset[()]
     if kind == b"char":
         return "".join(map(chr, np.ravel(values)))
@@ -154,12 +157,13 @@ ALSO = {"frequency_hz": "frequency", "hertz": "frequency", "labels": "label", "r
 _KNOWN = (*COLUMNS, "frequency", "label", "mask")
 
 
-#: Units that the headings of places and displacements may end in.
+#: Units with which the headings of positions and displacements may end.
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
 
 
 def _without_units(path: Path, head: list[str]) -> tuple[list[str], dict[str, str]]:
-    """Headings without their units, and the unit of the places ("x") and of the displacements ("u") if they have one.
+    """The headings without units; and the units of the positions ("x") and of the displacements ("u"), if the headings
+    have units.
 
     `x_mm`, `x [mm]` and `u_re_x (um)` are read.
     """
@@ -174,13 +178,14 @@ def _without_units(path: Path, head: list[str]) -> tuple[list[str], dict[str, st
         kind = match[1][0] if match[1][0] == "u" else "x"
         if units.setdefault(kind, match[2]) != match[2]:
             raise InputError(
-                f"{path}: the heading {name} has another unit than {units[kind]}: give all of them one unit"
+                f"{path}: the heading {name} has another unit than {units[kind]}: give all of them in one unit"
             )
     return plain, units
 
 
 def _voxel_table(path: Path) -> Content:
-    """x, y, z [m], real and imaginary parts, with or without frequency [Hz], label and mask, on a regular grid."""
+    """Read a table of x, y, z [m] on a regular grid, real and imaginary parts, with or without frequency [Hz], label
+    and mask."""
     numbered = enumerate(text_of(path, "waves").splitlines(), 1)
     lines = [(k, line) for k, line in numbered if line.strip() and not line.lstrip().startswith("#")]
     between = find_delimiter(lines[0][1]) if lines else ","
@@ -232,7 +237,7 @@ def _voxel_table(path: Path) -> Content:
 
 
 def _quick_number(text: str, between: str) -> float | None:
-    """A number; fast for texts that Python can read, because there are millions."""
+    """The number in a cell. It is fast for texts that Python can read, because there are millions of cells."""
     try:
         return float(text)
     except ValueError:
@@ -240,7 +245,7 @@ def _quick_number(text: str, between: str) -> float | None:
 
 
 def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Places (n, 3) of points on a regular grid, its spacing, origin and shape."""
+    """Grid indices (n, 3) of points on a regular grid, and the spacing, origin and shape of the grid."""
     if not np.all(np.isfinite(X)) or not len(X):
         raise InputError(f"{path}: has rows without x, y, z, or none at all: give every voxel its place in metres")
     spacing = np.empty(3)
@@ -250,7 +255,7 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
             raise InputError(f"{path}: all voxels have the same {'xyz'[a]}: waves need a volume, not a slice")
         spacing[a] = steps[steps < 1.5 * steps.min()].mean()
     origin = X.min(axis=0)
-    # Places are rounded in a file: the whole length tells the spacing best.
+    # Positions in a file are rounded: the whole length gives the best spacing.
     spacing = np.ptp(X, axis=0) / np.rint(np.ptp(X, axis=0) / spacing)
     at = np.rint((X - origin) / spacing).astype(int)
     off = np.abs(X - origin - at * spacing).max(axis=0) / spacing
@@ -260,7 +265,8 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _nifti(path: Path) -> Content:
-    """Complex data (nx, ny, nz, 3) or (nx, ny, nz, F, 3); real data are a mask or labels. Voxel sizes are in mm."""
+    """Read complex data (nx, ny, nz, 3) or (nx, ny, nz, F, 3). Real data are a mask or labels. Voxel sizes are in mm
+    unless the file has another unit."""
     try:
         import nibabel
     except ImportError:
@@ -285,12 +291,12 @@ def _nifti(path: Path) -> Content:
 
 
 def _has_place(image: "nibabel.Nifti1Image") -> bool:
-    """Whether a NIfTI file says where its voxels are in space."""
+    """Whether a NIfTI file gives the position of its voxels in space."""
     return bool(image.header["sform_code"] > 0 or image.header["qform_code"] > 0)
 
 
 def _voxel_size(path: Path, image: "nibabel.Nifti1Image") -> np.ndarray:
-    """Size of the voxels (3,) as the file states it; zeros if it states none."""
+    """Size of the voxels (3,) in the unit of the file; zeros if the file gives no size."""
     if not _has_place(image):
         stated = np.abs(np.asarray(image.header["pixdim"][1:4], float))
         return stated if np.all(stated) else np.zeros(3)

@@ -1,27 +1,28 @@
-"""Phases that a scanner wraps into (-pi, pi], made continuous in space and in time."""
+"""Phases that a scanner has wrapped into (-pi, pi] are made continuous in space and in time."""
 
 import numpy as np
 
 from liverjax.core.errors import InputError
 
-#: Neighbours whose wrapped phases differ by this part of pi are nearly ambiguous; a note if more than this part is.
+#: Neighbours whose wrapped phases differ by more than the part _STEEP of pi are nearly ambiguous. A note is given if
+#: this holds for more than the part _MANY of them.
 _STEEP, _MANY = 0.8, 0.01
 
 
 def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Phases without jumps, NaN where they are not measured; then notes if jumps are left, or if phases change so fast
-    from voxel to voxel that jumps cannot be told from waves.
+    """Phases without jumps (NaN where they are not measured), and notes. A note is given if jumps are left, or if
+    phases change so fast from voxel to voxel that jumps cannot be distinguished from waves.
 
     In space, edges between voxels are unwrapped in the order of their reliability (Herraez et al. 2002, Appl. Opt. 41,
-    7437). The level of each volume is then known up to multiples of 2 pi. From one instant of the period to the next it
-    is assumed to change by less than pi.
+    7437). The level of each volume is then known up to multiples of 2 pi. It is assumed that the level changes by less
+    than pi from one instant of the period to the next.
 
     Args:
         name: name of the file, for the messages.
         phases: (F, T, nx, ny, nz, 3) [rad], T instants of a period.
 
     Raises:
-        InputError: phases outside [-pi, pi], or scikit-image is missing.
+        InputError: phases lie outside of [-pi, pi], or scikit-image is missing.
     """
     measured = phases[np.isfinite(phases)]
     if not measured.size or np.abs(measured).max() > np.pi * (1 + 1e-3):
@@ -36,7 +37,7 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
     out = np.full(phases.shape, np.nan)
     for f, t, c in np.ndindex(phases.shape[0], phases.shape[1], phases.shape[-1]):
         one = phases[f, t, ..., c]
-        volume = np.ma.masked_array(np.nan_to_num(one), np.isnan(one))  # NaN would be sorted for ever
+        volume = np.ma.masked_array(np.nan_to_num(one), np.isnan(one))  # with NaN, the sorting would not end
         out[f, t, ..., c] = np.ma.filled(unwrap_phase(volume, rng=0), np.nan)
     levels = np.nanmedian(out, axis=(2, 3, 4))  # (F, T, 3)
     left = sum(int(np.sum(np.abs(np.diff(out, axis=a)) > np.pi)) for a in (2, 3, 4))
@@ -46,7 +47,8 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
 
 def _of_steep_phases(phases: np.ndarray) -> list[str]:
-    """A note for each frequency at which many neighbouring voxels differ by nearly pi, the most that can be seen."""
+    """A note for each frequency at which many neighbouring voxels differ by nearly pi, the maximum that wrapped phases
+    can show."""
     notes = []
     for f, one in enumerate(phases):
         steps = [np.diff(one, axis=a) for a in (1, 2, 3)]
@@ -55,7 +57,7 @@ def _of_steep_phases(phases: np.ndarray) -> list[str]:
         if steep > _MANY:
             notes.append(
                 f"frequency {f + 1} of {len(phases)}: {100 * steep:.2g} % of neighbouring voxels differ by nearly pi "
-                "in phase: jumps cannot be told from waves there, and the motion may be wrong; encode less motion per "
-                "radian, or give smaller voxels"
+                "in phase: there jumps cannot be distinguished from waves, and the motion may be wrong; use a "
+                "weaker motion encoding (fewer radians per micrometre), or smaller voxels"
             )
     return notes
