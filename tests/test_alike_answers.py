@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from fitting.fits import posterior, time_tests
-from fitting.fits.families.springpots_in_time import choose_in_time
-from fitting.fits.honesty.alike_answers import with_alike_noise, with_own_noise
+from fitting.fits.families.springpots_in_time import choose_in_time, choose_together
+from fitting.fits.honesty.alike_answers import fitted_by_its_noise, with_alike_noise, with_own_noise
 from fitting.fits.time_tests import INDEPENDENT
-from fitting.methods import uncertainty
+from fitting.methods import time_response, uncertainty
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 
 G0, RATIOS, TIMES, STRAIN = 1000.0, np.array([0.3, 0.25]), np.array([2.0, 40.0]), 0.05
@@ -113,3 +115,46 @@ def test_noise_that_grows_with_time_is_in_the_errors():
             found.append((stays - 400) / uncertainty.equilibrium_error(own))
     new, old = (float(np.sqrt(np.mean(np.square(found)))) for found in off.values())
     assert new < 1.3 < old
+
+
+#: A creep of 30 s and a recovery of 60 s.
+_RECOVERY = np.concatenate(
+    [np.linspace(0, 0.1, 3), 0.1 + np.geomspace(0.05, 29.9, 40), 30.1 + np.geomspace(0.05, 60, 40)]
+)
+
+
+def _recovery(noise: np.ndarray) -> TimeTest:
+    """Strain under 50 Pa that ends, of two exact modes; `noise` (n,) over the largest strain."""
+    stress = np.interp(_RECOVERY, [0, 0.1, 30, 30.1, 1e3], [0, 50, 50, 0, 0])
+    strain = np.asarray(time_response.strain_response(Maxwell(G0, RATIOS, TIMES / 4), _RECOVERY, stress))
+    return TimeTest("creep", _RECOVERY, stress, strain + noise * strain.max(), _RECOVERY > 0)
+
+
+def test_noise_of_constant_size_sets_the_weights_of_fit_interval_and_posterior(monkeypatch):
+    """With weights in proportion to the answers the interval of G_inf was half as wide as its standard error says, and
+    held the truth in 72 of 100 draws; with a sweep beside it, the errors were 2.2 times too small."""
+    test = _recovery(0.005 * np.random.default_rng(0).normal(size=len(_RECOVERY)))
+    fit = choose_in_time(test, "prony", 2)
+    assert fit.details[time_tests.CONSTANT_NOISE] and np.ptp(fit.scales) == 0
+    own, error = fit.details["equilibrium_modulus_interval_95"], uncertainty.equilibrium_error(fit.uncertainty)
+    half = (own["high"] - own["low"]) / 2
+    assert 0.8 < half / (1.96 * error) < 1.5 and own["low"] < G0 * (1 - RATIOS.sum()) < own["high"]
+    seen = []
+    monkeypatch.setattr(posterior, "sample", lambda target, *rest: seen.append(target))
+    posterior.of_time_test(fit, test, 10)
+    # The weights of the likelihood are those of the fit: its minimum is the fit's.
+    u = np.asarray(fit.solution.u)
+    near = u + 0.003 * np.random.default_rng(1).normal(size=(20, len(u)))
+    assert np.all(seen[0].log_likelihood(near) < seen[0].log_likelihood(u[None]))
+    omega = np.geomspace(0.3, 30, 12)
+    G = G0 * (
+        1 - RATIOS.sum() + (RATIOS * 1j * omega[:, None] * TIMES / 4 / (1 + 1j * omega[:, None] * TIMES / 4)).sum(1)
+    )
+    noisy = [a * (1 + 0.03 * np.random.default_rng(k).normal(size=12)) for k, a in enumerate((G.real, G.imag))]
+    both = choose_together([Sweep(omega, *noisy, source="sweep.csv"), test], "prony", 2)
+    assert both.tests[1].constant_noise and both.shares[1].noise < 0.05
+    # Noise in proportion to the answers, and exact answers, keep their weights.
+    clean = _recovery(np.zeros(len(_RECOVERY)))
+    some = clean.answer * (1 + 0.01 * np.random.default_rng(2).normal(size=len(_RECOVERY)))
+    for other in (clean, clean._replace(answer=some)):
+        assert not fitted_by_its_noise(other, 2)[0].constant_noise

@@ -11,9 +11,10 @@ from liverjax.__main__ import main
 from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.physics.contact.pressed import PressedObstacle
-from liverjax.simulation.cautions import cautions_of_run, cautions_of_waves, mesh_sentence
+from liverjax.simulation.cautions import cautions_of_run, mesh_sentence
 from liverjax.simulation.mesh_error import MeshError
 from liverjax.simulation.run import Result
+from liverjax.waves.cautions import cautions_of_waves
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -101,7 +102,11 @@ def test_waves_without_a_mass_are_told():
     assert cautions_of_waves(bare) == [
         "the scene has no [body], so the motion has no inertia: write density = 1060.0 in [body]"
     ]
-    assert cautions_of_waves(replace(bare, body=lj.Body(density=1060.0))) == []
+    heavy = replace(bare, body=lj.Body(density=1060.0))
+    (said,) = cautions_of_waves(heavy)
+    wave = np.sqrt(float(heavy.law.shear_modulus()) / 1060.0) / 60
+    assert said.startswith(f"at 60 Hz shear waves are about {wave:.2g} m long")
+    assert cautions_of_waves(replace(heavy, solve=replace(heavy.solve, frequencies=np.array([1.0])))) == []
 
 
 SCENE = """

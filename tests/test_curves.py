@@ -256,7 +256,7 @@ def test_a_law_that_misses_the_curve_is_not_taken_for_wrong_columns(tmp_path, ca
     (tmp_path / "c.csv").write_text("test,stretch,nominal_stress_Pa\n" + rows)
     main(["curves", "neo_hookean", str(tmp_path / "c.csv"), "--out", str(tmp_path)])
     said = capsys.readouterr().err
-    assert "the law misses something: try others" in said and "would follow" not in said
+    assert "the law misses something: try other laws" in said and "would follow" not in said
 
 
 @pytest.mark.draws

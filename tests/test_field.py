@@ -148,6 +148,10 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
     assert again.chi2 <= found.chi2 * 1.001 and again.deviation == found.deviation
     with pytest.raises(lj.InputError, match="belongs to another fit"):
         field.estimate(problem, name="law.bulk", length=0.02, file=file, resume=True)
+    (one,) = problem.scenes
+    other = problem._replace(scenes=(replace(one, solve=replace(one.solve, newton_iterations=24)),))
+    with pytest.raises(lj.InputError, match=r"another fit \(law or settings differs\)"):
+        field.estimate(other, length=0.02, file=file, resume=True)
 
 
 def test_a_map_goes_on_from_its_own_problem_alone(problem, tmp_path):

@@ -52,6 +52,16 @@ def test_chances_of_runs_are_those_of_counting_every_order(ups):
     assert runs_probability(np.ones(5)) == (1, 2.0**-4)
 
 
+def test_residuals_nearly_all_of_one_sign_are_not_random():
+    """One small residual of the other sign made them so: true stress read as nominal stress was not named."""
+    r = np.linspace(1.0, 2.0, 24)
+    r[11] = -0.1
+    assert runs_probability(r) == (3, pytest.approx(2 * 25 / 2**24, rel=1e-12))
+    assert runs_probability(-r) == runs_probability(r)
+    r[11] = -20.0  # one outlier moves the fit away from all other points
+    assert runs_probability(r) == (3, 1.0)
+
+
 def test_the_runs_of_long_records_are_counted_at_once():
     """Against whole numbers; 100,000 points took minutes, and by Wald and Wolfowitz's normal limit half are below."""
     signs = np.sign(np.random.default_rng(3).standard_normal(600))

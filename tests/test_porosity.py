@@ -9,10 +9,11 @@ import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.physics import darcy, porosity
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation.cautions import cautions_of_run, cautions_of_waves
+from liverjax.simulation.cautions import cautions_of_run
 from liverjax.simulation.equations import initial_state
 from liverjax.simulation.run import _cast
 from liverjax.tensors.matrices import deformation_gradient
+from liverjax.waves.cautions import cautions_of_waves
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -434,6 +434,9 @@ def test_unusable_options_are_refused(files, capsys):
     for given, sentence in (
         (("--devices", "0"), "--devices 0 must be"),
         (("--distributed", "x", "two"), "give HOST:PORT"),
+        (("--distributed", "localhost:abc", "1", "0"), "localhost:abc is not HOST:PORT"),
+        (("--distributed", "localhost", "1", "0"), "localhost is not HOST:PORT"),
+        (("--distributed", "localhost:1234", "0", "0"), "the number of processes must be above 0"),
     ):
         assert main(command(files, *given)) == 2
         assert sentence in capsys.readouterr().err

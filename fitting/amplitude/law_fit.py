@@ -84,9 +84,9 @@ def outside_series(memory: Memory, omega: float) -> str | None:
         return None
     hertz = [f"{1 / (2 * np.pi * t):.3g}" for t in (times.max(), times.min())]
     return (
-        f"the sweep's {omega / 2 / np.pi:.3g} Hz lie {side} the frequencies that the series of --model covers "
-        f"({hertz[0]} to {hertz[1]} Hz): this series does not contain {part} relaxation, so all moduli of the law are "
-        "wrong; give the fit.json of a frequency sweep that contains this frequency"
+        f"the frequency of the strain sweep, {omega / 2 / np.pi:.3g} Hz, is {side} the frequencies that the series of "
+        f"--model covers ({hertz[0]} to {hertz[1]} Hz). This series has no {part} relaxation, so all moduli of the law "
+        "are wrong: give the fit.json of a frequency sweep that contains this frequency"
     )
 
 

@@ -107,7 +107,9 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     how = field.MapOptions(max_iterations=options.iterations, file=file, resume=options.resume, progress=told)
     problem, beside = scene_numbers.with_mesh_as_noise(problem)
     if max(beside) > _TOLD:
-        finer = "; a finer mesh, or order = 2, would say more" if max(beside) > 1 else ""
+        linear = any(scene.mesh.order == 1 for scene in problem.scenes)
+        remedy = "a finer mesh, or order = 2," if linear else "a finer mesh"
+        finer = f"; {remedy} would say more" if max(beside) > 1 else ""
         print(f"note: the mesh's error, {max(beside):.2g} times the noise, counts as noise{finer}", file=sys.stderr)
     with bar:
         found = field.estimate(problem, options.name, length, how)

@@ -42,7 +42,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="S",
         help="duration of the ramp [s] if no column shows it; 0 with two columns: a step at 0 s, before the first row",
     )
-    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out earlier readings")
+    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out earlier answers")
     command.add_argument("--radius", type=float, metavar="M", help="radius of the sample [m], for torque and force")
     command.add_argument("--height", type=float, metavar="M", help="height of the sample [m], for torque and force")
     shared_options.add_cards_and_samples(command)
@@ -78,10 +78,10 @@ def _said_of_rows(test: "TimeTest") -> list[str]:
 
     number, every, told = len(thinned(test)), int(test.used.sum()), []
     if number < every:
-        told.append(f"{number} of {every} readings are fitted, spread over the log of the time since each load")
+        told.append(f"{number} of {every} answers are fitted, spread over the log of the time since each load")
     first, last = test.resolved
     told.append(
-        f"the readings begin {first:.3g} s after the load, and end at {last:.3g} s: G0 does not contain what relaxed "
+        f"the answers begin {first:.3g} s after the load, and end at {last:.3g} s: G0 does not contain what relaxed "
         "before"
     )
     return told

@@ -10,6 +10,7 @@ components (discrepancy principle; Morozov 1966), or until chi^2 no longer falls
 Hessian. Lanczos iterations find the largest eigenvalues of J^T J (Bui-Thanh et al. 2013).
 """
 
+import re
 import time
 from collections.abc import Callable
 from functools import partial
@@ -29,6 +30,7 @@ from fitting.methods.estimate import LARGEST_BIAS
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
+from liverjax.core.versions import versions
 from liverjax.scenes.scene import numbers_at
 
 #: Standard deviations of ln(modulus) to try: from a nearly uniform body to a body whose stiffness may vary strongly.
@@ -145,6 +147,11 @@ class _LinearRuns(NamedTuple):
         return z + (self.pull(self.push(z)) if self.finite else 0.0)
 
 
+def _without_addresses(structure: object) -> str:
+    """Kinds of laws and physics, and settings that are no numbers, as a text that is equal in every process."""
+    return re.sub(r" at 0x[0-9a-f]+", "", str(structure))
+
+
 class _Search:
     """State of a search: the functions that the minimiser calls, and the file from which a stopped run can go on."""
 
@@ -163,6 +170,8 @@ class _Search:
             "displacements": mark_of(*(a for d in problem.data for a in d._replace(sd=d.step))),
             "search": "trust region",  # files of other search methods may end at other points
             "scene": mark_of(base, *jax.tree.leaves(problem.scenes)),
+            "law or settings": mark_of(_without_addresses(jax.tree.structure(problem.scenes))),
+            "versions": mark_of(str(versions())),
         }
 
     def at(self, z: np.ndarray) -> _LinearRuns:

@@ -392,6 +392,7 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
 
     If neighbouring readings share their noise, the likelihood counts only the number of independent readings.
     """
+    test = test._replace(constant_noise=fit.details.get(time_tests.CONSTANT_NOISE, False))
     if fit.kind.values is None:
         one, data = time_tests.residuals_in_time(test, fit.kind)
         residuals = jax.jit(jax.vmap(lambda u: one(u, *data)))

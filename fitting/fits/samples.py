@@ -146,8 +146,8 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     return out
 
 
-#: A sample that differs from the others is reported below this probability, which holds for all samples together; and
-#: minimum number of samples for this test.
+#: A sample is reported if it differs from the others, and if the probability of such a difference by chance, in any of
+#: the samples, is below this value; and minimum number of samples for this test.
 _STRANGE, _FEWEST = 0.05, 4
 #: Minimum ratio to the mean of the others from which a sample is reported; and maximum standard error of a logarithm
 #: that is compared.

@@ -291,7 +291,7 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
         told.append("only one start reached the minimum: there may be a better minimum")
     if held:
         told.append(
-            "without a constraint, the stress would decrease as the stretch grows: the fit is kept at the "
+            "without a constraint, the stress would decrease within the range of the data: the fit is kept at the "
             "edge of stability"
         )
     solid = fit.law + laws.Volumetric(bulk=jnp.asarray(1e3 * abs(fit.shear_modulus)))

@@ -30,6 +30,8 @@ MOST = 300
 #: Key in `TimeFit.details`, if neighbours share their noise: so many readings with independent noise would tell as
 #: much.
 INDEPENDENT = "independent_answers"
+#: Key in `TimeFit.details`: whether the noise of all readings has the same size.
+CONSTANT_NOISE = "noise_of_constant_size"
 #: Starting points of a fit.
 STARTS = 12
 
@@ -184,8 +186,12 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
 
 
 def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
-    """A function of u and the data that returns the residuals (m,), and these data; for Prony modes of a solid or a
-    fluid."""
+    """A function and its data. The function computes the residuals (m,) from the variables u of the fit and these data.
+
+    Args:
+        test: `TimeTest`.
+        kind: Prony modes of a solid or of a fluid.
+    """
     return _residuals(test.kind, kind.name), data_in_time(test)
 
 
@@ -294,7 +300,7 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
         if not low <= tau <= high:
             out.append(f"relaxation_times[{k}] = {tau:.3g} s lies outside the {low:.3g}-{high:.3g} s of the test")
     out += structured_misfit(chosen)
-    runs, chance = kramers_kronig.runs_probability(np.sign(chosen.fitted - chosen.measured))
+    runs, chance = kramers_kronig.runs_probability(chosen.fitted - chosen.measured)
     details = {"tried": sorted(table, key=lambda row: row["above_the_lowest"]), "answers_fitted": len(chosen.measured)}
     details["residuals"] = {"runs": runs, "probability": chance}
     seconds = {n: sum(getattr(f, n) for f in tried) for n in ("run_time", "compile_time")}
@@ -324,7 +330,7 @@ def _without_relaxation(test: TimeTest, chosen: TimeFit) -> str:
 def structured_misfit(fit: TimeFit) -> list[str]:
     """A sentence if the residuals keep their sign over many readings."""
     residuals = fit.fitted - fit.measured
-    runs, chance = kramers_kronig.runs_probability(np.sign(residuals))
+    runs, chance = kramers_kronig.runs_probability(residuals)
     if chance >= kramers_kronig.CHANCE or fit.relative_errors.max() <= viscoelastic.EXACT:
         return []
     return [

@@ -358,7 +358,7 @@ def structured(fit: Together) -> list[str]:
         if np.max(np.abs(residuals) / sizes_of(test)) <= viscoelastic.EXACT:
             continue
         for part, what in zip(parts, (" (G')", " (G'')") if len(parts) == 2 else ("",), strict=True):
-            runs, chance = kramers_kronig.runs_probability(np.sign(part))
+            runs, chance = kramers_kronig.runs_probability(part)
             if chance < kramers_kronig.CHANCE:
                 out.append(
                     f"structured misfit of {test.source or name_of(test)}{what}: the residuals change sign {runs - 1} "

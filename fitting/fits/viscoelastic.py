@@ -32,7 +32,7 @@ class Kind(NamedTuple):
     names: tuple[str, ...] = ()  # of the model's parameters; empty: the modes are the parameters
     units: tuple[str, ...] = ()
     values: Callable[[Array], Array] | None = None  # u -> parameters of the model (P,)
-    prior: Callable[[Array], Array] | None = None  # u -> rows that follow the residuals of the data
+    prior: Callable[[Array], Array] | None = None  # u -> residuals of the prior, after those of the data
     effective: float | None = None  # number of parameters that the data determine; None: the length of u
     moduli: Callable[[Array, Array], tuple[Array, Array]] | None = None  # (u, omega) -> G', G'' (n,) [Pa]
 

@@ -155,15 +155,26 @@ def _rounded_up(hertz: float) -> float:
     return math.ceil(hertz / unit) * unit
 
 
-def runs_probability(signs: np.ndarray) -> tuple[int, float]:
+#: Nearly all residuals have one sign if so many of one sign are less probable than this; and the mean of the other
+#: residuals, divided by the mean of these, from which the others are outliers.
+_ONE_SIDED, _OUTLIERS = 1e-4, 3.0
+
+
+def runs_probability(residuals: np.ndarray) -> tuple[int, float]:
     """Number of runs of equal sign, and the probability of at most so many runs in random order (Wald and Wolfowitz
-    1940)."""
-    up = np.asarray(signs)[np.asarray(signs) != 0] > 0
+    1940). The order says nothing if nearly all residuals (n,) have one sign. Then the result is the probability of so
+    many equal signs, unless a few outliers cause them.
+    """
+    residuals = np.asarray(residuals)[np.asarray(residuals) != 0]
+    up = residuals > 0
     n, a = len(up), int(up.sum())
     b = n - a
     runs = int(1 + np.sum(up[1:] != up[:-1])) if n else 0
-    if min(a, b) == 0:  # only one sign: the probability is 2^(1 - n)
-        return runs, 2.0 ** (1 - n) if n else 1.0
+    few, many = (np.abs(residuals[up == (keep == (a < b))]) for keep in (True, False))
+    equal_signs = min(1.0, 2 * float(scipy.special.bdtr(len(few), n, 0.5))) if n else 1.0
+    one_sided = equal_signs < _ONE_SIDED and not (len(few) and few.mean() > _OUTLIERS * many.mean())
+    if len(few) == 0 or one_sided:
+        return runs, equal_signs
     # Of r runs, one sign has r // 2 runs, and the other sign has as many or one more.
     r = np.arange(2, runs + 1)
     k, more = r // 2, r // 2 + r % 2
@@ -190,7 +201,7 @@ def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple
     numbers, told = {}, []
     omega, storage, loss = merged(omega, storage, loss)
     for name, residuals in (("storage_modulus", storage), ("loss_modulus", loss)):
-        runs, chance = runs_probability(np.sign(residuals))
+        runs, chance = runs_probability(residuals)
         numbers[name] = {"runs": runs, "probability": chance}
         if chance < CHANCE:
             told.append(

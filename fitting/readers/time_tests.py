@@ -29,10 +29,17 @@ class TimeTest(NamedTuple):
     used: np.ndarray  # (n,) whether the reading of a row is fitted
     source: str = ""
     notes: tuple[str, ...] = ()
+    constant_noise: bool = False  # whether the noise of all readings has the same size
 
     @property
     def scales(self) -> np.ndarray:
-        """Scales of the residuals: the size of each reading, with a lower bound for readings that are lost in noise."""
+        """Scales of the residuals: the size of each reading, with a lower bound for readings that are lost in noise.
+        If the noise is constant, all scales are the median of these.
+        """
+        sizes = self._sizes_of_readings()
+        return np.full(len(sizes), np.median(sizes)) if self.constant_noise else sizes
+
+    def _sizes_of_readings(self) -> np.ndarray:
         answer = self.answer[self.used]
         floor = max(noise_of_series(answer) / RELATIVE, CYCLIC * float(np.max(np.abs(answer))) if self.cyclic else 0.0)
         return np.hypot(answer, floor)

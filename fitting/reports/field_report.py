@@ -60,7 +60,7 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
     if found.mesh_over_noise is not None and found.mesh_over_noise > MESH:
         said += (
             f"; the mesh's error in the data is {found.mesh_over_noise:.2g} times the noise: refine the mesh, or use "
-            "order = 2 (the bias of a region's border that goes through elements is not in the mesh bias)"
+            "order = 2 if it is 1 (the bias of a region's border that goes through elements is not in the mesh bias)"
         )
     return (
         f"{said}; look at the unit (--unit), the origin of the coordinates, node numbers (from 0), rows of zeros, "

@@ -99,7 +99,7 @@ def indentation_warnings(
         told.append("the modulus is not positive: the force does not rise with the depth; check the signs")
     # The points before contact contain only noise. With these points, a misfit in contact would look like noise.
     touching = fit.residuals[curve.depth > fit.contact_point]
-    runs, chance = runs_probability(np.sign(touching))
+    runs, chance = runs_probability(touching)
     if chance < 1e-3:
         told.append(
             f"structured misfit: residuals in contact change sign {runs - 1} times over {len(touching)} points (by "

@@ -44,8 +44,8 @@ def check_strain(strain: float) -> None:
     if not 0 <= strain <= LARGEST:
         meant = f"{strain / 100:g}" if 1 <= strain <= 100 * LARGEST else "0.05"  # in percent
         raise InputError(
-            f"--precompression {strain:g} is the part of the height by which the plates compress the sample, from 0 to "
-            f"{LARGEST:g}: give e.g. --precompression {meant}"
+            f"--precompression {strain:g} is out of range: it is the part of the height by which the plates compress "
+            f"the sample, from 0 to {LARGEST:g}; give e.g. --precompression {meant}"
         )
 
 

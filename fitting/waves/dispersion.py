@@ -109,7 +109,11 @@ def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispers
     if kept.all():
         return waves
     if len(np.unique(hertz[kept])) < FEWEST:
-        raise InputError(f"{waves.source}: {kept.sum()} waves lie in the band that the command names; widen the band")
+        left = len(np.unique(hertz[kept]))
+        raise InputError(
+            f"{waves.source}: only {left} frequencies are left by --min-frequency and --max-frequency, but {FEWEST} "
+            "are needed: widen the band"
+        )
     attenuation = None if waves.attenuation is None else waves.attenuation[kept]
     note = f"{np.sum(~kept)} waves outside of the band asked for are left out"
     return waves._replace(

@@ -104,6 +104,11 @@ def _share(given: list[str]) -> tuple[int, int]:
     option = f"--distributed {' '.join(given)}"
     if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
         raise InputError(f"{option}: give HOST:PORT, the number of processes and the number of this one, or nothing")
+    port = given[0].rpartition(":")[2] if given else "1"
+    if not (port.isdigit() and 1 <= int(port) <= 65535) or (given and ":" not in given[0]):
+        raise InputError(f"{option}: {given[0]} is not HOST:PORT with a port of 1 to 65535: give e.g. node1:12345")
+    if given and int(given[1]) < 1:
+        raise InputError(f"{option}: the number of processes must be above 0: give e.g. {given[0]} 2 0")
     if given and int(given[2]) >= int(given[1]):
         raise InputError(f"{option}: processes are numbered from 0 to {int(given[1]) - 1}")
     try:

@@ -1,4 +1,4 @@
-"""The exception for unusable input."""
+"""The exception for unusable input. Users meet no other exception."""
 
 
 class InputError(ValueError):

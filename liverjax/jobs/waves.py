@@ -21,10 +21,10 @@ from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, Solve
-from liverjax.simulation.cautions import cautions_of_waves
 from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared
 from liverjax.simulation.unloaded import resting
+from liverjax.waves.cautions import cautions_of_waves
 from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.mesh_error import HarmonicError, harmonic_errors
 from liverjax.waves.rest import under_its_weight

@@ -56,7 +56,7 @@ class Tied(Protocol):
         """Positions (V, 3) from a field, at fraction s of the step."""
 
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
-        """Where motion is not given: the mask (V, 3), with 0 at nodes with a given motion, and directions (V, 3).
+        """The mask (V, 3) with 0 at the nodes whose motion is given, and the free directions (V, 3) of these nodes.
 
         A direction is the only free direction of a node with a given motion, and 0 at other nodes. None: there is no
         such node.

@@ -50,7 +50,11 @@ class Solve:
         about="converged: iterations to the tolerance; one_step: the chapter's linearly implicit scheme, one linear "
         "solve per step (not for derivatives)",
     )
-    newton_iterations: int = static(default=25, about="most iterations of a step; 1 means newton = one_step", lower=1)
+    newton_iterations: int = static(
+        default=25,
+        about="maximum number of iterations in a step, or in a part of a cut step; 1: newton = one_step",
+        lower=1,
+    )
     integrator: str = static(
         default="euler", about="dynamic: euler (first order) or newmark (average acceleration, second order)"
     )
@@ -64,7 +68,7 @@ class Solve:
     robust: str = static(
         default="off", about="projected or regularised: minimise the energy if a step cannot be followed"
     )
-    frequencies: Numbers | None = param("Hz", "(F,) of harmonic motion", above=0.0, default=None)
+    frequencies: Numbers | None = param("Hz", "(F,) of harmonic motion", above=0.0, upper=1e9, default=None)
     reduced: str = static(default="", about="file of a reduced model, as `python -m liverjax reduce` makes it")
     reduced_tolerance: Number = param(
         "1", "estimated error over the largest displacement, above which the full model runs", above=0.0, default=0.01

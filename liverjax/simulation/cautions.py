@@ -13,10 +13,9 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.locate import doubled_vertices
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
-from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.base import Physics
 from liverjax.physics.contact.friction import RoughObstacle
-from liverjax.physics.contact.obstacle import Obstacle, missed_depth, touches_without_pressure
+from liverjax.physics.contact.obstacle import Obstacle, missed_depth
 from liverjax.physics.contact.passage import passed_in_step
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.loads import follows, nodal_tractions
@@ -50,7 +49,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
     """
     return [
         *cautions_of_mesh(scene.mesh),
-        *_of_locking(scene),
+        *of_locking(scene),
         *_of_histories(scene, result),
         *_of_stress_at_start(scene, result),
         *_of_growing_motion(scene, result),
@@ -59,35 +58,6 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         *_of_volumes(scene, result),
         *_of_friction_alone(scene, result),
     ]
-
-
-def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]:
-    """Sentences about the mesh, the volumes, the masses and the drive of a scene of harmonic motion.
-
-    Args:
-        scene: `Scene`, not traced.
-        about: positions (V, 3) [m] about which the body vibrates; None: the reference shape.
-    """
-    said = [*cautions_of_mesh(scene.mesh), *_of_locking(scene)]
-    if scene.body is None:
-        said.append("the scene has no [body], so the motion has no inertia: write density = 1060.0 in [body]")
-    inlets = () if scene.porosity is None else scene.porosity.inlet
-    if not scene.displaced and not scene.traction and not inlets:
-        said.append("nothing drives the motion: give amplitudes as [[displaced]] or [[traction]]")
-    x = scene.mesh.points if about is None else about
-    for name, physics in named_physics(scene):
-        if isinstance(physics, Ligament) and physics.is_straight_without_tension(scene.mesh, x):
-            said.append(
-                f"{name} is straight but has no tension: it pulls only, but here it acts as a spring in both directions"
-            )
-        if isinstance(physics, Obstacle) and touches_without_pressure(physics, scene.mesh, x):
-            said.append(
-                f"{name} touches the body without pressure: it cannot pull, and here it holds in both directions"
-            )
-    if scene.porosity is not None and scene.solve.frequencies is not None:
-        hertz = float(np.max(np.asarray(scene.solve.frequencies)))
-        said += _of_drained_layer(scene, 1 / (2 * np.pi * hertz), f"at {hertz:.3g} Hz, within 1/omega = {{:.2g}} s,")
-    return said
 
 
 #: If the mesh error is below this fraction of the largest displacement, no other mesh is recommended.
@@ -114,7 +84,8 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     said = said.format(*_pressure_errors(result))
     if not np.all(np.asarray(result.mesh_error.found)):
         return (
-            f"{said}; at some steps it is not found, or turns elements inside out: the mesh is too coarse for a number"
+            f"{said}; at some steps it is not found, or turns elements inside out: the mesh is too coarse for a "
+            "reliable number"
         )
     if error <= _SMALL * size:
         return said
@@ -160,7 +131,7 @@ def cautions_of_mesh(mesh: TetMesh) -> list[str]:
 _LOCKING = 100.0
 
 
-def _of_locking(scene: Scene) -> list[str]:
+def of_locking(scene: Scene) -> list[str]:
     """A sentence if quadratic elements lock although another form of the volumes would not lock."""
     if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
         return []
@@ -344,7 +315,7 @@ def _of_pressures(scene: Scene, result: Result) -> list[str]:
     if scene.porosity.scheme != "lagged":
         return [
             *_of_overshoot(scene, P[:, : scene.mesh.number_of_vertices]),
-            *_of_drained_layer(scene, float(scene.solve.dt or 0.0) * len(P), "in {:.3g} s"),
+            *of_drained_layer(scene, float(scene.solve.dt or 0.0) * len(P), "in {:.3g} s"),
         ]
     if len(P) < 4:
         return []
@@ -365,7 +336,7 @@ def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
     return float(np.median(3 * np.abs(np.asarray(scene.mesh.volumes)[at]) / area))
 
 
-def _of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
+def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
     """A sentence if the layer that drains in `seconds` is thinner than the elements there; `when` is the time in words.
 
     After a time t the fluid has left a layer of a thickness of about sqrt(c t), with the diffusivity c = kappa /

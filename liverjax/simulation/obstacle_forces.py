@@ -21,7 +21,8 @@ class ObstacleForces(NamedTuple):
 
 
 def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
-    """Forces on the obstacles of a scene, and depths of the body's surface in them. Both are differentiable.
+    """Forces on the obstacles of a scene, depths of the body's surface in them, and displacements of the obstacles. All
+    three are differentiable.
 
     Args:
         scene: the scene that was run.

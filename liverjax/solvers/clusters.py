@@ -84,7 +84,10 @@ def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) ->
 
 
 def of_points(clusters: Clusters | None, order: int, A: PointMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) between functions of elements, one for each source: the sum of c_ak K_kl c_bl over q, k, l."""
+    """Blocks (n, 3, 3) of the matrix between two shape functions a and b of an element, one for each source of the
+    clusters: the sum of c_ak K_kl c_bl over the integration points and over k and l. c_ak is the derivative of function
+    a by the linear function k, minus its derivative by the linear function 0. K_kl are the blocks of A.
+    """
     if clusters is None:
         return None
     c = basis(order).c

@@ -27,6 +27,8 @@ from liverjax.waves.operator import Operator, free_part, operator
 from liverjax.waves.rest import under_its_weight, without_history
 
 MASSES = ("consistent", "lumped")
+#: Highest frequency [Hz]: beyond ultrasound nothing here is meant.
+_HIGHEST = 1e9
 #: Values of [solve] for the equations of one instant.
 _STILL: Content = {
     "kind": "static",
@@ -189,9 +191,12 @@ def _frequencies(frequencies_Hz: Any) -> jax.Array:
         raise InputError("harmonic motion needs frequencies_Hz: give e.g. [60.0]")
     found = jnp.atleast_1d(jnp.asarray(frequencies_Hz, float))
     if not isinstance(found, jax.core.Tracer) and not (
-        found.ndim == 1 and found.size and np.all(np.asarray(found) > 0)
+        found.ndim == 1 and found.size and np.all((np.asarray(found) > 0) & (np.asarray(found) <= _HIGHEST))
     ):
-        raise InputError(f"frequencies_Hz = {np.asarray(frequencies_Hz).tolist()} must be a list of numbers above 0")
+        raise InputError(
+            f"frequencies_Hz = {np.asarray(frequencies_Hz).tolist()} must be a list of numbers above 0, at most "
+            f"{_HIGHEST:g}"
+        )
     return found
 
 

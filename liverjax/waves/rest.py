@@ -50,7 +50,8 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
         return found.check().positions[-1]
     except RuntimeError as error:
         raise InputError(
-            f"no state of rest under gravity or tension was found ({error}): hold the body, or give a state by about"
+            f"no state of rest under gravity or tension was found ({error}): hold the body, or give a state "
+            "with the argument about"
         ) from None
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from fitting.fits import time_tests, together
 from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.honesty import common_factor
-from fitting.fits.honesty.alike_answers import with_own_noise
+from fitting.fits.honesty.alike_answers import fitted_by_its_noise, with_own_noise
 from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.honesty.short_times import with_short_times
-from fitting.fits.time_tests import TimeFit
+from fitting.fits.time_tests import CONSTANT_NOISE, TimeFit
 from fitting.fits.together import Measured, Share, Together
 from fitting.fits.viscoelastic import Kind
 from fitting.methods import as_prony_modes, generalised_maxwell, host, springpots, uncertainty
@@ -178,7 +178,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
         model: one of `models.MODELS`.
         modes: number of Prony modes, or "auto".
     """
-    prony = time_tests.fit(test, modes)
+    test, prony = fitted_by_its_noise(test, modes)
     if model == "prony":
         return _with_ends_of_record(with_own_noise(prony), test)
     tried = [prony] if model == "auto" else []
@@ -194,6 +194,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
 
 
 def _with_ends_of_record(fit: TimeFit, test: TimeTest) -> TimeFit:
+    fit = fit._replace(details=fit.details | {CONSTANT_NOISE: test.constant_noise})
     return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise]), test)
 
 
@@ -220,6 +221,8 @@ def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Ban
     return sorted(rows, key=lambda row: row["above_the_lowest"])
 
 
+#: Minimum number of readings of a test whose residuals are asked for the size of its noise.
+_ENOUGH = 10
 #: Fields that are times in seconds.
 TIMES = ("run_time", "compile_time")
 
@@ -264,10 +267,18 @@ def choose_together(
 
     `relative`: relative error of all moduli of a test that comes from the size of its sample.
     """
+    tests = [_by_its_noise(test) for test in tests]
     prony = together.fit(tests, modes, progress)
     fit = prony if model == "prony" else _best_of_models(tests, model, prony, progress)
     fit = fit._replace(warnings=(*fit.warnings, *common_factor.told(fit, relative)))
     return with_interval(fit, fit.tests, [s.noise for s in fit.shares])
+
+
+def _by_its_noise(test: Measured) -> Measured:
+    """The test; a test in time is told whether its noise has a constant size, if it has enough readings."""
+    if not isinstance(test, TimeTest) or np.sum(test.used) < _ENOUGH:
+        return test
+    return fitted_by_its_noise(test)[0]
 
 
 def _best_of_models(tests: list[Measured], model: str, prony: Together, progress: Callable[[str], None]) -> Together:

@@ -6,15 +6,39 @@ from functools import partial
 
 import numpy as np
 
+from fitting.fits import time_tests, viscoelastic
 from fitting.fits.time_tests import INDEPENDENT, TimeFit
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation
 from fitting.methods.noise.alike_noise import alike_noise
 from fitting.methods.noise.uneven_noise import probability_of_sizes, uneven_root
+from fitting.readers.time_tests import TimeTest
 
 #: Standard errors computed from the size of each residual are used if they exceed the errors of equal noise by this
 #: factor.
 _UNEVEN_FROM = 1.3
+
+
+def fitted_by_its_noise(test: TimeTest, modes: int | str = "auto") -> tuple[TimeTest, TimeFit]:
+    """Prony modes of a test whose noise may have a constant size, and the test with `constant_noise` if it has.
+
+    The first fit takes the noise in proportion to the readings. If its residuals show noise of a constant size, the
+    test is fitted again with equal scales. Otherwise small readings would have too much weight.
+    """
+    fit = time_tests.fit(test, modes)
+    if test.constant_noise or not _has_constant_noise(fit):
+        return test, fit
+    test = test._replace(constant_noise=True)
+    return test, time_tests.fit(test, modes)
+
+
+def _has_constant_noise(fit: TimeFit) -> bool:
+    """Whether the residuals are noise of a constant size. Residuals with a structure say nothing about the noise."""
+    if not (fit.converged and fit.uncertainty.noise > 0 and np.all(np.isfinite(fit.uncertainty.standard_errors))):
+        return False
+    if fit.relative_errors.max() <= viscoelastic.EXACT or time_tests.structured_misfit(fit):
+        return False
+    return _sizes(fit, np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian))[1]
 
 
 def with_own_noise(fit: TimeFit) -> TimeFit:

@@ -55,7 +55,7 @@ def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> 
     # If the fit has reported a factor for each test already, this factor is not an error of the law.
     named = any(sentence.startswith(OWN_FACTORS) for sentence in fit.warnings)
     misfit = [(c, (_model(fit.law, c) * _nearest_factor(fit.law, c, named) - c.stress) / c.scale) for c in curves]
-    runs = {c.label: runs_probability(np.sign(r)) for c, r in misfit}
+    runs = {c.label: runs_probability(r) for c, r in misfit}
     odd = [c for c, r in misfit if len(r) >= _FEWEST and np.abs(r).max() > _EXACT and runs[c.label][1] < CHANCE]
     if not odd:
         return []
@@ -140,7 +140,7 @@ def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | 
     n, k = len(found.fun), len(begin) + 1
     value = n * np.log(max(2 * found.cost / n, 1e-300)) + 2 * k * n / max(n - k - 1, 1)
     own = [r for c, r in zip(curves, parts(found.x), strict=True) if c.label in labels]
-    chance = min(runs_probability(np.sign(r))[1] for r in own)
+    chance = min(runs_probability(r)[1] for r in own)
     return _Refit(float(value), chance, float(found.x[-1]) if free else 0.0, law_of(found.x))
 
 

@@ -124,9 +124,9 @@ def _of_long_waves(hertz: float, found: Found, f: int) -> list[str]:
         half = 2 * e / G**2
         top = f"{1 / (1 / G - half):.3g} Pa" if half < 1 / G else "any value above"
         told.append(
-            f"{hertz:g} Hz: {_modulus_named(found, r)} has an error of {100 * e / G:.2g} %. If waves are much longer "
-            f"than the organ, the data determine 1/G. So the size of G may be {1 / (1 / G + half):.3g} Pa to {top} "
-            "(95 %): measure at a higher frequency"
+            f"{hertz:g} Hz: {_modulus_named(found, r)} has an error of {100 * e / G:.2g} %. Waves that are long beside "
+            "the organ determine 1/G rather than G. By the error of 1/G, the size of G is "
+            f"{1 / (1 / G + half):.3g} Pa to {top} (95 %): measure at a higher frequency"
         )
     return told
 

@@ -2,8 +2,8 @@
 
 The distance from one end is measured along the surface. Lines of equal distance are rings around the tubes, one ring
 for each branch. The band between two levels contains the surface between two rings. The centres of the two rings of a
-band are joined by a piece of a centre line. The radius of a piece is the mean distance of the points of its rings from
-it. The centre lines begin and end at the ends of the surface.
+band are joined by a piece of a centre line. The radius of a piece is the mean distance between the piece
+and the points of its rings. The centre lines begin and end at the ends of the surface.
 
 Source: level sets of geodesic distance (Verroust and Lazarus 2000, Extracting skeletal curves from 3D scattered data).
 """

@@ -58,7 +58,10 @@ def _normal_to(y: list[jax.Array], axis: Array) -> list[jax.Array]:
 
 
 def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Distance:
-    """Distance from a sphere about a point, or from a cylinder about an axis normal to y."""
+    """Distance of the points y from a sphere with its centre at 0, or from a cylinder whose axis passes through 0.
+
+    For a cylinder, y has no component along the axis.
+    """
     # At the centre no direction is defined: any direction is taken, without a division by 0.
     r = jnp.sqrt(jnp.maximum(sum(c * c for c in y), 1e-30))
     n = [c / r for c in y]

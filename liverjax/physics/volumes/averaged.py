@@ -2,9 +2,9 @@
 
 The volumetric energy is the sum of V_a U(J_a) over the nodes. J_a is the mean J of the elements around node a, weighted
 by their volumes. V_a is a quarter of the sum of these volumes. There are about five times fewer nodes than elements. So
-a large bulk modulus gives five times fewer constraints. The pressure of a node is p_a = U'(J_a), and the pressure of an
-element is the mean over its nodes. The stiffness is the stiffness at given pressures plus G^T D^-1 G, with G the
-derivative of the nodal volumes and D = V_a/U''. This is the system of a porous step in which nothing flows.
+there are five times fewer constraints if the bulk modulus is large. The pressure of a node is p_a = U'(J_a), and the
+pressure of an element is the mean over its nodes. The stiffness is the stiffness at given pressures plus G^T D^-1 G,
+with G the derivative of the nodal volumes and D = V_a/U''. This is the system of a porous step in which nothing flows.
 
 If elements have different volumetric energies, a node has the mean of these energies, weighted by volume.
 """
