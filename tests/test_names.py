@@ -27,8 +27,8 @@ def test_what_is_put_is_got(name, value):
 @pytest.mark.parametrize(
     "name, sentence",
     [
-        ("0.nu", "no: did you mean mu?"),
-        ("0.volumetric", "no: use one of mu, bulk"),
+        ("0.nu", "no: did you mean 0.mu?"),
+        ("0.volumetric", "no: use one of 0.mu, 0.bulk"),
         ("1.mu.2", "no: '2' leads nowhere: it has places 0 to 1"),
         ("2.mu", "no: '2' leads nowhere: it has places 0 to 1"),
         ("mu", "no: did you mean 0.mu or 1.mu?"),

@@ -99,7 +99,7 @@ def test_gradient_of_a_batch_mean(files):
         ({}, "needs parameters"),
         ({"law.mu": 700.0}, "law.mu has no lanes"),
         ({"law.mu": [1.0, 2.0], "law.bulk": [1.0]}, "law.bulk has 1 lanes and law.mu has 2: give as many"),
-        ({"law.nu": [1.0]}, "did you mean mu"),
+        ({"law.nu": [1.0]}, "did you mean law.mu"),
     ],
 )
 def test_unusable_batches_are_refused(files, values, sentence):
@@ -370,7 +370,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("body.gravity.2,body.gravity.02\n0.01,0.02\n", "'02' leads nowhere"),
         ("law.mu\nnan\n", "row 1, law.mu = 'nan' is not a finite number"),
         ("law.mu\n700\n-1\n", "row 2: .*mu = -1"),
-        ("law.nu\n700\n", "did you mean mu"),
+        ("law.nu\n700\n", "did you mean law.mu?"),
         ("mu\n700\n", "did you mean law.mu?"),
         ("Law.mu\n700\n", "did you mean law.mu?"),
         ("law.mu [Pa]\n700\n", "did you mean law.mu?"),

@@ -6,12 +6,15 @@ from collections.abc import Iterable
 from liverjax.core.errors import InputError
 
 
-def hint(word: str, known: Iterable[str]) -> str:
-    """The end of a message on an unknown word: the most similar known word, or all known words if none is similar."""
+def hint(word: str, known: Iterable[str], before: str = "") -> str:
+    """The end of a message on an unknown word: the most similar known word, or all known words if none is similar.
+
+    `before` is written before each known word, for example "law.".
+    """
     words = list(known)
     longer = [name for name in words if len(word) > 2 and name.startswith(word)]
     near = longer or difflib.get_close_matches(word, words, n=1, cutoff=0.5 if len(word) < 4 else 0.6)
-    return f"did you mean {near[0]}?" if near else f"use one of {', '.join(words)}"
+    return f"did you mean {before}{near[0]}?" if near else f"use one of {', '.join(before + name for name in words)}"
 
 
 def as_word(value: object, where: str) -> str:

@@ -69,7 +69,7 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
     path, inside = name.split("."), thing
     while path:
         try:
-            keys, path = _keys(inside, path, refusal)
+            keys, path = _keys(inside, path, refusal, name[: len(name) - len(".".join(path))])
         except InputError:
             near = _names_that_end_in(thing, name)
             if near:
@@ -103,11 +103,11 @@ def _names_of_numbers(struct: object, before: str = "") -> Iterator[str]:
             yield own.removesuffix(".")
 
 
-def _keys(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
-    """The keys for the first words of a path, and the remaining words."""
+def _keys(thing: Any, path: list[str], refusal: str, before: str) -> tuple[list, list[str]]:
+    """The keys for the first words of a path, and the remaining words. `before`: the part of the name up to there."""
     word, rest = path[0], path[1:]
     if dataclasses.is_dataclass(thing):
-        return _keys_of_struct(thing, path, refusal)
+        return _keys_of_struct(thing, path, refusal, before)
     if isinstance(thing, dict) and ".".join(path) in thing:
         return [".".join(path)], []
     several = isinstance(thing, tuple) or np.ndim(thing)
@@ -116,7 +116,7 @@ def _keys(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
     raise InputError(f"{refusal}: {_nowhere(word, len(thing) if several else 0)}")
 
 
-def _keys_of_struct(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
+def _keys_of_struct(thing: Any, path: list[str], refusal: str, before: str) -> tuple[list, list[str]]:
     word, rest = path[0], path[1:]
     fields = [f for f in dataclasses.fields(thing) if not f.metadata.get("static")]
     known = [f.name for f in fields if not f.metadata.get("unnamed") and getattr(thing, f.name) is not None]
@@ -132,7 +132,7 @@ def _keys_of_struct(thing: Any, path: list[str], refusal: str) -> tuple[list, li
         elif unnamed and (word.isdigit() or not isinstance(getattr(thing, field.name), tuple)):
             return [field.name], path
     if known:
-        raise InputError(f"{refusal}: {hint(word, known)}")
+        raise InputError(f"{refusal}: {hint(word, known, before)}")
     places = next((len(getattr(thing, f.name)) for f in fields if isinstance(getattr(thing, f.name), tuple)), 0)
     raise InputError(f"{refusal}: {_nowhere(word, places)}")
 
