@@ -209,6 +209,11 @@ def table(content: Content) -> str:
                 f"{name:12s}{hertz:8g}{cells[0]:>22s}{cells[1]:>22s}{own['phase_velocity_m_s'][f]:9.3g}"
                 f"{chi2_text(own['chi2_per_component'][f]):>9s}   {pair}"
             )
+    if any(row.endswith("   none") for row in rows):
+        rows.append(
+            "direct: none where every voxel is near an edge or a hole of the data, or a component is not measured: its "
+            "derivatives and its smoothing reach 5 voxels"
+        )
     for name, own in (content["springpots"] or {}).items():
         said = ", ".join(
             f"{k} = {v:.4g} {f'± {error:.2g}' if (error := own['standard_errors'][k]) else '(at its bound)'}"
