@@ -11,7 +11,7 @@ from liverjax.core.struct import replace
 from liverjax.scenes.enriched import enriched
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import equations, initial_state, positions, residual, unknowns
-from liverjax.simulation.mesh_error import padded
+from liverjax.simulation.mesh_error import Richer
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -38,7 +38,7 @@ def test_blocks_are_the_inverse_of_the_tangents(order):
     moved = scene.mesh.points + 1e-3 * jnp.asarray(np.random.default_rng(3).uniform(-1, 1, scene.mesh.points.shape))
     for _ in range(order - 1):
         scene = enriched(scene)
-        moved = padded(scene.mesh, moved)
+        moved = Richer(scene=scene).padded(moved)
     e = equations(scene, initial_state(scene), 1.0)
     q = unknowns(e, moved)
     K = tangent.tangent(e, None, positions(e, q, 1.0), 1.0)
