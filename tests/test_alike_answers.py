@@ -136,6 +136,7 @@ def test_noise_of_constant_size_sets_the_weights_of_fit_interval_and_posterior(m
     test = _recovery(0.005 * np.random.default_rng(0).normal(size=len(_RECOVERY)))
     fit = choose_in_time(test, "prony", 2)
     assert fit.details[time_tests.CONSTANT_NOISE] and np.ptp(fit.scales) == 0
+    assert INDEPENDENT not in fit.details  # white noise: the residuals themselves were once taken for its order
     own, error = fit.details["equilibrium_modulus_interval_95"], uncertainty.equilibrium_error(fit.uncertainty)
     half = (own["high"] - own["low"]) / 2
     assert 0.8 < half / (1.96 * error) < 1.5 and own["low"] < G0 * (1 - RATIOS.sum()) < own["high"]

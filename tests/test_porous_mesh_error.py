@@ -168,3 +168,51 @@ def test_the_parts_of_triangles_and_element_sets():
     parts = np.asarray(quarters(mesh, whole)).reshape(len(whole), 4, 3)
     each = np.asarray(areas(refined(mesh).points, parts.reshape(-1, 3))).reshape(len(whole), 4, 3)
     assert np.allclose(each, np.asarray(areas(mesh.points, whole))[:, None] / 4)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_places_that_meet_at_an_edge_keep_their_size(order):
+    """In one set, the triangle at their corner and faces inside had all vertices in the set: they were drained too."""
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    x = np.asarray(mesh.points)
+
+    def place(x):
+        return np.flatnonzero((x[:, 2] > 1 - 1e-9) | (x[:, 0] < 1e-9))
+
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=1.0, bulk=2.0),
+        fixed=(lj.Fixed(nodes=jnp.asarray(place(x))), lj.Fixed(nodes=jnp.flatnonzero(x[:, 1] == 0.5), axes="y")),
+    )
+    fine = on_refined_mesh(scene)[0]
+    y = np.asarray(fine.mesh.points)
+    assert set(np.asarray(fine.fixed[0].nodes)) == set(place(y))
+    assert set(np.asarray(fine.fixed[1].nodes)) == set(np.flatnonzero(np.abs(y[:, 1] - 0.5) < 1e-9))  # inside
+
+
+def test_only_numbers_by_element_are_given_to_the_parts():
+    """As many triangles as elements were taken for numbers by element: the inflow was eight times too large."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.025), (4, 4, 1))
+    whole = boundary_triangles(mesh)
+    assert len(whole) == mesh.number_of_elements
+    flux = Inlet(triangles=whole, flux=1e-6)
+    sponge = lj.Porosity(bulk=1.0, limit_bulk=9.0, fluid_fraction=0.5, permeability=1e-3, inlet=(flux,))
+    scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=1.0, bulk=2.0), porosity=sponge)
+    assert len(on_refined_mesh(scene)[0].porosity.inlet[0].triangles) == 4 * len(whole)
+    each = replace(flux, flux=jnp.full(len(whole), 1e-6))
+    assert can_be_refined(scene) and not can_be_refined(replace(scene, porosity=replace(sponge, inlet=(each,))))
+
+
+def test_the_estimate_inside_a_traced_function():
+    scene = column(2, 1, dt=LONG)
+
+    def top(mu):
+        run = lj.simulate(lj.with_parameters(scene, {"law.mu": mu}), mesh_error=True)
+        return run.mesh_error.positions[-1, scene.mesh.node_sets["z_max"], 2].mean()
+
+    outside = float(top(SHEAR))
+    assert float(jax.jit(top)(SHEAR)) == pytest.approx(outside, rel=1e-5)
+    points = lambda x: lj.simulate(lj.with_parameters(scene, {"mesh.points": x}), mesh_error=True).positions  # noqa: E731
+    with pytest.raises(lj.InputError, match=r"inside jax\.jit"):
+        jax.jit(points)(scene.mesh.points)

@@ -158,7 +158,8 @@ _OTHER_UNIT = 100.0
 
 def outliers(found: Samples) -> list[str]:
     """A sentence on each sample with a parameter far from the other samples (t-tests on logarithms, Bonferroni
-    correction).
+    correction). Half of the level belongs to the first parameter, a modulus: a wrong gap or radius multiplies all
+    moduli by one factor. The other half belongs to the other parameters.
 
     The strengths of a spectrum are not compared: one strength may grow while its neighbour on the grid falls.
     """
@@ -166,8 +167,9 @@ def outliers(found: Samples) -> list[str]:
     told: dict[int, list[tuple[float, str, float, float]]] = {}
     for name in names:
         for sample, chance, ratio, mean in _strangers(found, name):
-            if chance * len(names) < _STRANGE:
-                told.setdefault(sample, []).append((chance * len(names), name, ratio, mean))
+            chance *= 1 if len(names) == 1 else 2 if name == names[0] else 2 * (len(names) - 1)
+            if chance < _STRANGE:
+                told.setdefault(sample, []).append((chance, name, ratio, mean))
     out = []
     for sample, own in told.items():
         which = ", and ".join(

@@ -61,9 +61,20 @@ class TimeFit(NamedTuple):
 
     @property
     def relative_errors(self) -> np.ndarray:
-        """|fit - data| (m,) divided by the scales. A scale is the size of the reading, with a lower bound for small
-        readings."""
-        return np.abs(self.fitted - self.measured) / self.scales
+        """|fit - data| (m,) divided by `relative_sizes`."""
+        return np.abs(self.fitted - self.measured) / relative_sizes(self.measured, self.fitted, self.scales)
+
+
+def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Divisors (m,) of relative errors: the fitted readings, at least the median of |fit - data|.
+
+    Where the readings pass 0, as in cycles, the divisors are the scales of the residuals. Elsewhere these scales would
+    hide noise: their lower bound is 33 times the noise.
+    """
+    largest = np.abs(measured).max(initial=0.0)
+    if min(measured.max(initial=0.0), -measured.min(initial=0.0)) > 0.1 * largest:
+        return scales
+    return np.hypot(fitted, max(float(np.median(np.abs(fitted - measured))), 1e-300))
 
 
 @lru_cache(maxsize=8)

@@ -103,6 +103,12 @@ def sizes_of(test: Measured) -> np.ndarray:
     return scales if isinstance(test, TimeTest) else measured
 
 
+def _sizes_beside(test: Measured, fitted: np.ndarray) -> np.ndarray:
+    """`sizes_of` a test whose fit gives these values."""
+    sizes = sizes_of(test)
+    return time_tests.relative_sizes(reported_numbers(test)[1], fitted, sizes) if isinstance(test, TimeTest) else sizes
+
+
 def least_noise(test: Measured) -> float:
     """Lower bound of the noise of a test, relative to its scales. It is 1 if standard deviations are given: they are
     not reduced."""
@@ -232,7 +238,7 @@ def misfits(
     left = np.split(residuals[: sum(counts)], np.cumsum(counts)[:-1])
     shares, fitted = [], []
     for test, (_, y, scales), r, s in zip(tests, data, left, noise, strict=True):
-        errors = np.abs(r * scales) / sizes_of(test)
+        errors = np.abs(r * scales) / _sizes_beside(test, y + r * scales)
         misfit = _size_of_noise(errors, len(y) * (1 - free / sum(counts)))
         own = (name_of(test), test.source, len(y), float(s), np.nan, misfit, np.nan, float(errors.mean()))
         shares.append(Share(*own, errors_without=np.array([])))
@@ -433,13 +439,13 @@ def shares_by_rows(
     for k, share in enumerate(fit.shares):
         root, _ = spread(jacobian[place != k], 1.0, slope)
         without = errors_and_correlation(root)[0]
-        r, (_, _, scales) = alone(k)[: sum(counts)][place[: sum(counts)] == k], reported_numbers(fit.tests[k])
+        r, (_, y, scales) = alone(k)[: sum(counts)][place[: sum(counts)] == k], reported_numbers(fit.tests[k])
         freedom = counts[k] - min(free, counts[k] / 2)
         unknown = ~(without < 1e3 * np.abs(values))
         out.append(
             share._replace(
                 alone=max(least_noise(fit.tests[k]), _size_of_noise(r, freedom)),
-                misfit_alone=_size_of_noise(r * scales / sizes_of(fit.tests[k]), freedom),
+                misfit_alone=_size_of_noise(r * scales / _sizes_beside(fit.tests[k], y + r * scales), freedom),
                 errors_without=np.where(unknown, np.inf, without),
             )
         )

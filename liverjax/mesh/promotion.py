@@ -36,7 +36,7 @@ def of_faces(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     inside[nodes] = True
     held = inside[np.asarray(mesh.tetrahedra)]
     middles = [
-        np.asarray(mesh.pattern.element_edges[k])[held[:, face].all(axis=1)]
+        np.asarray(mesh.pattern.element_edges)[k][held[:, face].all(axis=1)]
         for face in map(list, FACES)
         for k, pair in enumerate(PAIRS)
         if set(pair) <= set(face)

@@ -3,6 +3,7 @@ linear in both kinds of elements, so only a finer mesh is richer in pressures.
 """
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from typing import TypeVar
 
@@ -10,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices, Number, param, replace, struct
 from liverjax.laws import Law
 from liverjax.laws.by_region import ByRegion
-from liverjax.mesh import promotion
 from liverjax.mesh.adjacency import node_numbers
 from liverjax.mesh.locate import weights
 from liverjax.mesh.refinement import parts_of, places_in, quarters, refined
@@ -22,6 +23,9 @@ from liverjax.physics.attached.vessel import Vessel
 from liverjax.physics.base import Physics
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import Displaced
+from liverjax.physics.viscosity import Prony
+from liverjax.scenes.middles import middles_of_places
+from liverjax.scenes.regions import POROUS, VISCOUS
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.subsets import subsets
 
@@ -51,7 +55,8 @@ class Within:
 def can_be_refined(scene: Scene) -> bool:
     """Whether all parts of the scene have a meaning on the refined mesh.
 
-    A vessel has numbers of elements, and a physics may have one number per triangle: these are not refined.
+    A vessel has numbers of elements. A load, an inlet or a physics may have one number per triangle or per node. These
+    are not refined.
     """
 
     def plain(physics: Physics) -> bool:
@@ -61,16 +66,22 @@ def can_be_refined(scene: Scene) -> bool:
         others = jax.tree.leaves(replace(physics, triangles=None))
         return all(jnp.shape(leaf)[:1] != (len(triangles),) for leaf in others)
 
-    return all(map(plain, scene.physics))
+    fluid = scene.porosity
+    one = [fluid.initial_pressure, *(own for i in fluid.inlet for own in (i.pressure, i.flux))] if fluid else []
+    one += [load.pressure for load in scene.traction]
+    several = any(np.ndim(number) for number in one if number is not None)
+    several |= any(np.ndim(load.value) > 1 for load in scene.traction if load.value is not None)
+    return not several and all(map(plain, scene.physics))
 
 
 def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
-    """The scene with every element cut into eight of the same order; host side, but numbers may be traced."""
+    """The scene with every element cut into eight of the same order; host side, but numbers may be traced.
+
+    Raises:
+        InputError: traced positions of the mesh inside `jax.jit`.
+    """
     old, E = scene.mesh, scene.mesh.number_of_elements
-    mesh = refined(replace(old, triangle_sets=None))
-    element, place = places_in(old, mesh)
-    nodes, values = weights(old, element, place)
-    within = Within(nodes=node_numbers(nodes), weights=jnp.asarray(values))
+    mesh, within = _mesh_and_within(old)
 
     def more(nodes: Indices) -> jax.Array:
         return node_numbers(_with_nodes_between(old, mesh, np.asarray(nodes)))
@@ -86,9 +97,9 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
         scene,
         mesh=mesh,
         law=_law_of_parts(E, scene.law),
-        viscosity=_of_parts(E, scene.viscosity),
+        viscosity=_series(E, scene.viscosity),
         region=tuple(replace(r, elements=node_numbers(parts_of(r.elements))) for r in scene.region),
-        porosity=_sponge(_of_parts(E, scene.porosity), more, parts),
+        porosity=_sponge(E, scene.porosity, more, parts),
         body=body,
         fixed=tuple(replace(f, nodes=more(f.nodes)) for f in scene.fixed),
         displaced=tuple(_moved_in_between(within, d, more(d.nodes), old.number_of_nodes) for d in scene.displaced),
@@ -97,14 +108,27 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
     ), within
 
 
+def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
+    """The refined mesh, and where its nodes lie."""
+    traced = isinstance(old.points, jax.core.Tracer)
+    with nullcontext() if traced else jax.ensure_compile_time_eval():  # node numbers are needed on the host
+        mesh = refined(replace(old, triangle_sets=None))
+        if isinstance(mesh.pattern.edges, jax.core.Tracer):
+            raise InputError(
+                "the mesh error of a scene with a fluid cannot be estimated inside jax.jit if the positions of the "
+                "mesh are traced: estimate it outside"
+            )
+        element, place = places_in(old, mesh)
+        nodes, values = weights(old, element, place)
+        return mesh, Within(nodes=node_numbers(nodes), weights=jnp.asarray(values))
+
+
 def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Nodes (n,) of the old mesh, and the new nodes on the faces whose vertices they contain."""
-    middles = promotion.of_faces(old, nodes[nodes < old.number_of_vertices])
-    found = np.concatenate([nodes, np.setdiff1d(middles, nodes)])
+    """Nodes (n,) of the old mesh, and the new nodes between them that belong to the same places."""
+    found = np.concatenate([nodes, np.setdiff1d(middles_of_places(old, nodes), nodes)])
     if mesh.order == 1:
         return found
-    more = promotion.of_faces(mesh, found)
-    return np.concatenate([found, np.setdiff1d(more, found)])
+    return np.concatenate([found, np.setdiff1d(middles_of_places(mesh, found), found)])
 
 
 def _of_parts(E: int, numbers: T) -> T:
@@ -130,13 +154,22 @@ def _law_of_parts(E: int, law: Law) -> Law:
     )
 
 
-def _sponge(porosity: Porosity | None, more: Callable[[Indices], Indices], parts: Callable) -> Porosity | None:
+def _series(E: int, prony: Prony | None) -> Prony | None:
+    """The series; numbers by mode and element (N, E) are given to the parts of each element."""
+    if prony is None:
+        return None
+    by_element = {name: own for name in VISCOUS if np.ndim(own := getattr(prony, name)) == 2}
+    return replace(prony, **_of_parts(E, by_element))
+
+
+def _sponge(E: int, porosity: Porosity | None, more: Callable[[Indices], Indices], parts: Callable) -> Porosity | None:
     """The sponge, drained and supplied at the nodes of the refined mesh too."""
     if porosity is None:
         return None
     inlets = tuple(parts(own if own.nodes is None else replace(own, nodes=more(own.nodes))) for own in porosity.inlet)
     drained = None if porosity.drained is None else more(porosity.drained)
-    return replace(porosity, drained=drained, inlet=inlets)
+    numbers = _of_parts(E, {name: getattr(porosity, name) for name in POROUS})
+    return replace(porosity, drained=drained, inlet=inlets, **numbers)
 
 
 def _moved_in_between(within: Within, moved: Displaced, nodes: Indices, number_of_nodes: int) -> Displaced:

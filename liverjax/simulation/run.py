@@ -129,7 +129,7 @@ def simulate(
             square root of the number of steps. The steps between kept states run a second time. Without a derivative it
             has no effect. See `liverjax.simulation.gradients`.
         mesh_error: whether to estimate the error of the mesh (`liverjax.simulation.mesh_error`). Then the run must
-            begin in the reference positions.
+            begin in the reference positions. The estimate has derivatives in forward mode only.
 
     Raises:
         InputError: unknown choices; a time step or a mass is missing; numbers out of bounds, unless they are traced; a

@@ -119,6 +119,9 @@ def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool
     proportion to the readings. The residuals decide which case is more probable."""
     # The scales contain the measured readings with their noise, and this noise would seem to depend on J. So the fitted
     # readings are used here.
+    if np.ptp(fit.scales) == 0:  # the fit knows already that the noise is constant
+        equal = np.ones(len(r))
+        return probability_of_sizes(J, r, equal)[1] * equal, True
     lower = fit.scales**2 - fit.measured**2
     relative = np.sqrt(np.maximum(fit.fitted**2 + lower, 1e-300)) / fit.scales
     constant = np.median(fit.scales) / fit.scales
