@@ -147,6 +147,16 @@ def test_noise_of_constant_size_sets_the_weights_of_fit_interval_and_posterior(m
     u = np.asarray(fit.solution.u)
     near = u + 0.003 * np.random.default_rng(1).normal(size=(20, len(u)))
     assert np.all(seen[0].log_likelihood(near) < seen[0].log_likelihood(u[None]))
+    # Noise in proportion to the answers, and exact answers, keep their weights.
+    clean = _recovery(np.zeros(len(_RECOVERY)))
+    some = clean.answer * (1 + 0.01 * np.random.default_rng(2).normal(size=len(_RECOVERY)))
+    for other in (clean, clean._replace(answer=some)):
+        assert not fitted_by_its_noise(other, 2)[0].constant_noise
+
+
+@pytest.mark.slow
+def test_noise_of_constant_size_sets_the_weights_beside_a_sweep():
+    test = _recovery(0.005 * np.random.default_rng(0).normal(size=len(_RECOVERY)))
     omega = np.geomspace(0.3, 30, 12)
     G = G0 * (
         1 - RATIOS.sum() + (RATIOS * 1j * omega[:, None] * TIMES / 4 / (1 + 1j * omega[:, None] * TIMES / 4)).sum(1)
@@ -154,8 +164,3 @@ def test_noise_of_constant_size_sets_the_weights_of_fit_interval_and_posterior(m
     noisy = [a * (1 + 0.03 * np.random.default_rng(k).normal(size=12)) for k, a in enumerate((G.real, G.imag))]
     both = choose_together([Sweep(omega, *noisy, source="sweep.csv"), test], "prony", 2)
     assert both.tests[1].constant_noise and both.shares[1].noise < 0.05
-    # Noise in proportion to the answers, and exact answers, keep their weights.
-    clean = _recovery(np.zeros(len(_RECOVERY)))
-    some = clean.answer * (1 + 0.01 * np.random.default_rng(2).normal(size=len(_RECOVERY)))
-    for other in (clean, clean._replace(answer=some)):
-        assert not fitted_by_its_noise(other, 2)[0].constant_noise

@@ -107,6 +107,7 @@ def test_terzaghis_consolidation(verified):
     assert errors[0] / errors[1] > 1.6  # first order in the step, which is halved with the layers
 
 
+@pytest.mark.slow
 def test_the_implicit_scheme_is_stable_at_any_step():
     # Twenty steps of 5e-5 to 500 diffusion times, by the program of the test of consolidation.
     at_once, at_last = LOAD / (MODULUS + 2200) * HEIGHT, LOAD / MODULUS * HEIGHT

@@ -39,7 +39,8 @@ def sphere(kind, top, **numbers):
     return kind(triangles=top, shape="sphere", **place, **numbers)
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
 def test_a_plate_on_a_held_bar(order, verified):
     """No motion to the side: stress F/A at one stretch, and the plate as deep in the surface as its stiffness says."""
     F, hardness = 0.05, 1e8

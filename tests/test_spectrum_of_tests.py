@@ -152,5 +152,5 @@ def test_a_general_model_needs_strong_evidence(labels, criteria, chosen):
 def test_criteria_count_the_parameters_in_effect():
     test = in_time("relaxation")
     found = spectrum_of_tests.spectrum_in_time(test, NEAR)
-    m, square = len(found.measured), np.sum(found.relative_errors**2)
+    m, square = len(found.measured), np.sum(((found.fitted - found.measured) / found.scales) ** 2)
     assert time_tests.criterion(found) == pytest.approx(m * np.log(square / m) + found.kind.effective * np.log(m))

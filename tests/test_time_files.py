@@ -202,7 +202,8 @@ def recorded(noise_of_strain=0.0, seed=0):
     return t, strain + noise_of_strain * 0.05 * rng.standard_normal(len(t)), stress
 
 
-@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.01])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_rest_before_the_load_and_a_strain_that_scatters_do_not_matter(tmp_path, noise):
     """An instrument's clock runs before the step, and its sensor has noise: neither is motion of the sample."""
     t, strain, stress = recorded(noise)

@@ -172,6 +172,7 @@ def test_a_factor_that_sizes_of_samples_explain_is_no_alarm(relative, explained)
     assert ("look for another temperature" in told) != explained
 
 
+@pytest.mark.slow
 def test_a_common_fit_with_too_few_modes_does_not_hide_the_factor():
     """The sweep shows the fast mode, the relaxation, ten times as stiff, the slow one: both together allow one mode."""
     both = Maxwell(np.float64(1000.0), np.array([0.3, 0.3]), np.array([20.0, 0.05]))

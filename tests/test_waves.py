@@ -332,7 +332,7 @@ def test_moduli_that_long_waves_leave_open_have_an_interval_of_their_own(small):
 
     (sentence,) = told(e)
     low, high = 1 / (1 / G + 2 * e / G**2), 1 / (1 / G - 2 * e / G**2)
-    assert f"may be {low:.3g} Pa to {high:.3g} Pa (95 %)" in sentence and high > 30000
+    assert f"is {low:.3g} Pa to {high:.3g} Pa (95 %)" in sentence and high > 30000
     assert "to any value above" in told(0.6 * G)[0] and "to any value above" in told(1.5 * G)[0] and not told(0.1 * G)
 
 

@@ -73,7 +73,7 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
 
 
 def _said_of_rows(test: "TimeTest") -> list[str]:
-    """A note if only some rows of a long record are fitted, and a note on the time before the first reading."""
+    """A note if only some rows of a long record are fitted, and a note on the time before the first answer."""
     from fitting.fits.time_tests import thinned
 
     number, every, told = len(thinned(test)), int(test.used.sum()), []

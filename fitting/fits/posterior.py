@@ -390,7 +390,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
 def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a relaxation or creep test in closed form, of Prony modes or of a fractional model.
 
-    If neighbouring readings share their noise, the likelihood counts only the number of independent readings.
+    If neighbouring answers share their noise, the likelihood counts only the number of independent answers.
     """
     test = test._replace(constant_noise=fit.details.get(time_tests.CONSTANT_NOISE, False))
     if fit.kind.values is None:

@@ -24,13 +24,13 @@ from liverjax.core.struct import Content
 #: The load moves if it changes from row to row by more than this part of its maximum; and maximum number of loads that
 #: are treated separately.
 STILL, MOST_LOADS = 0.01, 10
-#: Maximum number of readings (measured responses) that are fitted. From a longer record, readings at about equal steps
+#: Maximum number of answers (measured responses) that are fitted. From a longer record, answers at about equal steps
 #: of log time are used.
 MOST = 300
-#: Key in `TimeFit.details`, if neighbours share their noise: so many readings with independent noise would tell as
+#: Key in `TimeFit.details`, if neighbours share their noise: so many answers with independent noise would tell as
 #: much.
 INDEPENDENT = "independent_answers"
-#: Key in `TimeFit.details`: whether the noise of all readings has the same size.
+#: Key in `TimeFit.details`: whether the noise of all answers has the same size.
 CONSTANT_NOISE = "noise_of_constant_size"
 #: Starting points of a fit.
 STARTS = 12
@@ -44,7 +44,7 @@ class TimeFit(NamedTuple):
     solution: Solution
     uncertainty: Estimate
     converged: bool
-    time: np.ndarray  # (m,) [s] of the fitted readings
+    time: np.ndarray  # (m,) [s] of the fitted answers
     measured: np.ndarray  # (m,) stress [Pa]; in creep strain [1]
     fitted: np.ndarray
     scales: np.ndarray  # (m,) divisors of relative errors
@@ -66,9 +66,9 @@ class TimeFit(NamedTuple):
 
 
 def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Divisors (m,) of relative errors: the fitted readings, at least the median of |fit - data|.
+    """Divisors (m,) of relative errors: the fitted answers, at least the median of |fit - data|.
 
-    Where the readings pass 0, as in cycles, the divisors are the scales of the residuals. Elsewhere these scales would
+    Where the answers pass 0, as in cycles, the divisors are the scales of the residuals. Elsewhere these scales would
     hide noise: their lower bound is 33 times the noise.
     """
     largest = np.abs(measured).max(initial=0.0)
@@ -207,7 +207,7 @@ def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Arr
 
 
 def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
-    """Times (n,), driven quantity (n,), the rows (m,) of the readings among these times, readings (m,) and their scales
+    """Times (n,), driven quantity (n,), the rows (m,) of the answers among these times, answers (m,) and their scales
     (m,)."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
@@ -233,7 +233,7 @@ def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
 
 def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Array:
     """Predicted measurements: G' then G'' [Pa] at angular frequencies; velocities and attenuations of shear waves; or
-    the readings of a test in time.
+    the answers of a test in time.
 
     It works with JAX arrays. For a sweep and for dispersion it also works with NumPy arrays (`fitting.methods.host`).
 
@@ -241,7 +241,7 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
         kind: "sweep", "dispersion", "relaxation" or "creep".
         model: Prony modes.
         at: angular frequencies (n,) [rad/s], or times (n,) [s].
-        drive: for a test in time, the driven quantity (n,) and the rows (m,) of the readings. For dispersion, the
+        drive: for a test in time, the driven quantity (n,) and the rows (m,) of the answers. For dispersion, the
             density and the indices (m,) of the measured values among velocities [m/s] followed by attenuations [1/m].
     """
     xp = arrays_of(model.ratios)
@@ -258,7 +258,7 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
 
 
 def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
-    """Stress divided by strain (m,) [Pa] at the fitted readings (roughly G(t)), and the times of these readings."""
+    """Stress divided by strain (m,) [Pa] at the fitted answers (roughly G(t)), and the times of these answers."""
     rows = thinned(test)
     driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
     ratio = answer / np.maximum(driven, 1e-6 * driven.max())
@@ -339,7 +339,7 @@ def _without_relaxation(test: TimeTest, chosen: TimeFit) -> str:
 
 
 def structured_misfit(fit: TimeFit) -> list[str]:
-    """A sentence if the residuals keep their sign over many readings."""
+    """A sentence if the residuals keep their sign over many answers."""
     residuals = fit.fitted - fit.measured
     runs, chance = kramers_kronig.runs_probability(residuals)
     if chance >= kramers_kronig.CHANCE or fit.relative_errors.max() <= viscoelastic.EXACT:

@@ -69,7 +69,7 @@ class Together(NamedTuple):
     uncertainty: Estimate
     converged: bool
     shares: list[Share]
-    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], velocities then attenuations, or the readings
+    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], velocities then attenuations, or the answers
     tried: list[Content]
     warnings: tuple[str, ...]
     run_time: float

@@ -106,7 +106,7 @@ def residuals_with_jacobian(
         kind: "relaxation" or "creep".
         maxwell: u -> Prony modes.
         u: (…, P).
-        data: times (n,) [s]; driven quantity (n,); rows (m,) of the readings; readings (m,); scales of the readings
+        data: times (n,) [s]; driven quantity (n,); rows (m,) of the answers; answers (m,); scales of the answers
             (m,).
     """
     time, driven, rows, answer, scales = data

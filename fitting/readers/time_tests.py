@@ -11,11 +11,11 @@ from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.time_columns import FORMS, beyond_small, read_columns
 from liverjax.core.errors import InputError
 
-#: A load below this part of the largest load counts as rest: its effect on the readings is just as small.
+#: A load below this part of the largest load counts as rest: its effect on the answers is just as small.
 AT_REST = 0.01
 
 #: Lower bound of the scales: the noise divided by RELATIVE. In a cyclic test, the bound is at least the part CYCLIC of
-#: the largest reading.
+#: the largest answer.
 RELATIVE, CYCLIC = 0.03, 0.1
 
 
@@ -25,28 +25,28 @@ class TimeTest(NamedTuple):
     kind: str  # relaxation or creep
     time: np.ndarray  # (n,) [s], ascending
     driven: np.ndarray  # (n,) imposed strain; in creep the imposed stress [Pa]
-    answer: np.ndarray  # (n,) readings: measured stress [Pa]; in creep the strain
-    used: np.ndarray  # (n,) whether the reading of a row is fitted
+    answer: np.ndarray  # (n,) measured response: stress [Pa]; in creep the strain
+    used: np.ndarray  # (n,) whether the answer of a row is fitted
     source: str = ""
     notes: tuple[str, ...] = ()
-    constant_noise: bool = False  # whether the noise of all readings has the same size
+    constant_noise: bool = False  # whether the noise of all answers has the same size
 
     @property
     def scales(self) -> np.ndarray:
-        """Scales of the residuals: the size of each reading, with a lower bound for readings that are lost in noise.
+        """Scales of the residuals: the size of each answer, with a lower bound for answers that are lost in noise.
         If the noise is constant, all scales are the median of these.
         """
-        sizes = self._sizes_of_readings()
+        sizes = self._sizes_of_answers()
         return np.full(len(sizes), np.median(sizes)) if self.constant_noise else sizes
 
-    def _sizes_of_readings(self) -> np.ndarray:
+    def _sizes_of_answers(self) -> np.ndarray:
         answer = self.answer[self.used]
         floor = max(noise_of_series(answer) / RELATIVE, CYCLIC * float(np.max(np.abs(answer))) if self.cyclic else 0.0)
         return np.hypot(answer, floor)
 
     @property
     def cyclic(self) -> bool:
-        """Whether the driven quantity falls by more than half of its largest value and rises again. Then the readings
+        """Whether the driven quantity falls by more than half of its largest value and rises again. Then the answers
         pass 0."""
         driven = np.abs(self.driven)
         half = 0.5 * driven.max()
@@ -68,7 +68,7 @@ class TimeTest(NamedTuple):
     @property
     def resolved(self) -> tuple[float, float]:
         """Shortest and longest relaxation time [s] that the test resolves: the times of the first and the last used
-        reading after the load began."""
+        answer after the load began."""
         time = self.time[self.used] - self.begun
         return float(time[0]), float(time[-1])
 
@@ -91,7 +91,7 @@ def read_time_test(
         sample: radius and height of a cylinder, for torque and force.
         ramp: for a column of modulus or compliance: duration [s] of the ramp of strain or stress; 0 (or None) for a
             step. For two columns: None; or 0, if the load was a step at 0 s and the rows begin later.
-        start: readings before this time [s] are not fitted.
+        start: answers before this time [s] are not fitted.
 
     Raises:
         InputError: one sentence with the file, the column or line, the value and the remedy.
@@ -145,10 +145,10 @@ def of_columns(
         time: (n,) [s], rising from 0.
         driven, answer: (n,) strain and stress [Pa]; in creep, stress [Pa] and strain.
         source: name of the file, and notes.
-        start: readings before this time [s] are not fitted.
+        start: answers before this time [s] are not fitted.
 
     Raises:
-        InputError: the driven quantity is zero, there are too few readings, or most readings have the opposite sign.
+        InputError: the driven quantity is zero, there are too few answers, or most answers have the opposite sign.
     """
     driven, told = without_scatter(time, driven, "strain" if kind == "relaxation" else "stress")
     told += _ringing(time, driven, answer, start) if kind == "creep" else []
@@ -231,7 +231,7 @@ def _own_table(kind: str) -> str:
 
 
 def _as_a_step(path, time, modulus, ramp):
-    """Times, a driven strain (or stress) that reaches 1 at once or by a ramp, and readings."""
+    """Times, a driven strain (or stress) that reaches 1 at once or by a ramp, and answers."""
     if not (np.isfinite(ramp) and ramp >= 0):
         raise InputError(f"{path}: --ramp {ramp:g} cannot be the seconds of a ramp; give 0 or more")
     if ramp > time[-1]:
@@ -337,14 +337,14 @@ def _as_shear(path, form, columns, sample):
     return strain, columns["force"] / (3 * np.pi * r**2), [note, *beyond_small(float(np.nanmax(np.abs(strain))))]
 
 
-#: Minimum number of rows at rest that show an offset; and the part of the largest reading below which an offset does
+#: Minimum number of rows at rest that show an offset; and the part of the largest answer below which an offset does
 #: not matter.
 RESTING, OFFSET = 3, 0.003
 
 
 def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
-    """The readings, and a note. If the mean before the load clearly exceeds its error, this mean is subtracted from all
-    readings."""
+    """The answers, and a note. If the mean before the load clearly exceeds its error, this mean is subtracted from all
+    answers."""
     rest = np.isfinite(test.answer) & (test.time < test.begun) & ~((test.time == 0) & (test.answer == 0))
     count, size = int(rest.sum()), float(np.nanmax(np.abs(test.answer)))
     if count < RESTING:
@@ -360,12 +360,12 @@ def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
 
 
 def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
-    """A note if the reading at the begin of the load is not 0. One or two rows cannot distinguish an offset from
+    """A note if the answer at the begin of the load is not 0. One or two rows cannot distinguish an offset from
     noise."""
     k = int(np.argmax(test.time >= test.begun))
     here, load = float(test.answer[k]), abs(float(test.driven[k])) / float(np.max(np.abs(test.driven)))
     noise = noise_of_series(test.answer[np.isfinite(test.answer) & (test.time > test.begun)])
-    # In a steady cycle, the first reading is not 0, because the response lags behind.
+    # In a steady cycle, the first answer is not 0, because the response lags behind.
     if test.cyclic or load > AT_REST or not abs(here) > max(_IN_NOISE * noise, (OFFSET + 2 * load) * size):
         return []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
@@ -390,7 +390,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         )
     if not np.sum(driven[used] * answer[used]) > 0:
         raise InputError(
-            f"{test.source}: most readings of the {test.kind} test have the wrong sign for its load; correct the signs"
+            f"{test.source}: most answers of the {test.kind} test have the wrong sign for its load; correct the signs"
         )
     notes, before = (*test.notes, *told), int(np.sum(test.time <= test.begun))
     if before > 2:

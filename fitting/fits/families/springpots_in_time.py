@@ -221,7 +221,7 @@ def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Ban
     return sorted(rows, key=lambda row: row["above_the_lowest"])
 
 
-#: Minimum number of readings of a test whose residuals are asked for the size of its noise.
+#: Minimum number of answers of a test whose residuals are asked for the size of its noise.
 _ENOUGH = 10
 #: Fields that are times in seconds.
 TIMES = ("run_time", "compile_time")
@@ -275,7 +275,7 @@ def choose_together(
 
 
 def _by_its_noise(test: Measured) -> Measured:
-    """The test; a test in time is told whether its noise has a constant size, if it has enough readings."""
+    """The test; a test in time is told whether its noise has a constant size, if it has enough answers."""
     if not isinstance(test, TimeTest) or np.sum(test.used) < _ENOUGH:
         return test
     return fitted_by_its_noise(test)[0]

@@ -1,4 +1,4 @@
-"""Noise that neighbouring readings of a test in time share. If the noise is treated as independent, the standard errors
+"""Noise that neighbouring answers of a test in time share. If the noise is treated as independent, the standard errors
 of the parameters are too small. Here they are corrected."""
 
 from collections.abc import Callable
@@ -22,8 +22,8 @@ _UNEVEN_FROM = 1.3
 def fitted_by_its_noise(test: TimeTest, modes: int | str = "auto") -> tuple[TimeTest, TimeFit]:
     """Prony modes of a test whose noise may have a constant size, and the test with `constant_noise` if it has.
 
-    The first fit takes the noise in proportion to the readings. If its residuals show noise of a constant size, the
-    test is fitted again with equal scales. Otherwise small readings would have too much weight.
+    The first fit takes the noise in proportion to the answers. If its residuals show noise of a constant size, the
+    test is fitted again with equal scales. Otherwise small answers would have too much weight.
     """
     fit = time_tests.fit(test, modes)
     if test.constant_noise or not _has_constant_noise(fit):
@@ -43,7 +43,7 @@ def _has_constant_noise(fit: TimeFit) -> bool:
 
 def with_own_noise(fit: TimeFit) -> TimeFit:
     """The fit with standard errors for its real noise. Neighbours may share noise (`with_alike_noise`). The noise may
-    also be larger at some readings than at others, for example if it grows with time.
+    also be larger at some answers than at others, for example if it grows with time.
     """
     own = fit.parameters
     if fit.kind.effective is not None or not np.all(np.isfinite((own or fit.uncertainty).standard_errors)):
@@ -70,9 +70,9 @@ def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
 
 
 def with_alike_noise(fit: TimeFit) -> TimeFit:
-    """The fit with standard errors for noise that neighbouring readings share, if the residuals show such noise.
+    """The fit with standard errors for noise that neighbouring answers share, if the residuals show such noise.
 
-    Neighbours may be near each other in time, for example in a drift. Or they may be near in the order of the readings,
+    Neighbours may be near each other in time, for example in a drift. Or they may be near in the order of the answers,
     for example if the instrument averages or the model misses a part of the spectrum. The more probable case is used.
     """
     r, J = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian)
@@ -116,9 +116,9 @@ _CONSTANT = 3.0
 
 def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool]:
     """Standard deviations of the residuals r (m,), and whether the noise has a constant size. Otherwise the noise is in
-    proportion to the readings. The residuals decide which case is more probable."""
-    # The scales contain the measured readings with their noise, and this noise would seem to depend on J. So the fitted
-    # readings are used here.
+    proportion to the answers. The residuals decide which case is more probable."""
+    # The scales contain the measured answers with their noise, and this noise would seem to depend on J. So the fitted
+    # answers are used here.
     if np.ptp(fit.scales) == 0:  # the fit knows already that the noise is constant
         equal = np.ones(len(r))
         return probability_of_sizes(J, r, equal)[1] * equal, True

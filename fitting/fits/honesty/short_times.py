@@ -1,4 +1,4 @@
-"""Stress that relaxes before the first reading of a test in time is missing in G0. The way in which the stress begins
+"""Stress that relaxes before the first answer of a test in time is missing in G0. The way in which the stress begins
 to fall tells how much may be missing.
 
 Let r be the fall in one half decade divided by the fall in the next one. If r < 1 stays the same, the falls before the
