@@ -143,17 +143,17 @@ def test_a_sample_that_is_not_of_the_others_is_named():
         assert len(said) == told and all(s.startswith("s4.csv: its shear_modulus is 4.9 times") for s in said)
 
 
+def samples_of(rows):
+    """Samples s0.csv … whose fits have these values with their errors, by name."""
+    sweeps = [SimpleNamespace(source=f"s{k}.csv") for k in range(len(rows))]
+    return SimpleNamespace(sweeps=sweeps, fits=rows, populations=dict.fromkeys(rows[0]), values=lambda k: rows[k])
+
+
 def test_a_sample_of_other_times_is_named_by_them():
     """The unit of the frequency, or the temperature, moves the times alone."""
     rows = [{"shear_modulus": (900.0 + 50 * k, 5.0), "relaxation_times[0]": (1.0 + 0.01 * k, 0.01)} for k in range(5)]
     rows[3]["relaxation_times[0]"] = (6.4, 0.05)
-    found = SimpleNamespace(
-        sweeps=[SimpleNamespace(source=f"s{k}.csv") for k in range(5)],
-        fits=rows,
-        populations=dict.fromkeys(rows[0]),
-        values=lambda k: rows[k],
-    )
-    (said,) = outliers(found)
+    (said,) = outliers(samples_of(rows))
     assert said.startswith("s3.csv: its relaxation_times[0] is 6.3 times") and "the unit of its frequency" in said
 
 
@@ -249,11 +249,5 @@ def test_a_sample_of_a_wrong_gap_is_named_among_many_parameters():
         | {f"relaxation_times[{m}]": (10.0**-m * (1 + 0.01 * k), 0.01) for m in range(2)}
         for k, G in enumerate((979.0, 1039.0, 1608.0, 1008.0, 1082.0))
     ]
-    found = SimpleNamespace(
-        sweeps=[SimpleNamespace(source=f"s{k}.csv") for k in range(5)],
-        fits=rows,
-        populations=dict.fromkeys(rows[0]),
-        values=lambda k: rows[k],
-    )
-    (said,) = outliers(found)
+    (said,) = outliers(samples_of(rows))
     assert said.startswith("s2.csv: its shear_modulus is 1.6 times")

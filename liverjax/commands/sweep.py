@@ -94,6 +94,12 @@ def _of_crushed(rows: dict[int, float]) -> list[str]:
     ]
 
 
+def _is_address(text: str) -> bool:
+    """Whether the text is HOST:PORT: JAX ends with a segmentation fault at another port."""
+    host, _, port = text.rpartition(":")
+    return bool(host) and port.isdigit() and 1 <= int(port) <= 65535
+
+
 def _share(given: list[str]) -> tuple[int, int]:
     """Index and number of the processes from JAX's distributed runtime.
 
@@ -104,8 +110,7 @@ def _share(given: list[str]) -> tuple[int, int]:
     option = f"--distributed {' '.join(given)}"
     if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
         raise InputError(f"{option}: give HOST:PORT, the number of processes and the number of this one, or nothing")
-    port = given[0].rpartition(":")[2] if given else "1"
-    if not (port.isdigit() and 1 <= int(port) <= 65535) or (given and ":" not in given[0]):
+    if given and not _is_address(given[0]):
         raise InputError(f"{option}: {given[0]} is not HOST:PORT with a port of 1 to 65535: give e.g. node1:12345")
     if given and int(given[1]) < 1:
         raise InputError(f"{option}: the number of processes must be above 0: give e.g. {given[0]} 2 0")

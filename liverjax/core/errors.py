@@ -1,4 +1,4 @@
-"""The exception for unusable input. Users meet no other exception."""
+"""The exception for unusable input: unusable input causes no other."""
 
 
 class InputError(ValueError):

@@ -20,6 +20,9 @@ from liverjax.physics.viscosity import Prony
 from liverjax.scenes.regions import Region
 from liverjax.scenes.springpots import SpringpotSeries
 
+#: Highest frequency [Hz] of harmonic motion: its square must not overflow, and no wave in tissue is faster.
+HIGHEST_HZ = 1e9
+
 
 @struct
 class Body:
@@ -68,7 +71,7 @@ class Solve:
     robust: str = static(
         default="off", about="projected or regularised: minimise the energy if a step cannot be followed"
     )
-    frequencies: Numbers | None = param("Hz", "(F,) of harmonic motion", above=0.0, upper=1e9, default=None)
+    frequencies: Numbers | None = param("Hz", "(F,) of harmonic motion", above=0.0, upper=HIGHEST_HZ, default=None)
     reduced: str = static(default="", about="file of a reduced model, as `python -m liverjax reduce` makes it")
     reduced_tolerance: Number = param(
         "1", "estimated error over the largest displacement, above which the full model runs", above=0.0, default=0.01

@@ -18,7 +18,7 @@ from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import prescribed
 from liverjax.scenes.regions import laws_of
-from liverjax.scenes.scene import Scene
+from liverjax.scenes.scene import HIGHEST_HZ, Scene
 from liverjax.scenes.springpots import check_springpots, series_at_rest, springpot_factors
 from liverjax.simulation.equations import Sizes, equations, initial_state
 from liverjax.simulation.run import prepared
@@ -27,8 +27,6 @@ from liverjax.waves.operator import Operator, free_part, operator
 from liverjax.waves.rest import under_its_weight, without_history
 
 MASSES = ("consistent", "lumped")
-#: Highest frequency [Hz]: beyond ultrasound nothing here is meant.
-_HIGHEST = 1e9
 #: Values of [solve] for the equations of one instant.
 _STILL: Content = {
     "kind": "static",
@@ -191,11 +189,11 @@ def _frequencies(frequencies_Hz: Any) -> jax.Array:
         raise InputError("harmonic motion needs frequencies_Hz: give e.g. [60.0]")
     found = jnp.atleast_1d(jnp.asarray(frequencies_Hz, float))
     if not isinstance(found, jax.core.Tracer) and not (
-        found.ndim == 1 and found.size and np.all((np.asarray(found) > 0) & (np.asarray(found) <= _HIGHEST))
+        found.ndim == 1 and found.size and np.all((np.asarray(found) > 0) & (np.asarray(found) <= HIGHEST_HZ))
     ):
         raise InputError(
             f"frequencies_Hz = {np.asarray(frequencies_Hz).tolist()} must be a list of numbers above 0, at most "
-            f"{_HIGHEST:g}"
+            f"{HIGHEST_HZ:g}"
         )
     return found
 
