@@ -1,5 +1,6 @@
 """Quadratic tetrahedra: the same physics at their points, exact where they must be, of the order they promise."""
 
+import itertools
 from math import factorial
 
 import jax
@@ -245,6 +246,33 @@ def test_held_faces_hold_the_middles_of_their_edges_and_pairs_do_not():
     face = np.asarray(box.node_sets["x_min"])
     assert len(promotion.of_faces(box, face)) == 9
     assert np.array_equal(promotion.of_faces(box, face[:2]), face[:2])
+
+
+@pytest.mark.parametrize("cells", [(1, 1, 1), (2, 2, 2), (3, 2, 1)])
+def test_middles_of_several_held_sides_lie_on_these_sides(cells):
+    """Between two sides that meet there are faces with a vertex on each: they were held too."""
+    box = lj.shapes.box((1.0, 2.0, 3.0), cells)
+    points = np.asarray(lj.quadratic(box).points)
+    sides = {name: (k // 2, (0.0, (1.0, 2.0, 3.0)[k // 2])[k % 2]) for k, name in enumerate(box.node_sets)}
+    assert list(sides) == ["x_min", "x_max", "y_min", "y_max", "z_min", "z_max"]
+    for number in (1, 2, 3, 6):
+        for names in itertools.combinations(sides, number):
+            held = np.unique(np.concatenate([np.asarray(box.node_sets[name]) for name in names]))
+            on_sides = [points[:, axis] == place for axis, place in (sides[name] for name in names)]
+            expected = set(np.flatnonzero(np.any(on_sides, axis=0)))
+            found = set(promotion.of_faces(box, held))
+            if len(held) == box.number_of_vertices:  # without a node inside, all faces are held
+                assert expected <= found
+            else:
+                assert found == expected, names
+
+
+def test_all_faces_of_a_coarse_surface_are_held():
+    """No two of the faces of an octahedron have nearly the same direction."""
+    corners = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    faces = [[1, 2, 3], [2, 4, 3], [4, 5, 3], [5, 1, 3], [2, 1, 6], [4, 2, 6], [5, 4, 6], [1, 5, 6]]
+    octahedron = lj.tet_mesh(corners, np.array([[0, *face] for face in faces]))
+    assert len(promotion.of_faces(octahedron, np.arange(1, 7))) == 6 + 12
 
 
 def test_points_do_not_see_a_fold_that_vertices_show():

@@ -6,20 +6,29 @@ import numpy as np
 
 from liverjax.core.struct import Indices, replace
 from liverjax.mesh.adjacency import PAIRS, Clusters, function_clusters, node_numbers
+from liverjax.mesh.selection import boundary_triangles, face_codes
 from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh
+
+#: Cosines of angles: two neighbours on the surface belong to one place if theirs is above the first. Two neighbours
+#: inside the body lie in one plane if theirs is above the second.
+_ONE_PLACE, _ONE_PLANE = 0.7, 0.999
 
 
 def quadratic(mesh: TetMesh) -> TetMesh:
     """The mesh with 10 nodes in each element. A quadratic mesh is returned unchanged.
 
     The vertices keep their numbers. The middles of the edges follow in the order of `pattern.edges`. If a node set
-    contains the three vertices of a face, the middles of the face's edges are added, so that a fixed face stays fixed.
+    The vertices keep their numbers. The middles of the edges follow in the order of `pattern.edges`. A node set also
+    gets the middles of the edges of its faces (`middles_of_set`), so that a fixed face stays fixed.
     """
     if mesh.order > 1:
         return mesh
     points = _points_and_middles(mesh.points, mesh.pattern.edges)
-    sets = {name: node_numbers(of_faces(mesh, np.asarray(nodes))) for name, nodes in mesh.node_sets.items()}
+    sets = {
+        name: node_numbers(np.concatenate([np.asarray(nodes), middles_of_set(mesh, name)]))
+        for name, nodes in mesh.node_sets.items()
+    }
     made = replace(mesh, points=points, node_sets=sets, order=2)
     return replace(made, clusters=_all_clusters(made))
 
@@ -30,18 +39,106 @@ def _points_and_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
     return jnp.concatenate([points, 0.5 * (points[low] + points[high])])
 
 
+def middles_of_set(mesh: TetMesh, name: str) -> np.ndarray:
+    """Numbers V + edge of the middles that belong to a node set of the mesh; host side.
+
+    If the mesh has a triangle set of the same name with the same vertices, its triangles say which edges these are.
+    """
+    V, nodes = mesh.number_of_vertices, np.asarray(mesh.node_sets[name])
+    nodes = nodes[nodes < V]
+    triangles = np.asarray((mesh.triangle_sets or {}).get(name, np.zeros((0, 3)))).astype(np.int64)
+    if len(triangles) and np.array_equal(np.unique(triangles), np.unique(nodes)):
+        return V + np.unique(_edges_of(mesh, triangles))
+    return middles_of_places(mesh, nodes)
+
+
 def of_faces(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Vertices `nodes` (n,) of a linear mesh, and the edge middles of all faces with only such vertices; host side."""
-    inside = np.zeros(mesh.number_of_vertices, bool)
-    inside[nodes] = True
-    held = inside[np.asarray(mesh.tetrahedra)]
-    middles = [
-        np.asarray(mesh.pattern.element_edges)[k][held[:, face].all(axis=1)]
-        for face in map(list, FACES)
-        for k, pair in enumerate(PAIRS)
-        if set(pair) <= set(face)
-    ]
-    return np.concatenate([nodes, mesh.number_of_vertices + np.unique(np.concatenate(middles))])
+    """Vertices `nodes` (n,), and the middles of edges that `middles_of_places` finds between them; host side."""
+    return np.concatenate([nodes, middles_of_places(mesh, nodes)])
+
+
+def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
+    """Numbers V + edge of the middles of edges of all faces that form a place with only vertices `nodes`; host side.
+
+    Two places may meet at an edge of the body, such as two held sides. A face there can have all its vertices in the
+    two places without belonging to one of them. On the surface, it meets the faces of the places at an angle, and goes
+    on in its own direction outside them. Inside the body, a face of a place has a vertex that is not on the surface, or
+    it continues the plane of such a face. If the positions of the mesh are traced, directions are not known: then all
+    faces on the surface belong to a place.
+    """
+    V = mesh.number_of_vertices
+    inside = np.zeros(V, bool)
+    inside[nodes[nodes < V]] = True
+    if inside.all():
+        return V + np.arange(mesh.pattern.edges.shape[1])
+    tets = np.asarray(mesh.tetrahedra).astype(np.int64)
+    held = inside[tets]
+    own = np.concatenate([tets[held[:, face].all(axis=1)][:, face] for face in map(list, FACES)])
+    if not len(own):
+        return np.zeros(0, np.int64)
+    surface = boundary_triangles(mesh).astype(np.int64)
+    outer = surface[inside[surface].all(axis=1)]
+    code, of_outer = (face_codes(np.sort(t, axis=1), V) for t in (own, outer))
+    inner = own[~np.isin(code, of_outer)]
+    deep = np.ones(V, bool)
+    deep[surface.ravel()] = False
+    certain = deep[inner].any(axis=1)
+    if not isinstance(mesh.points, jax.core.Tracer):
+        outer = outer[_in_a_place(mesh, surface, inside)]
+        inner = inner[_in_planes(mesh, inner, certain)]
+    else:
+        inner = inner[certain]
+    return V + np.unique(np.concatenate([_edges_of(mesh, outer).ravel(), _edges_of(mesh, inner).ravel()]))
+
+
+def _edges_of(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
+    """Numbers (3, m) of the edges of faces (m, 3)."""
+    low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
+    ends = np.sort(np.stack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=2)
+    return np.searchsorted(low * mesh.number_of_vertices + high, ends[..., 0] * mesh.number_of_vertices + ends[..., 1])
+
+
+def _in_a_place(mesh: TetMesh, surface: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Which triangles of the surface with only vertices `inside` belong to a place.
+
+    All do, except those that have nearly the direction of a neighbour outside the places, and of none within them.
+    """
+    own = inside[surface].all(axis=1)
+    normal = _normals(mesh, surface)
+    a, b = _pairs_at_edges(_edges_of(mesh, surface), np.ones(len(surface), bool))
+    parallel = np.sum(normal[a] * normal[b], axis=1) > _ONE_PLACE
+    number = np.arange(len(surface))
+    continued, outside = (np.isin(number, a[parallel & which]) for which in (own[b], ~own[b]))
+    alone = ~np.isin(number, a[own[b]])
+    return (continued | ~outside | alone)[own]
+
+
+def _in_planes(mesh: TetMesh, faces: np.ndarray, certain: np.ndarray) -> np.ndarray:
+    """Which faces (m, 3) inside the body belong to a place: the certain ones, and those in the plane of a neighbour
+    that is certain."""
+    normal = _normals(mesh, faces)
+    a, b = _pairs_at_edges(_edges_of(mesh, faces), certain)
+    in_plane = np.abs(np.sum(normal[a] * normal[b], axis=1)) > _ONE_PLANE
+    return certain | np.isin(np.arange(len(faces)), a[in_plane])
+
+
+def _normals(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
+    corners = np.asarray(mesh.points)[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def _pairs_at_edges(edges: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of a triangle and another one, one of `others` (m,), with a common edge; edges (3, m)."""
+    m = edges.shape[1]
+    triangle = np.tile(np.arange(m), 3)
+    known = np.flatnonzero(others[triangle])
+    known = known[np.argsort(edges.ravel()[known], kind="stable")]
+    first, last = (np.searchsorted(edges.ravel()[known], edges.ravel(), side) for side in ("left", "right"))
+    number = last - first
+    place = np.repeat(first - (np.cumsum(number) - number), number) + np.arange(number.sum())
+    a, b = np.repeat(triangle, number), triangle[known[place]]
+    return a[a != b], b[a != b]
 
 
 def cubic(mesh: TetMesh) -> TetMesh:
@@ -77,7 +174,7 @@ def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:
     """Numbers (m,) of the faces of a mesh of order 3 with vertices (m, 3); host side."""
     tets, V = np.asarray(mesh.tetrahedra).astype(np.int64), mesh.number_of_vertices
     of_elements = np.concatenate([tets[:, face] for face in map(list, FACES)])
-    code, wanted = (_code(np.sort(t.astype(np.int64), axis=1), V) for t in (of_elements, triangles))
+    code, wanted = (face_codes(np.sort(t.astype(np.int64), axis=1), V) for t in (of_elements, triangles))
     order = np.argsort(code, kind="stable")
     return np.asarray(mesh.faces).ravel()[order[np.searchsorted(code, wanted, sorter=order)]]
 
@@ -91,11 +188,6 @@ def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
         return triangles
     vertices = np.sort(np.asarray(triangles), axis=1)
     return node_numbers(np.column_stack([vertices, face_numbers(mesh, vertices)]))
-
-
-def _code(triples: np.ndarray, V: int) -> np.ndarray:
-    """A number for each sorted triple, different for different triples. It is below 2^63 up to two million vertices."""
-    return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
 
 
 def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:

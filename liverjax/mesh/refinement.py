@@ -6,7 +6,7 @@ import numpy as np
 
 from liverjax.core.struct import Array, Indices, replace
 from liverjax.mesh.adjacency import PAIRS, node_numbers
-from liverjax.mesh.promotion import of_faces, quadratic
+from liverjax.mesh.promotion import middles_of_set, quadratic
 from liverjax.mesh.selection import boundary_triangles
 from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
@@ -16,10 +16,10 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     """The mesh with every tetrahedron cut into eight (Bey 1995), of the same order; host side.
 
     The old vertices keep their numbers, and the middles of the edges follow in the order of `pattern.edges`. So the new
-    vertices are the nodes of `quadratic(mesh)`. A node set also gets the new nodes on all faces whose three vertices it
-    contains. The parts of element e are the elements 8 e … 8 e + 7, and an element set contains the parts of its
-    elements. The surface keeps its flat triangles: refinement does not bring it nearer to the organ. Positions may be
-    traced if `near` is not given and the mesh has no triangle sets.
+    vertices are the nodes of `quadratic(mesh)`, and a node set gets the same of them as there. The parts of element e
+    are the elements 8 e … 8 e + 7, and an element set contains the parts of its elements. The surface keeps its flat
+    triangles: refinement does not bring it nearer to the organ. Positions may be traced if `near` is not given and the
+    mesh has no triangle sets.
 
     Args:
         near: node numbers (n,). If given, only edges at these nodes are halved, and other edges if the mesh would not
@@ -35,7 +35,7 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     sets = {}
     for name, nodes in mesh.node_sets.items():
         own = np.asarray(nodes)[np.asarray(nodes) < V]
-        new = middle[of_faces(mesh, own)[len(own) :] - V]
+        new = middle[middles_of_set(mesh, name) - V]
         sets[name] = np.concatenate([own, new[new >= 0]])
     elements = {} if near is not None else {name: parts_of(own) for name, own in mesh.element_sets.items()}
     stack = jnp.vstack if isinstance(points, jax.core.Tracer) else np.vstack

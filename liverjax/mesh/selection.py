@@ -75,9 +75,15 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
     """Outer triangles (m, 3) with outward normals; with `nodes`, only triangles with all vertices in `nodes`."""
     tets = np.asarray(mesh.tetrahedra)
     faces = np.concatenate([tets[:, f] for f in FACES])
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    codes = face_codes(np.sort(faces.astype(np.int64), axis=1), mesh.number_of_vertices)
+    _, first, count = np.unique(codes, return_index=True, return_counts=True)
     outer = faces[np.sort(first[count == 1])]
     return outer if nodes is None else outer[np.isin(outer, np.asarray(nodes)).all(axis=1)]
+
+
+def face_codes(triples: np.ndarray, V: int) -> np.ndarray:
+    """A number for each sorted triple, different for different triples. It is below 2^63 up to two million vertices."""
+    return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
 
 
 def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> np.ndarray:

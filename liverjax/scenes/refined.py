@@ -17,6 +17,7 @@ from liverjax.laws import Law
 from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.adjacency import node_numbers
 from liverjax.mesh.locate import weights
+from liverjax.mesh.promotion import middles_of_places
 from liverjax.mesh.refinement import parts_of, places_in, quarters, refined
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.vessel import Vessel
@@ -24,7 +25,6 @@ from liverjax.physics.base import Physics
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import Displaced
 from liverjax.physics.viscosity import Prony
-from liverjax.scenes.middles import middles_of_places
 from liverjax.scenes.regions import POROUS, VISCOUS
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.subsets import subsets
