@@ -12,7 +12,8 @@ from conftest import SHARED
 
 from fitting.__main__ import main
 from fitting.fits import time_tests as fits
-from fitting.methods import time_response
+from fitting.methods import time_response, uncertainty
+from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.time_tests import TimeTest, read_time_test
 from liverjax import InputError
@@ -174,6 +175,25 @@ def test_relaxation_of_polystyrene_is_predicted_from_its_creep():
     error = np.abs(predicted / relaxed.answer[relaxed.used][both] - 1)
     # Found: 4 %. Creep and relaxation are two loadings of the sample; how far it repeats itself nobody has measured.
     assert np.median(error) < 0.1
+
+
+def test_a_melt_with_little_left_is_compared_with_a_fluid():
+    """Structured misfit left an equilibrium modulus of 2.1 errors in a melt, and no fluid was tried."""
+    folder = SHARED / "data" / "rheology" / "pyrheo"
+    if not folder.is_dir():
+        pytest.skip("the measured tests are not here")
+    found = fits.fit(read_time_test(folder / "creep_ps190_data.csv", "creep"))
+    assert found.kind.name == "prony_fluid"
+
+
+@pytest.mark.parametrize(("rest", "error", "compared", "told"), [(1e-3, 1e-4, True, False), (0.1, 0.06, True, True)])
+def test_a_small_or_uncertain_equilibrium_modulus_may_be_that_of_a_fluid(rest, error, compared, told):
+    values, root = np.array([900.0, 1 - rest, 2.0]), np.diag([0.0, error, 0.0])
+    errors = np.diag(root)
+    found = Estimate(("G0", "g", "tau"), values, root, errors, np.eye(3), 9.0, 10, 1.0, 7.0, 5, True)
+    assert uncertainty.may_be_fluid(found) == compared
+    assert bool(uncertainty.like_a_fluid(found, "measure longer")) == told
+    assert not uncertainty.may_be_fluid(found._replace(values=np.array([900.0, 0.6, 2.0])))
 
 
 def test_a_cyclic_strain_that_scatters_is_not_taken_for_wrong_signs(tmp_path):

@@ -149,8 +149,7 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
     numbers = range(1, top + 1) if modes == "auto" else range(int(modes), int(modes) + 1)
     tried = _raised(test, rows, numbers, Kind())
     solid = min(tried, key=criterion)
-    stays = solid.model.shear_modulus * (1 - solid.model.ratios.sum())
-    if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # then the material may be a fluid
+    if uncertainty.may_be_fluid(solid.uncertainty):
         begin = max(numbers.start, solid.modes - 1)
         tried += _raised(test, rows, range(begin, numbers.stop), FLUID)
     return _told(_chosen_model(tried, test), test, tried)

@@ -156,8 +156,7 @@ def fit(
     numbers = range(1, top + 1) if modes == "auto" else range(int(modes), int(modes) + 1)
     tried = _raised_together(tests, band, numbers, Kind(), progress)
     solid = min(tried, key=criterion_of_all)
-    stays = solid.model.shear_modulus * (1 - solid.model.ratios.sum())
-    if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # the tests may be of a fluid
+    if uncertainty.may_be_fluid(solid.uncertainty):
         tried += _raised_together(
             tests, band, range(max(numbers.start, solid.modes - 1), numbers.stop), FLUID, progress
         )
@@ -323,6 +322,8 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     out += missed(chosen.shares)
     out += structured(chosen)
     out += uncertainty.superfluous(band, chosen.uncertainty)
+    if chosen.kind.name == "prony":
+        out += uncertainty.like_a_fluid(chosen.uncertainty, "measure longer, or at lower frequencies")
     low, high = band.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):
         if not low <= tau <= high:

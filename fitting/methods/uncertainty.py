@@ -69,6 +69,30 @@ def equilibrium_error(u: Estimate) -> float:
     return float(np.linalg.norm(slope @ u.root)) if rest > NO_REST else np.inf
 
 
+#: A solid whose equilibrium modulus is below this part of G0 is compared with a fluid.
+_SOFT = 0.01
+
+
+def may_be_fluid(u: Estimate) -> bool:
+    """Whether the equilibrium modulus is so small, or so uncertain, that a fluid may explain the data as well."""
+    return not _equilibrium(u) > max(2 * equilibrium_error(u), _SOFT * u.values[0])
+
+
+def like_a_fluid(u: Estimate, remedy: str) -> list[str]:
+    """A sentence, with a remedy, if the equilibrium modulus of a solid is below twice its standard error."""
+    stays = _equilibrium(u)
+    if stays > 2 * equilibrium_error(u):
+        return []
+    return [
+        f"the ratios add up to {1 - stays / u.values[0]:.4g}: the equilibrium modulus {stays:.3g} Pa cannot be "
+        f"distinguished from zero (a fluid); {remedy}"
+    ]
+
+
+def _equilibrium(u: Estimate) -> float:
+    return float(u.values[0] * (1 - u.values[1 : 1 + (len(u.values) - 1) // 2].sum()))
+
+
 def equilibrium_change(values: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Change [Pa] of G0 (1 - sum g), to first order, for changes `moved` (1 + 2N, ...) of G0, ratios and times."""
     ratios = slice(1, 1 + (len(values) - 1) // 2)
@@ -204,6 +228,9 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
     return out
 
 
+#: Remedy if a sweep does not show the equilibrium modulus.
+LOWER = "measure at lower frequencies"
+
 #: Points with a scatter below this were computed, not measured.
 _SMALL = 1e-4
 
@@ -222,13 +249,8 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
                 f"frequencies resolve: it is extrapolated (standard error {_percent(tau_err[k], tau[k])}); measure at "
                 f"{'higher' if tau[k] < low else 'lower'} frequencies to determine it"
             )
-    ratios = u.values[1 : modes + 1].sum()
-    equilibrium = u.values[0] * (1 - ratios)
-    if model == "prony" and not equilibrium > 2 * equilibrium_error(u):
-        out.append(
-            f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be distinguished "
-            "from zero (a fluid); measure at lower frequencies"
-        )
+    if model == "prony":
+        out += like_a_fluid(u, LOWER)
     if sweep.storage_sd is not None and not (sweep.noise_given or sweep.sd_estimated or sweep.sd_before):
         out.append(
             f"the deviations in the file ({100 * sweep.relative_deviation:.2g} %) are no noise: the points scatter by "

@@ -219,7 +219,7 @@ def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) ->
         tried.append(spectrum_fit(sweep))
     if model == "auto" and prony is not None:
         tried.append(prony)
-        if any("(a fluid)" in w for w in prony.warnings):
+        if uncertainty.may_be_fluid(prony.uncertainty):
             tried.append(fluid(sweep, dense))
     return tried
 

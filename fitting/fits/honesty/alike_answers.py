@@ -56,7 +56,8 @@ def with_own_noise(fit: TimeFit) -> TimeFit:
     modes = _at_least(fit.uncertainty, host.with_jacobian(_modes_of(fit), u)[1] @ root)
     if own is not None and fit.kind.values is not None:
         own = _at_least(own, host.with_jacobian(fit.kind.values, u)[1] @ root)
-    return fit._replace(uncertainty=modes, parameters=own)
+    fluid = uncertainty.like_a_fluid(modes, "measure longer") if fit.kind.name == "prony" else []
+    return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, *fluid))
 
 
 def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:

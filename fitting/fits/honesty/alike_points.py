@@ -38,8 +38,10 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
         f"{SHARED}, or the model misses something: {2 * len(fit.storage)} moduli measure as much as "
         f"{alike.independent:.0f} of independent noise; the standard errors are those of such noise"
     )
+    fluid = uncertainty.like_a_fluid(modes, uncertainty.LOWER) if fit.kind.name == "prony" else []
+    fluid = [] if any("(a fluid)" in w for w in fit.warnings) else fluid  # told before, with smaller errors
     details = fit.details | {INDEPENDENT: float(alike.independent)}
-    return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, told), details=details)
+    return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, *fluid, told), details=details)
 
 
 def alike_of(fit: Fit) -> Alike | None:
