@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import scipy.sparse
 
 import liverjax as lj
 from liverjax.solvers.factors import dissection, multifrontal
+from liverjax.solvers.factors.memory import free_memory
 from liverjax.waves import sparse
 
 pytestmark = pytest.mark.quick_to_compile
@@ -158,6 +160,42 @@ def test_other_ways_where_the_first_fails(monkeypatch):
     for other in (single, pivoted):
         assert np.linalg.norm(other - double) < 1e-11 * np.linalg.norm(double)
         assert not np.array_equal(other, double)
+
+
+def test_a_factor_that_does_not_fit_in_memory_is_told(monkeypatch):
+    """The system ended the process without a word."""
+    monkeypatch.setattr(sparse, "KEPT", 0.0)
+    whole = lj.harmonic(scene(), [40.0]).displacement
+    monkeypatch.setattr(multifrontal, "SINGLE_FROM", 0)
+    plan = next(iter(sparse._orders.values())).plan
+    plain, small = (multifrontal.needed_bytes(plan, np.dtype(complex), True, own) for own in (False, True))
+    assert small < plain
+    monkeypatch.setattr(sparse, "free_memory", lambda: 0.5 * (small + plain))
+    rounded = lj.harmonic(scene(), [40.0]).displacement
+    assert 0 < np.linalg.norm(rounded - whole) < 1e-11 * np.linalg.norm(whole)
+    monkeypatch.setattr(sparse, "free_memory", lambda: small)
+    with pytest.warns(
+        UserWarning, match="equations of harmonic motion need at least .* GB of memory, and .* free: use"
+    ):
+        lost = lj.harmonic(scene(), [40.0])
+    assert np.all(np.isnan(lost.residual))
+    with pytest.raises(RuntimeError, match="40 Hz"):
+        lost.check()
+
+
+def test_memory_of_an_elimination_is_foretold(monkeypatch):
+    monkeypatch.setattr(multifrontal, "_cores", lambda: 1)
+    A, plan = system(complex)
+    tracemalloc.start()
+    multifrontal.factorised(A, plan, False)
+    used = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # More is used: the matrix itself, and upper triangles that are never touched.
+    assert 0.5 * used < multifrontal.needed_bytes(plan, A.dtype, False, False) < used
+
+
+def test_free_memory_is_below_that_of_the_machine():
+    assert 1e8 < free_memory() <= 1.01 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ whole matrix, is used if that fails.
 """
 
 import hashlib
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,6 +18,7 @@ from liverjax.solvers.blas import one_blas_thread
 from liverjax.solvers.direct import across
 from liverjax.solvers.factors import multifrontal
 from liverjax.solvers.factors.dissection import dissected
+from liverjax.solvers.factors.memory import free_memory
 from liverjax.waves.operator import Motion, Operator, forces_of_motion, free_part
 
 if TYPE_CHECKING:
@@ -228,8 +230,11 @@ def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept:
     for single in (True, False):
         if single and K.shape[0] < multifrontal.SINGLE_FROM:
             continue
+        small = _has_to_be_small(K, plan, single, kept[1])
+        if small is None:
+            return np.full(len(b), np.nan)
         try:
-            factor = multifrontal.factorised(K, plan, single, kept[1])
+            factor = multifrontal.factorised(K, plan, single, small)
         except np.linalg.LinAlgError:
             break
         x, error = multifrontal.refined_solution(factor, b)
@@ -237,6 +242,22 @@ def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept:
             _keep(kept[0], factor)
             return x
     return _pivoted(K, b)
+
+
+def _has_to_be_small(K: Any, plan: list[multifrontal.Front], single: bool, small: bool) -> bool | None:
+    """Whether the factor has to be kept as 16-bit integers, because `small` asks for it or for lack of memory. None,
+    with a warning, if even this does not fit: without it, the system would end the process without a word."""
+    free, needed = free_memory(), np.inf
+    for own in (small, single):  # in double precision there are no such integers
+        needed = multifrontal.needed_bytes(plan, K.dtype, single, single and own)
+        if needed < free:
+            return own
+    warnings.warn(
+        f"{K.shape[0]} equations of harmonic motion need at least {needed / 1e9:.3g} GB of memory, and "
+        f"{free / 1e9:.3g} GB are free: use a coarser mesh, order = 1, or a machine with more memory",
+        stacklevel=2,
+    )
+    return None
 
 
 def _keep(key: bytes, factor: multifrontal.Factor) -> None:

@@ -116,6 +116,21 @@ def single_bytes(plan: list[Front], kind: np.dtype) -> float:
     return float(np.sum(own * (0.5 * (own + together) + border))) * (8 if kind.kind == "c" else 4)
 
 
+def needed_bytes(plan: list[Front], kind: np.dtype, single: bool, small: bool) -> float:
+    """Memory [bytes] that an elimination in the order of the plan needs: the factor, the matrix of one group, and the
+    lower triangles that groups have left to their parents. Groups in parallel need more.
+    """
+    each = (8 if kind.kind == "c" else 4) * (1 if single else 2)
+    of_factor, waiting, most = 0.0, 0.0, 0.0
+    lower = [each * len(border) ** 2 / 2 for _, border, _ in plan]
+    for k, (own, border, children) in enumerate(plan):
+        n, m = float(len(own)), len(border)
+        most = max(most, of_factor + waiting + lower[k] + each * n * (n + 2 * m))
+        of_factor += each * n * (0.5 * (n + min(n, PIVOTS)) + m) * (0.5 if small else 1.0)
+        waiting += lower[k] - sum(lower[c] for c in children)
+    return most
+
+
 def factorised(A: "scipy.sparse.csr_array", plan: list[Front], single: bool, small: bool = False) -> Factor:
     """The factor of A, from the elimination of one group after the other.
 

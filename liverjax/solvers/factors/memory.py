@@ -1,0 +1,23 @@
+"""Memory of the machine that a factorisation may use."""
+
+import os
+from pathlib import Path
+
+#: Files of Linux: the memory that is free or can be freed, and the limit of a container [bytes].
+_FREE, _LIMIT = Path("/proc/meminfo"), Path("/sys/fs/cgroup/memory.max")
+
+
+def free_memory() -> float:
+    """Memory [bytes] that this process can still get; infinite where the system does not tell it."""
+    try:
+        lines = dict(line.split(":") for line in _FREE.read_text().splitlines())
+        free = 1024 * float(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        try:
+            free = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        except (AttributeError, OSError, ValueError):  # Windows has no sysconf
+            return float("inf")
+    try:
+        return min(free, float(_LIMIT.read_text()))
+    except (OSError, ValueError):  # no container, or no limit ("max")
+        return free
