@@ -3,6 +3,7 @@
 import json
 
 import h5py
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core import status
 from liverjax.core.struct import replace
+from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.simulation.cautions import cautions_of_run, mesh_sentence
 from liverjax.simulation.mesh_error import MeshError
@@ -40,13 +42,16 @@ def test_a_sound_run_has_none():
     assert cautions_of_run(scene(one), run(one, gradients[:1], [1.0])) == []
 
 
-@pytest.mark.parametrize("dt, grows", [(0.01, True), (0.002, False)])
-def test_motion_that_grows_by_long_steps_of_newmark_is_told(dt, grows):
+@pytest.mark.parametrize(("dt", "grows", "plane"), [(0.01, True, False), (0.01, True, True), (0.002, False, False)])
+def test_motion_that_grows_by_long_steps_of_newmark_is_told(dt, grows, plane):
     """A block of period 12 ms under constant gravity: its energy is known, and a step of 10 ms multiplies it."""
     mesh = lj.shapes.box((0.002, 0.002, 0.006), (1, 1, 3))
     body = lj.Body(density=1060.0, gravity=np.array([0.0, 0.0, 40.0]))
     solve = lj.Solve(kind="dynamic", integrator="newmark", dt=dt, steps=85)
     own = replace(scene(mesh), body=body, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),), solve=solve)
+    if plane:  # far below
+        below = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])
+        own = replace(own, physics=(Obstacle(triangles=jnp.asarray(below), position=jnp.array([0.0, 0.0, -1.0])),))
     result = lj.simulate(own)
     assert not np.any(result.status)
     said = [sentence for sentence in cautions_of_run(own, result) if "more energy than its loads" in sentence]

@@ -112,6 +112,7 @@ class Step(NamedTuple):
     inertia: bool  # whether there is inertia: then loads act at once
     tolerance: Any  # of the residual, without derivative
     free: Free
+    averaged: bool = False  # whether forces at the beginning and at the end of a step count half each: Newmark's method
 
 
 class End(NamedTuple):
@@ -120,6 +121,7 @@ class End(NamedTuple):
     x: jax.Array  # (V, 3) [m]
     F: Matrix  # deformation gradients (E,), or (Q, E) if elements have Q points
     pressure: Any  # (V,) [Pa] of the nodes, or None
+    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] minus the acceleration by `NodalForce.at_end`
 
 
 class Solid:
@@ -183,6 +185,9 @@ class NodalForce:
     conservative: bool = True
     #: Whether the derivative of the force jumps, for example where contact begins.
     kinked: ClassVar[bool] = False
+    #: Whether Newmark's method takes only the force at the end of the step. The force is then doubled, since the mean
+    #: of the other forces is half of the sum at both ends.
+    at_end: bool = False
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Gradient of the energy (V, 3) [N] at positions x (V, 3) [m], at fraction s of the step."""
@@ -224,6 +229,14 @@ class NodalForce:
     def predicted(self) -> jax.Array | None:
         """Positions (V, 3) [m] that the body would reach without forces, as a guess for Newton; None: no such guess."""
         return None
+
+    def accelerations(self, force: jax.Array) -> jax.Array | None:
+        """Accelerations (V, 3) [m/s^2] of free nodes by a force (V, 3) [N]; None: the part has no mass."""
+        return None
+
+    def inertial(self, acceleration: jax.Array) -> jax.Array:
+        """Forces (V, 3) [N] of inertia, for a part with mass."""
+        raise TypeError(f"{type(self).__name__} lacks inertial(acceleration)")
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
         """Change (V, 3) [N] of a force that is not conservative, for a motion dx (V, 3) [m]."""

@@ -1,4 +1,10 @@
-"""Inertia of lumped or consistent masses, with implicit Euler or Newmark's average acceleration."""
+"""Inertia of lumped or consistent masses, with implicit Euler or Newmark's average acceleration.
+
+Newmark's method takes the mean of the forces at both ends of a step. Of the forces of an obstacle whose place is
+given, it takes only those at the end (Kane et al. 1999, Comput. Methods Appl. Mech. Eng. 180, 1). Then a still obstacle
+never gives energy to the body; with the mean it does, where contact begins or ends within a step. The acceleration in
+the memory is that of all other forces.
+"""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -60,6 +66,7 @@ class Inertia(Physics):
         for nodes in step.free.tied:
             mask, axes = nodes.not_given(mask, axes)
         own = {"x": step.x, "motion": memory, "dt": step.dt, "mask": mask, "integrator": self.integrator}
+        own["free"] = step.free if step.averaged else None
         return Moving(mass=mass, shared=shared, axes=axes, **own)
 
     def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
@@ -75,6 +82,8 @@ class Inertia(Physics):
     def advance(self, memory: Motion, acting: "Moving", end: End) -> Motion:
         """Velocity and acceleration at the end of the step."""
         velocity, acceleration = acting.kinematics(end.x)
+        if end.by_end_forces is not None:
+            acceleration = acceleration + end.by_end_forces
         return Motion(velocity, None if memory.acceleration is None else acceleration)
 
 
@@ -108,6 +117,8 @@ class Moving(NodalForce):
     shared: Masses | None = param("kg", "other part of the consistent mass; None: lumped", default=None)
     axes: jax.Array | None = param("1", "(V, 3) axis of a lifting plate with a given angle, 0 elsewhere", default=None)
 
+    free: Free | None = param("1", "free directions; None if no force acts at the end only", default=None)
+
     everywhere: ClassVar[bool] = True
 
     def kinematics(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -134,6 +145,15 @@ class Moving(NodalForce):
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Mass times acceleration."""
         return _inertia(self.mass, self.shared, self.kinematics(x)[1])
+
+    def accelerations(self, force: jax.Array) -> jax.Array | None:
+        """Solution a (V, 3) of m a = f in free directions."""
+        assert self.free is not None
+        return _accelerations(self.mass, self.shared, self.free, self.free.vectors(force))
+
+    def inertial(self, acceleration: jax.Array) -> jax.Array:
+        """Mass times acceleration."""
+        return _inertia(self.mass, self.shared, acceleration)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
         """m a . a dt^2/(2k); the force is its gradient."""

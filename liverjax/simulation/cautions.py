@@ -13,12 +13,15 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.locate import doubled_vertices
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.attached.membrane import Membrane
 from liverjax.physics.base import Physics
 from liverjax.physics.contact.friction import RoughObstacle
 from liverjax.physics.contact.obstacle import Obstacle, missed_depth
 from liverjax.physics.contact.passage import passed_in_step
 from liverjax.physics.contact.pressed import PressedObstacle
+from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.loads import follows, nodal_tractions
+from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes import regions
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.checks.rigid_motion import loose_piece
@@ -182,7 +185,8 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
         return []
     driven = any(np.any(np.asarray(d.by)) for d in scene.displaced) or histories(scene) or follows(scene.traction)
     inlets = scene.porosity is not None and (scene.porosity.inlet or scene.porosity.initial_pressure is not None)
-    if driven or inlets or named_physics(scene) or np.ndim(body.density) or solve.dt is None:
+    driven = driven or not all(_gives_no_energy(physics) for _, physics in named_physics(scene))
+    if driven or inlets or np.ndim(body.density) or solve.dt is None:
         return []
     mass = float(body.density) * np.asarray(nodal_volumes(scene.mesh))[:, None]
     force = mass * np.asarray(body.gravity) + np.asarray(nodal_tractions(scene.mesh, scene.traction))
@@ -198,6 +202,13 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
         "it: Newmark's method lets large motion grow if a step is as long as a period. Take a step of a twentieth of "
         "the period, or integrator = 'euler'"
     ]
+
+
+def _gives_no_energy(physics: Physics) -> bool:
+    """Whether a physics without a history begins without stored energy, and nothing else gives it any."""
+    if isinstance(physics, Obstacle):
+        return not isinstance(physics, PressedObstacle) and physics.by is None
+    return isinstance(physics, SlidingSupport | ElasticSupport | Membrane)
 
 
 def _of_histories(scene: Scene, result: Result) -> list[str]:

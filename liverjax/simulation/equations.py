@@ -112,7 +112,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
         # At rest in the reference positions only nodal forces act.
         begin = _first_step(scene, x, free)
         acting = [p.freeze(None, begin) for p in physics if p.acts_without_memory()]
-        forces = [a.force(scene.mesh, x, 0.0) for a in acting if isinstance(a, NodalForce)]
+        forces = [a.force(scene.mesh, x, 0.0) for a in acting if isinstance(a, NodalForce) and not a.at_end]
         return sum(forces, jnp.zeros_like(x))
 
     begin = Start(scene.mesh, x, free, force, moved=start is not None and scene.solve.kind == "dynamic")
@@ -120,7 +120,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
 
 
 def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] of all physics except inertia at positions x (V, 3).
+    """Forces (V, 3) [N] of all physics at positions x (V, 3), except inertia and forces at the end only.
 
     The memories are those of the reference shape.
     """
@@ -129,11 +129,15 @@ def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
     at_rest = initial_state(still)._replace(x=x)
     e = _of_physics(scene, physics_of(still), at_rest, jnp.ones((), x.dtype), Sizes(none, none))
     q = unknowns(e, x)
-    return forces(e, q if e.mixed is None else settled(e, q, none), none).total
+    f = forces(e, q if e.mixed is None else settled(e, q, none), none)
+    return f.total - sum(_at_end(e, x), jnp.zeros_like(x))
 
 
 def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
-    return Step(scene.mesh, x, 1, scene.solve.steps, scene.solve.dt, scene.solve.kind == "dynamic", None, free)
+    moving = scene.solve.kind == "dynamic"
+    # Nodes that move together accelerate together: for them the mean of the forces is taken.
+    averaged = moving and scene.solve.integrator == "newmark" and not any(p.ties for p in scene.physics)
+    return Step(scene.mesh, x, 1, scene.solve.steps, scene.solve.dt, moving, None, free, averaged)
 
 
 def force_sizes(scene: Scene) -> Sizes:
@@ -331,10 +335,31 @@ def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
     return sum((a.energy_from(e.mesh, x, begin) for a in e.nodal), total)
 
 
-def advanced(e: Equations, end: End) -> State:
-    """The state after an accepted step."""
+def advanced(e: Equations, end: End, by_end_forces: jax.Array | None = None) -> State:
+    """The state after an accepted step. `by_end_forces` is the second result of `reported_forces`."""
+    end = end._replace(by_end_forces=by_end_forces)
     each = zip(e.physics, e.state.memories, e.acting, strict=True)
     return State(end.x, tuple(p.advance(memory, acting, end) for p, memory, acting in each))
+
+
+def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+    """The sum of all forces (V, 3) [N] without the doubled part of forces at the end (`NodalForce.at_end`), and minus
+    the accelerations (V, 3) [m/s^2] by these forces, or None if there are none.
+
+    Args:
+        total: sum of all forces at positions x (V, 3), as in the step's equations.
+    """
+    doubled = _at_end(e, x)
+    if not doubled:
+        return total, None
+    force = sum(doubled[1:], doubled[0])
+    (mass, a) = next((part, a) for part in e.nodal if (a := part.accelerations(force)) is not None)
+    return total - 0.5 * (force - mass.inertial(a)), a
+
+
+def _at_end(e: Equations, x: jax.Array) -> list[jax.Array]:
+    """Forces (V, 3) [N] that act at the end of a step only, doubled."""
+    return [a.force(e.mesh, x, 1.0) for a in e.nodal if a.at_end]
 
 
 def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:

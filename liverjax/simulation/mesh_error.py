@@ -52,6 +52,7 @@ from liverjax.simulation.equations import (
     forces,
     initial_state,
     positions,
+    reported_forces,
     residual,
     unknowns,
 )
@@ -235,7 +236,7 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
         begin = q + unknowns(e, state.x) - unknowns(e, rich.padded(before))
     near, (dq, iterations, positive) = _found_near(scene, e, begin)
     f, along = jax.linearize(lambda q: forces(e, q, one), near)
-    whole = f.total + along(dq).total
+    whole, _ = reported_forces(e, f.total + along(dq).total, positions(e, near + dq, one))
     reaction = whole - e.free.vectors(whole)
     dq = near + dq - q
     # If du inverts elements, the richer run goes on from the positions of the run.
@@ -248,7 +249,8 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
         # The old nodes are vertices of the refined mesh.
         "pressure": None if pressure is None else end.pressure[: len(x)] - pressure,
     }
-    return advanced(e, End(end.x, end.F, end.pressure)), (change, found)
+    by_end_forces = reported_forces(e, end.total, end.x)[1]
+    return advanced(e, End(end.x, end.F, end.pressure), by_end_forces), (change, found)
 
 
 #: The change dq, the number of iterations, and whether the matrix was positive.

@@ -24,6 +24,7 @@ from liverjax.simulation.equations import (
     flowing_pressure,
     forces,
     positions,
+    reported_forces,
     residual,
     settled,
     unknowns,
@@ -141,11 +142,12 @@ def step(
     known = None if kept.beside is None or problem.adjoint is not None else Guess(kept.beside, 1.0)
     f = forces(e, q, jnp.ones((), x.dtype), known, None if problem.adjoint is None else kept.beside)
     projected = e.free.normals is not None or e.free.tied
-    reactions = f.total - e.free.vectors(f.total, f.x) if projected else (1 - e.free.mask) * f.total
+    total, by_end_forces = reported_forces(e, f.total, f.x)
+    reactions = total - e.free.vectors(total, f.x) if projected else (1 - e.free.mask) * total
     found = (statistics.status == status.CONVERGED) | (statistics.status == status.ONE_STEP)
     inverted = found & jnp.any(volume_ratios(e.mesh, f.x) <= 0)
     statistics = statistics._replace(status=jnp.where(inverted, status.INVERTED, statistics.status))
-    return advanced(e, End(f.x, f.F, f.pressure)), reactions, statistics, kept
+    return advanced(e, End(f.x, f.F, f.pressure), by_end_forces), reactions, statistics, kept
 
 
 def adjoint(

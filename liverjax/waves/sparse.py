@@ -244,7 +244,9 @@ def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept:
     return _pivoted(K, b)
 
 
-def _has_to_be_small(K: Any, plan: list[multifrontal.Front], single: bool, small: bool) -> bool | None:
+def _has_to_be_small(
+    K: "scipy.sparse.csr_array", plan: list[multifrontal.Front], single: bool, small: bool
+) -> bool | None:
     """Whether the factor has to be kept as 16-bit integers, because `small` asks for it or for lack of memory. None,
     with a warning, if even this does not fit: without it, the system would end the process without a word."""
     free, needed = free_memory(), np.inf

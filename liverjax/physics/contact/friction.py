@@ -62,13 +62,15 @@ class RoughObstacle(Obstacle):
 
     def freeze(self, memory: Any, step: Step) -> "Rubbing":
         """Store the slip at the step's beginning, and the positions of the contact points relative to the obstacle."""
-        moved = super().freeze(memory, step).moved
+        plain = super().freeze(memory, step)
+        moved = plain.moved
         # In a static run the first positions are only a guess: the surface starts from the reference shape.
         x = step.x if step.inertia else jnp.where(step.k == 1, step.mesh.points, step.x)
         past = contact_points(self, step.mesh, x) - moved[0][:, None, None]
         slip = jnp.zeros_like(past) if memory is None else memory
         return Rubbing(
-            obstacle=self,
+            obstacle=plain.obstacle,
+            at_end=plain.at_end,
             moved=moved,
             slip=slip,
             past=past,

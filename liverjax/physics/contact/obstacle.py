@@ -175,7 +175,9 @@ class Obstacle(Physics):
         """The obstacle, with its displacements at the beginning and at the end of the step."""
         dt = 0.0 if step.dt is None else step.dt
         moved = jnp.stack([self.displacement(n, step.steps, dt) for n in (step.k - 1, step.k)])
-        return Touching(obstacle=self, moved=moved.astype(step.x.dtype))
+        # Newmark's method takes the force at the end only, doubled (`liverjax.physics.inertia`).
+        own = replace(self, stiffness=2 * jnp.asarray(self.stiffness)) if step.averaged else self
+        return Touching(obstacle=own, moved=moved.astype(step.x.dtype), at_end=step.averaged)
 
 
 @struct
@@ -184,6 +186,8 @@ class Touching(NodalForce):
 
     obstacle: Obstacle = param("1", "shape and stiffness")
     moved: jax.Array = param("m", "its displacement at the beginning and at the end (2, 3)")
+
+    at_end: bool = static(default=False)  # type: ignore[misc]
 
     kinked: ClassVar[bool] = True
 

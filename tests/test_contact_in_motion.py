@@ -1,0 +1,85 @@
+"""Contact in motion by Newmark's method: the force of a given obstacle acts at the end of each step, and gives no
+energy."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.mesh.nodal import nodal_volumes
+from liverjax.physics.contact.friction import RoughObstacle
+from liverjax.physics.contact.obstacle import Obstacle
+
+pytestmark = pytest.mark.quick_to_compile
+
+SIDE, DENSITY = 0.02, 1060.0
+
+
+def block(cells: int, order: int = 1) -> lj.Scene:
+    mesh = lj.shapes.box((SIDE,) * 3, (cells,) * 3)
+    return lj.Scene(
+        mesh=mesh if order == 1 else lj.quadratic(mesh),
+        law=lj.laws.NeoHookean(mu=800.0, bulk=3000.0),
+        body=lj.Body(density=DENSITY),
+        solve=lj.Solve(kind="dynamic", integrator="newmark", tolerance=1e-10),
+    )
+
+
+def plane(scene: lj.Scene, **given) -> Obstacle:
+    """Above the block."""
+    kind = RoughObstacle if "friction" in given else Obstacle
+    top = jnp.asarray(lj.boundary.boundary_triangles(scene.mesh, scene.mesh.node_sets["z_max"]))
+    return kind(triangles=top, axis=jnp.array([0.0, 0.0, -1.0]), **given)
+
+
+def test_a_still_obstacle_gives_no_energy():
+    """A plane presses the block for 0.1 s and stops. The mean of the contact forces of both ends gave the block 600
+    times its energy, with every step converged."""
+    scene = block(2)
+    times, ways = jnp.array([0.0, 0.1]), jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.0015]])
+    above = plane(scene, position=jnp.array([0.0, 0.0, SIDE + 1e-4]), times=times, history=ways)
+    # The nodes of one edge are held and touch the plane.
+    held = tuple(lj.Fixed(nodes=scene.mesh.node_sets[side]) for side in ("z_min", "x_min"))
+    scene = replace(scene, fixed=held, physics=(above,), solve=replace(scene.solve, dt=0.002, steps=200))
+    result = lj.simulate(scene).check()
+    x = np.asarray(result.positions)
+    mass = DENSITY * np.asarray(nodal_volumes(scene.mesh))[:, None]
+    energy = 0.5 * np.sum(mass * (np.diff(x, axis=0) / 0.002) ** 2, axis=(1, 2))
+    assert energy[150:].max() < 1.5 * energy[50:100].max()
+    # The held faces carry what the plane presses, but for the inertia of the motion that is left.
+    force = np.asarray(lj.obstacle_forces(scene, result).force)[0, 100:, 2].mean()
+    assert np.isclose(np.asarray(result.reactions)[100:, :, 2].sum(axis=1).mean(), force, rtol=0.02)
+
+
+@pytest.mark.parametrize(("order", "mass"), [(1, "lumped"), (2, "consistent")])
+def test_the_change_of_momentum_is_the_force_at_the_end(order, mass):
+    """Of a block that flies against a plane that rubs: m (v1 - v0) = dt (weight + contact at the end), in each step."""
+    scene, up = block(1, order), jnp.array([2.0, 0.0, 9.81])
+    ceiling = plane(scene, friction=0.3, position=jnp.array([0.0, 0.0, SIDE + 1e-3]))
+    scene = replace(
+        scene,
+        body=replace(scene.body, gravity=up, mass=mass),
+        physics=(ceiling,),
+        solve=replace(scene.solve, dt=0.002, steps=20),
+    )
+    result = lj.simulate(scene).check()
+    weights = np.asarray(nodal_volumes(scene.mesh)) if mass == "lumped" else _consistent_weights(scene.mesh)
+    x = np.concatenate([np.asarray(scene.mesh.points)[None], np.asarray(result.positions)])
+    centre = DENSITY * np.einsum("v,tvi->ti", weights, x)
+    momentum = [np.zeros(3)]
+    for way in np.diff(centre, axis=0):  # v0 + v1 is twice the way over dt
+        momentum.append(2 * way / 0.002 - momentum[-1])
+    force = np.diff(momentum, axis=0) / 0.002 - DENSITY * SIDE**3 * np.asarray(up)
+    contact = np.asarray(lj.obstacle_forces(scene, result).force)[0]
+    size = np.abs(contact).max()
+    assert contact[0, 2] == 0 and contact[:, 2].max() > 0.1 and np.abs(contact[:, 0]).max() > 0.01
+    assert np.allclose(force, -contact, atol=1e-6 * size)
+
+
+def _consistent_weights(mesh: lj.TetMesh) -> np.ndarray:
+    """Integrals (V,) of the shape functions of quadratic elements: -1/20 and 1/5 of the volume."""
+    weights = np.zeros(mesh.number_of_nodes)
+    for k, nodes in enumerate(mesh.element_nodes_on_host):
+        np.add.at(weights, nodes, np.asarray(mesh.volumes) * (-0.05 if k < 4 else 0.2))
+    return weights
