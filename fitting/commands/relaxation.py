@@ -40,7 +40,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--ramp",
         type=float,
         metavar="S",
-        help="duration of the ramp [s] if no column shows it; 0 with two columns: a step at 0 s, before the first row",
+        help="duration of the ramp [s] if no row shows it, until the first row under load; 0: a step",
     )
     command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out earlier answers")
     command.add_argument("--radius", type=float, metavar="M", help="radius of the sample [m], for torque and force")
@@ -80,6 +80,8 @@ def _said_of_rows(test: "TimeTest") -> list[str]:
     if number < every:
         told.append(f"{number} of {every} answers are fitted, spread over the log of the time since each load")
     first, last = test.resolved
+    if test.answers_at_once:
+        return told
     told.append(
         f"the answers begin {first:.3g} s after the load, and end at {last:.3g} s: G0 does not contain what relaxed "
         "before"

@@ -195,6 +195,11 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
     return TimeFit(kind, model, found, spread, bool(found.converged), *at, (), running, 0.0, {})
 
 
+def refitted(fit: TimeFit, test: TimeTest) -> TimeFit:
+    """Prony modes of the same kind and number as in the fit, fitted to another form of its test."""
+    return _one_model(test, thinned(test), fit.modes, fit.kind)
+
+
 def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
     """A function and its data. The function computes the residuals (m,) from the variables u of the fit and these data.
 

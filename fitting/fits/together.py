@@ -322,6 +322,7 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     out += missed(chosen.shares)
     out += structured(chosen)
     out += uncertainty.superfluous(band, chosen.uncertainty)
+    out += _of_rises(chosen)
     if chosen.kind.name == "prony":
         out += uncertainty.like_a_fluid(chosen.uncertainty, "measure longer, or at lower frequencies")
     low, high = band.resolved
@@ -334,6 +335,26 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
         run_time=sum(f.run_time for f in tried) + time.perf_counter() - begin,
         compile_time=sum(f.compile_time for f in tried),
     )
+
+
+#: The rise of a load matters if the time between two rows is above this part of a relaxation time.
+_SHORT = 0.2
+
+
+def _of_rises(chosen: Together) -> list[str]:
+    """A sentence on each load that rises between two rows, if modes relax meanwhile."""
+    own = chosen.model.relaxation_times[np.asarray(chosen.model.ratios) > 0.01]
+    out = []
+    for test in chosen.tests:
+        row = test.rises_at if isinstance(test, TimeTest) else None
+        if row is None or not len(own) or test.time[row] - test.time[row - 1] < _SHORT * own.min():
+            continue
+        out.append(
+            f"no row of {test.source} shows how the load rose between {test.time[row - 1]:.4g} and "
+            f"{test.time[row]:.4g} s, and a straight rise is assumed: if it was a step, G0 and the short relaxation "
+            "times are wrong; give more rows of the rise"
+        )
+    return out
 
 
 def disagreements(shares: list[Share]) -> list[str]:

@@ -30,6 +30,7 @@ class TimeTest(NamedTuple):
     source: str = ""
     notes: tuple[str, ...] = ()
     constant_noise: bool = False  # whether the noise of all answers has the same size
+    rise_given: bool = False  # whether the user has said how the load rose between two rows
 
     @property
     def scales(self) -> np.ndarray:
@@ -66,11 +67,22 @@ class TimeTest(NamedTuple):
         return float(self.time[first])
 
     @property
+    def rises_at(self) -> int | None:
+        """Number of the first row under load, if the load is complete there: no row shows how it rose. Else None."""
+        return None if self.rise_given else _rises_at(self.driven)
+
+    @property
+    def answers_at_once(self) -> bool:
+        """Whether an answer at the moment of a step is used. It tells G0, but resolves no time."""
+        first, second = self.time[self.used][:2] - self.begun
+        return bool(first < AT_ONCE * second)
+
+    @property
     def resolved(self) -> tuple[float, float]:
         """Shortest and longest relaxation time [s] that the test resolves: the times of the first and the last used
         answer after the load began."""
         time = self.time[self.used] - self.begun
-        return float(time[0]), float(time[-1])
+        return float(time[int(self.answers_at_once)]), float(time[-1])
 
 
 class Sample(NamedTuple):
@@ -90,7 +102,7 @@ def read_time_test(
         kind: "relaxation" or "creep".
         sample: radius and height of a cylinder, for torque and force.
         ramp: for a column of modulus or compliance: duration [s] of the ramp of strain or stress; 0 (or None) for a
-            step. For two columns: None; or 0, if the load was a step at 0 s and the rows begin later.
+            step. For two columns: None; or the seconds of a rise that no row shows (see `from_rest`), 0 for a step.
         start: answers before this time [s] are not fitted.
 
     Raises:
@@ -119,14 +131,13 @@ def read_time_test(
                 "times count from its end"
             )
     else:
-        if ramp:
-            raise InputError(f"{path}: --ramp {ramp:g} is for a file without the {form[0]}; leave it out")
         strain, stress, told = _as_shear(str(path), form, columns, sample)
         notes += told
         notes += _of_the_other_kind(kind, time, strain, stress)
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
-        time, driven, answer, told = from_rest(time, driven, answer, at_once=ramp == 0)
-        return of_columns(kind, time, driven, answer, (str(path), [*notes, *told]), start)
+        time, driven, answer, told = from_rest(time, driven, answer, ramp, (str(path), "--ramp"))
+        test = of_columns(kind, time, driven, answer, (str(path), [*notes, *told]), start)
+        return test._replace(rise_given=ramp is not None)
     return _checked(TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes)), start)
 
 
@@ -165,25 +176,72 @@ BEGINS_LOADED = (
 
 
 def from_rest(
-    time: np.ndarray, driven: np.ndarray, answer: np.ndarray, at_once: bool
+    time: np.ndarray, driven: np.ndarray, answer: np.ndarray, ramp: float | None, names: tuple[str, str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """The rows (n,), with an added row at 0 s if they begin later; and notes.
+    """The rows (n,), with an added row at 0 s if they begin later, and an added row if `ramp` is given; and notes.
 
     Args:
         time, driven, answer: (n,), see `of_columns`.
-        at_once: whether the first load acted from 0 s on. Otherwise it rose from 0 s until the first row.
+        ramp: None: the load is straight between rows. If the rows begin under load, 0: it acted from 0 s on. If it is 0
+            in a row and complete in the next one, seconds of its rise until that row; 0 for a step.
+        names: name of the file, and name of `ramp`, for messages.
+
+    Raises:
+        InputError: the rows show how the load rose, or it rose in less time.
     """
+    size = np.abs(driven)
+    loaded, row = size[0] > AT_REST * np.max(size), _rises_at(driven)
+    at_once = ramp == 0 and (loaded or row is None)
+    if ramp and (row is None or not 0 < ramp <= time[row] - time[row - 1]):
+        shown = "the rows begin under load" if loaded else "the rows show how the load rose"
+        if row is not None:
+            shown = f"the load rose after {time[row - 1]:.4g} s, and is complete at {time[row]:.4g} s"
+        raise InputError(f"{names[0]}: {names[1]} {ramp:g} cannot be right, since {shown}: leave it out")
+    if ramp is not None and row is not None and not at_once:
+        time, driven, answer = _row_before_the_load(row, ramp, time, driven, answer)
     if not time[0] > 0:
-        loaded = abs(driven[0]) > AT_REST * np.max(np.abs(driven)) and not at_once
-        return time, driven, answer, [BEGINS_LOADED] if loaded else []
+        return time, driven, answer, [BEGINS_LOADED] if loaded and not at_once else []
     first, notes = driven[0] if at_once else 0.0, []
-    if not at_once and abs(driven[0]) > AT_REST * np.max(np.abs(driven)):
+    if not at_once and loaded:
         notes.append(
             f"the rows begin at {time[0]:.3g} s under load: a linear ramp from 0 s on is assumed. If it was a step at "
             "0 s, put a row with this load at 0 s, or (relaxation and creep alone) say --ramp 0 (in a description: "
             "ramp = 0)"
         )
     return np.append(0.0, time), np.append(first, driven), np.append(0.0, answer), notes
+
+
+#: A load is complete if its next change is below this part of its rise.
+_COMPLETE = 0.1
+#: A step takes this part of the time between two rows. Such a short time resolves no relaxation time.
+AT_ONCE = 1e-4
+
+
+def _rises_at(driven: np.ndarray) -> int | None:
+    """Number of the first row under load, if the row before it is at rest and the load is complete there."""
+    size = np.abs(driven)
+    first = int(np.argmax(size > AT_REST * np.max(size)))
+    if first == 0 or first + 1 == len(size):
+        return None
+    complete = abs(size[first + 1] - size[first]) < _COMPLETE * (size[first] - size[first - 1])
+    return first if complete else None
+
+
+def _row_before_the_load(row: int, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The columns with a row in which the sample is still at rest, `ramp` [s] before row `row`."""
+    before = time[row] - max(ramp, 0.1 * AT_ONCE * (time[row] - time[row - 1]))
+    if not before > time[row - 1]:
+        return time, *columns
+    return np.insert(time, row, before), *(np.insert(values, row, values[row - 1]) for values in columns)
+
+
+def with_a_step(test: TimeTest, ramp: float) -> TimeTest:
+    """The test whose load rises within `ramp` [s] until the row `TimeTest.rises_at`; 0: it is a step there."""
+    row = test.rises_at
+    assert row is not None
+    time, driven, answer = _row_before_the_load(row, ramp, test.time, test.driven, test.answer)
+    used = np.insert(test.used, row, False) if len(time) > len(test.time) else test.used
+    return test._replace(time=time, driven=driven, answer=answer, used=used)
 
 
 def kind_of(path: str | os.PathLike) -> str:
@@ -392,7 +450,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         raise InputError(
             f"{test.source}: most answers of the {test.kind} test have the wrong sign for its load; correct the signs"
         )
-    notes, before = (*test.notes, *told), int(np.sum(test.time <= test.begun))
-    if before > 2:
-        notes = (*notes, f"the load begins at {test.begun:.3g} s: {before} rows before it are not fitted")
+    notes = (*test.notes, *told)
+    if np.sum(test.time <= test.begun) > 2:
+        notes = (*notes, f"the load begins at {test.begun:.3g} s: the rows before it are not fitted")
     return test._replace(driven=driven, answer=answer, used=used, notes=notes)

@@ -106,7 +106,9 @@ def read_described(path: str | Path) -> TimeTest:
     if described.test in ("sphere", "cone"):
         section = curve(largest) / (largest / size)
     first, then = (d, force) if described.drive == "displacement" else (force, d)
-    time, first, then, told_of_start = from_rest(columns["time"], first, then, described.at_once)
+    time, first, then, told_of_start = from_rest(
+        columns["time"], first, then, 0.0 if described.at_once else None, (str(described.data), "ramp")
+    )
     d, force = (first, then) if described.drive == "displacement" else (then, first)
     if described.test in ("sphere", "cone"):
         kept, told_of_way = _while_contact_grows(time, sign * d)

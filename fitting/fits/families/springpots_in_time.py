@@ -18,6 +18,7 @@ from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.honesty import common_factor
 from fitting.fits.honesty.alike_answers import fitted_by_its_noise, with_own_noise
 from fitting.fits.honesty.long_times import with_interval
+from fitting.fits.honesty.rise_of_load import with_rise_of_load
 from fitting.fits.honesty.short_times import with_short_times
 from fitting.fits.time_tests import CONSTANT_NOISE, TimeFit
 from fitting.fits.together import Measured, Share, Together
@@ -195,6 +196,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
 
 def _with_ends_of_record(fit: TimeFit, test: TimeTest) -> TimeFit:
     fit = fit._replace(details=fit.details | {CONSTANT_NOISE: test.constant_noise})
+    fit = with_rise_of_load(fit, test)
     return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise]), test)
 
 

@@ -26,10 +26,11 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
     """The fit of Prony modes with the part that may be missing in G0, and a sentence, if this part exceeds `SHOWN`
     standard errors of G0.
 
-    Fits of other models, and fits of records shorter than a decade, are returned unchanged.
+    Fits of other models, of records shorter than a decade, and of records with an answer at the moment of the load are
+    returned unchanged.
     """
     first, last = test.resolved
-    if fit.parameters is not None or not fit.converged or last < HALF_DECADE**2 * first:
+    if fit.parameters is not None or not fit.converged or test.answers_at_once or last < HALF_DECADE**2 * first:
         return fit
     whole, error = float(fit.model.shear_modulus), float(fit.uncertainty.standard_errors[0])
     G = _relaxation_modulus(fit.model, first * HALF_DECADE ** np.arange(3))

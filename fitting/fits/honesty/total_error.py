@@ -8,6 +8,7 @@ import numpy as np
 
 from fitting.fits.honesty import edges
 from fitting.fits.honesty.long_times import INTERVAL, NORMAL
+from fitting.fits.honesty.rise_of_load import OF_A_STEP, share_of_rise
 from fitting.fits.honesty.short_times import MISSING
 from fitting.fits.simulated_rheometer import Simulation
 from fitting.fits.time_tests import TimeFit
@@ -35,6 +36,7 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter. The share `long_times`
     comes from the farther end of `long_times.equilibrium_interval`, as a standard deviation. The share `short_times` is
     the part of G0 that `short_times` finds to be missing.
+    The share `rise_of_load` is the change if the load was a step at the row that shows it first.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -62,6 +64,8 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
         half = max(value - interval["low"], interval["high"] - value) / NORMAL
         beyond = float(np.sqrt(max(0.0, half**2 - error**2)))
         out["long_times"] = dict.fromkeys(known, 0.0) | {"equilibrium_modulus": beyond}
+    if isinstance(fit, TimeFit) and OF_A_STEP in fit.details:
+        out["rise_of_load"] = share_of_rise(fit, list(known))
     if MISSING in fit.details and "shear_modulus" in known:
         out["short_times"] = dict.fromkeys(known, 0.0) | {"shear_modulus": fit.details[MISSING]}
     return out
