@@ -2,6 +2,7 @@
 
 import json
 from functools import partial
+from types import SimpleNamespace
 
 import h5py
 import jax
@@ -15,6 +16,7 @@ from fitting.fits import field, inclusion, scene_numbers
 from fitting.methods import prior
 from fitting.readers import displacements
 from fitting.reports import field_report
+from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile
@@ -290,9 +292,8 @@ def test_a_map_is_written_at_the_nodes_of_its_mesh(tmp_path, order):
     p, rng = prior.prior(mesh, 0.02), np.random.default_rng(0)
     m = prior.field_at_nodes(p, rng.normal(size=mesh.number_of_vertices))
     none, E = np.zeros_like(m), mesh.number_of_elements
-    found = field.Field(
-        "law.mu", m, np.ones(E), none + 0.1, none + 1, none, 0.1, 0.02, 1.0, 9, True, 0.0, [], np.ones(3), (0,), 1.0
-    )
+    nowhere, rest = np.zeros(E, bool), (0.1, 0.02, 1.0, 9, True, 0.0, [], np.ones(3), (0,), 1.0)
+    found = field.Field("law.mu", m, np.ones(E), none + 0.1, none + 1, none, *rest, nowhere)
     field_report.write(tmp_path, mesh, {}, found)
     with h5py.File(tmp_path / "field.h5") as f:
         factor = f["factor"][:]
@@ -301,6 +302,38 @@ def test_a_map_is_written_at_the_nodes_of_its_mesh(tmp_path, order):
     if order == 2:
         low, high = mesh.pattern.edges
         np.testing.assert_allclose(factor[len(m) :], np.sqrt(factor[low] * factor[high]), rtol=1e-12)
+    # Where a region of the scene sets the value, the map says nothing.
+    given = np.zeros(E, bool)
+    given[: E // 2] = True
+    field_report.write(tmp_path, mesh, {}, found._replace(given=given))
+    with h5py.File(tmp_path / "field.h5") as f:
+        lost = np.flatnonzero(np.isnan(f["factor"][:]))
+        assert np.array_equal(f["given"][:], given)
+    nodes = mesh.element_nodes_on_host
+    assert len(lost) and np.array_equal(lost, np.setdiff1d(nodes[:, given], nodes[:, ~given]))
+
+
+def test_elements_keep_the_numbers_of_their_regions():
+    """A map of mu showed its own values where a region of the scene sets mu, and the runs did not use them."""
+    box = lj.shapes.box((2.0, 1.0, 1.0), (2, 1, 1))  # 12 elements
+    soft = lj.laws.NeoHookean(mu=500.0, bulk=2000.0)
+    regions = (
+        lj.Region(elements=jnp.arange(0, 4), law={"mu": 3000.0}, viscosity={"ratios": jnp.array([0.1, 0.2])}),
+        lj.Region(elements=jnp.arange(3, 6), law=lj.laws.create("mooney_rivlin", c10=1.0, c01=1.0, bulk=2.0)),
+    )
+    scene = lj.Scene(mesh=box, law=soft, region=regions)
+    problem = SimpleNamespace(scenes=(scene,))
+    given, values = field.given_by_regions(problem, "law.mu")
+    assert np.array_equal(given, np.arange(12) < 6)
+    assert np.all(values[:3] == 3000) and np.all(np.isnan(values[3:]))
+    given, values = field.given_by_regions(problem, "viscosity.ratios.1")
+    assert np.array_equal(given, np.arange(12) < 4) and np.all(values[:4] == 0.2)
+    # A parameter that another scene may change there is mapped.
+    both = SimpleNamespace(scenes=(scene, replace(scene, region=())))
+    assert not np.any(field.given_by_regions(both, "law.mu")[0])
+    every = replace(scene, region=(lj.Region(elements=jnp.arange(12), law={"mu": 1.0}),))
+    with pytest.raises(InputError, match="so there is nothing to map"):
+        field.start_of(SimpleNamespace(scenes=(every,)), "law.mu")
 
 
 def test_a_sphere_starts_where_the_map_is_known(problem):
@@ -311,7 +344,7 @@ def test_a_sphere_starts_where_the_map_is_known(problem):
     corner = np.linalg.norm(X, axis=1) < 0.015
     m = np.where(near, 1.0, np.where(corner, -2.0, 0.0))
     sd = np.where(corner, 3.0, 0.1)
-    found = field.Field("law.mu", m, m, sd, sd, None, 1.6, 0.02, 1.0, 9, True, 0.0, [], np.ones(3), (0,), 1.0)
+    found = field.Field("law.mu", m, m, sd, sd, None, 1.6, 0.02, 1.0, 9, True, 0.0, [], np.ones(3), (0,), 1.0, m > 9)
     start = inclusion.start_from(problem, found)
     assert np.linalg.norm(start[:3] - [0.03, 0.02, 0.02]) < 0.01 and start[5] > 0
 

@@ -98,6 +98,13 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
 def _map(options: argparse.Namespace, problem: Problem) -> int:
     mesh = problem.scenes[0].mesh
     field.start_of(problem, options.name)
+    given = int(field.given_by_regions(problem, options.name)[0].sum())
+    if given:
+        print(
+            f"note: {given} of {mesh.number_of_elements} elements keep the {options.name} of their [[region]]: the map "
+            "says nothing there; leave it out of the region to map it too",
+            file=sys.stderr,
+        )
     writable(options.out, ("field.json", "field.vtu", "field.h5", "field.png", "progress.h5"))
     kept = sum(gradients.memory(scene) for scene in problem.scenes) / 1e6
     print(f"gradients need about {kept:.0f} MB of memory", file=sys.stderr)

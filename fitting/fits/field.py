@@ -31,6 +31,7 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.versions import versions
+from liverjax.scenes.regions import set_by_regions
 from liverjax.scenes.scene import numbers_at
 
 #: Standard deviations of ln(modulus) to try: from a nearly uniform body to a body whose stiffness may vary strongly.
@@ -48,7 +49,7 @@ class Field(NamedTuple):
 
     name: str
     log_factor: np.ndarray  # m (V,)
-    modulus: np.ndarray  # modulus of the elements (E,)
+    modulus: np.ndarray  # modulus of the elements (E,); NaN where a region has a law without it
     sd: np.ndarray  # of m at the nodes (V,), with the data
     prior_sd: np.ndarray  # of m at the nodes (V,), without data
     mesh_bias: np.ndarray | None  # error of m (V,) by the meshes, to be subtracted from m; None: not known
@@ -62,6 +63,7 @@ class Field(NamedTuple):
     eigenvalues: np.ndarray  # of J^T J in whitened z: the data determine the directions with eigenvalues above 1
     codes: tuple[int, ...]
     seconds: float
+    given: np.ndarray  # (E,) whether a [[region]] of the scene sets the modulus: the map does not change it there
 
 
 def start_of(problem: Problem, name: str) -> jax.Array:
@@ -80,7 +82,19 @@ def start_of(problem: Problem, name: str) -> jax.Array:
         raise InputError(f"a field of {name!r} needs one number: name one of the list, e.g. {name}.0")
     if not np.all(np.asarray(base) > 0):
         raise InputError(f"a field of {name!r} must begin at a positive value: change the value in the scene")
+    if np.all(given_by_regions(problem, name)[0]):
+        raise InputError(
+            f"every element has the {name} of its [[region]], so there is nothing to map: leave it out there"
+        )
     return jnp.broadcast_to(base, (E,))
+
+
+def given_by_regions(problem: Problem, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Which elements (E,) keep the parameter of their [[region]] in all scenes, and the values (E,) of the first scene
+    there, or NaN."""
+    E = problem.scenes[0].mesh.number_of_elements
+    each = [set_by_regions(scene.region, name, E) for scene in problem.scenes]
+    return np.all([own for own, _ in each], axis=0), each[0][1]
 
 
 def values_at(problem: Problem, name: str, base: jax.Array, m: jax.Array) -> dict[str, jax.Array]:
@@ -271,10 +285,13 @@ def estimate(
     values, vectors = _measured_directions(here, len(m), options.modes)
     before, after = smooth.variances(p, vectors, 1 / (1 + values))
     slope, chi2 = here.gradient(), float(here.r @ here.r)
+    given, its_values = given_by_regions(problem, name)
+    modulus = np.asarray(values_at(problem, name, base, here.m)[name])
     return Field(
         name=name,
         log_factor=m,
-        modulus=np.asarray(values_at(problem, name, base, here.m)[name]),
+        modulus=np.where(given, its_values, modulus),
+        given=given,
         sd=deviation * np.sqrt(after),
         prior_sd=deviation * np.sqrt(before),
         mesh_bias=_bias_of_map(search, here, values, vectors) if options.mesh_error else None,

@@ -101,8 +101,9 @@ def of_field(found: Field) -> Content:
     """The content of field.json for a map."""
     return {
         "name": found.name,
-        "smallest": float(found.modulus.min()),
-        "largest": float(found.modulus.max()),
+        "smallest": float(found.modulus[~found.given].min()),
+        "largest": float(found.modulus[~found.given].max()),
+        "elements_given_by_regions": int(found.given.sum()),
         "smallest_standard_deviation_of_ln": float(np.min(found.sd)),
         "largest_standard_deviation_of_ln": float(np.max(found.sd)),
         "prior_deviation": found.deviation,
@@ -127,14 +128,17 @@ def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> No
     at_nodes = {"factor": found.log_factor, "sd_of_ln": found.sd, "prior_sd_of_ln": found.prior_sd}
     if found.mesh_bias is not None:
         at_nodes["mesh_bias_of_ln"] = found.mesh_bias
-    at_nodes = {name: np.asarray(on_middles(mesh, jnp.asarray(values))) for name, values in at_nodes.items()}
+    at_nodes = {name: np.array(on_middles(mesh, jnp.asarray(values))) for name, values in at_nodes.items()}
     at_nodes["factor"] = np.exp(at_nodes["factor"])
+    unknown = np.setdiff1d(np.arange(mesh.number_of_nodes), mesh.element_nodes_on_host[:, ~found.given])
+    for values in at_nodes.values():
+        values[unknown] = np.nan
     write_mesh(out / "field.vtu", mesh, at_nodes)
     with h5py.File(out / "field.h5", "w") as f:
         f["modulus"], f["reference"], f["tetrahedra"] = found.modulus, mesh.points, mesh.tetrahedra
         for name, values in at_nodes.items():
             f[name] = values
-        f["eigenvalues"] = found.eigenvalues
+        f["eigenvalues"], f["given"] = found.eigenvalues, found.given
         f.attrs["name"] = found.name
     save(map_figure(mesh, found), out / "field.png")
 
@@ -194,9 +198,10 @@ def table_of_field(found: Field) -> str:
             f"{h['deviation']:8g}  {h['chi2_per_component']:14.4f}  {h['iterations']:10.0f}  {h['evaluations']:11.0f}  "
             f"{h['seconds']:7.1f}"
         )
+    own = found.modulus[~found.given]
     known, factors = int(np.sum(found.eigenvalues > 1)), np.exp([np.min(found.sd), np.max(found.sd)])
     rows.append(
-        f"{found.name} from {found.modulus.min():.4g} to {found.modulus.max():.4g}, known to a factor of "
+        f"{found.name} from {own.min():.4g} to {own.max():.4g}, known to a factor of "
         f"{factors[0]:.3g} to {factors[1]:.3g} (one standard deviation); the data determine "
         f"{'at least ' if known == len(found.eigenvalues) else ''}{known} directions of the map; {found.seconds:.1f} s"
     )

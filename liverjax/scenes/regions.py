@@ -92,6 +92,28 @@ def changed_numbers(region: Region) -> dict[str, object]:
     return region.law if isinstance(region.law, dict) else {}
 
 
+def set_by_regions(regions: tuple[Region, ...], name: str, number_of_elements: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which elements (E,) have a value of their own from their region, for a parameter of the scene such as `law.mu`;
+    and these values (E,), NaN if a region's law does not have the parameter.
+    """
+    table, _, rest = name.partition(".")
+    own, values = np.zeros(number_of_elements, bool), np.full(number_of_elements, np.nan)
+    for region in regions:
+        given = changed_numbers(region) if table == "law" else (getattr(region, table, None) or {})
+        value, key = None, rest
+        if table == "law" and isinstance(region.law, Law):
+            value = getattr(region.law, rest, np.nan)
+        elif rest in given:
+            value = given[rest]
+        elif table in ("viscosity", "porosity") and rest.partition(".")[0] in given:
+            key, _, mode = rest.partition(".")
+            value = np.asarray(given[key])[int(mode)]
+        if value is not None:
+            own[np.asarray(region.elements)] = True
+            values[np.asarray(region.elements)] = np.asarray(value, float) if np.ndim(value) == 0 else np.nan
+    return own, values
+
+
 def law_number(law: Law, name: str) -> jax.Array:
     """The value in the law of a parameter that a region changes.
 
