@@ -7,7 +7,7 @@ import pytest
 
 from fitting.__main__ import main
 from fitting.methods.contact_point import fit_contact, fit_with_offset
-from fitting.readers.indentation_curves import read_indentation
+from fitting.readers.indentation_curves import _end_of_loading, read_indentation
 from fitting.rigs.thin_layer import Indenter, Layer
 from liverjax.core.errors import InputError
 
@@ -316,3 +316,20 @@ def test_an_approach_as_long_as_the_layer_is_thick_is_fitted():
         layer = Layer(rig)
         found = fit_contact(depth, E * layer.force(depth), layer.force)
         assert np.isclose(found.modulus, E, rtol=1e-4) and abs(found.contact_point) < 1e-7
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.2])
+def test_only_a_real_hold_at_the_end_is_left_out(noise):
+    """Noise of 20 % brought points near the largest force long before the end; the last points then decided E."""
+    rng, depth = np.random.default_rng(38), np.linspace(-2e-4, 6e-4, 200)
+    force = 0.03 * (np.maximum(depth, 0) / 6e-4) ** 1.5
+    shaken = force + noise * 0.03 * rng.standard_normal(200)
+    assert _end_of_loading(depth, shaken) == (200, [])
+    held = np.append(depth, np.full(60, 6e-4))
+    relaxing = np.append(force, 0.03 * (1 - 0.3 * (1 - np.exp(-np.arange(60) / 20))))
+    last, _ = _end_of_loading(held, relaxing + noise * 0.03 * rng.standard_normal(260))
+    assert abs(last - 200) <= 2
+    # The force is held, and the depth creeps.
+    creeping, constant = np.append(depth, 6e-4 + 2e-6 * np.arange(60)), np.append(force, np.full(60, 0.03))
+    last, told = _end_of_loading(creeping, constant + noise * 0.03 * rng.standard_normal(260))
+    assert (noise > 0.1 and not told) or 190 <= last <= 205

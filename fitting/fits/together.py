@@ -345,8 +345,8 @@ def _of_rises(chosen: Together) -> list[str]:
     """A sentence on each load that rises between two rows, if modes relax meanwhile."""
     own = chosen.model.relaxation_times[np.asarray(chosen.model.ratios) > 0.01]
     out = []
-    for test in chosen.tests:
-        row = test.rises_at if isinstance(test, TimeTest) else None
+    for test in (t for t in chosen.tests if isinstance(t, TimeTest)):
+        row = test.rises_at
         if row is None or not len(own) or test.time[row] - test.time[row - 1] < _SHORT * own.min():
             continue
         out.append(

@@ -94,12 +94,10 @@ def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str
     after = depth[end:]
     if len(after) and np.max(after - np.minimum.accumulate(after)) > _BACK * np.ptp(depth):
         notes.append("the file has several loadings: the first is fitted")
-    reached = [int(np.argmax(v[:last] >= np.max(v[:last]) - _margin(v[:last]))) + 1 for v in (depth, force)]
-    if last - min(reached) > max(5, _HELD * last):
-        notes.append(
-            f"{last - min(reached)} points are left out, because depth or force is constant at the end of the loading"
-        )
-        last = min(reached)
+    held = max(_points_of_hold(v[:last]) for v in (depth, force))
+    if held:
+        notes.append(f"{held} points are left out, because depth or force is constant at the end of the loading")
+        last -= held
     elif last < number:
         notes.append(f"{number - last} points after the deepest one are left out")
     return last, notes
@@ -115,6 +113,29 @@ def _offset(force: np.ndarray) -> float:
     level = 3 * noise_of_series(force) / np.sqrt(few / 2)
     flat = abs(after - first) < max(level, 1e-3 * np.max(force)) and level < _FLAT * np.max(force)
     return first if flat and abs(first) > max(level, 1e-3 * np.max(force)) else 0.0
+
+
+def _points_of_hold(values: np.ndarray) -> int:
+    """Number of points at the end at which depth or force stays at its largest value; 0 if it still rises there.
+
+    By noise, a rising quantity comes near its largest value long before the end. So the rise within these points must
+    be below half of the rise before them, by more than noise explains.
+    """
+    reached = int(np.argmax(values >= np.max(values) - _margin(values))) + 1
+    held = len(values) - reached
+    if held <= max(5, _HELD * len(values)):
+        return 0
+    half = min(held, reached) // 2
+    if half < 2:  # the largest value is at the beginning
+        return held
+    before, within = (np.diff(part.reshape(2, half).mean(axis=1))[0] for part in _both_sides(values, reached, half))
+    noise = noise_of_series(values) * np.sqrt(2 / half)  # of a difference of two means
+    return held if within < 0.5 * before - 2 * noise else 0
+
+
+def _both_sides(values: np.ndarray, reached: int, half: int) -> tuple[np.ndarray, np.ndarray]:
+    """The last 2 `half` values until `reached`, and the last ones of all."""
+    return values[reached - 2 * half : reached], values[len(values) - 2 * half :]
 
 
 def _margin(values: np.ndarray) -> float:
