@@ -56,6 +56,25 @@ def test_a_frequency_of_noise_alone_is_named_and_a_number_at_its_bound():
     assert "4.3 % off on average: exponent = 1 (at its bound), springpot = 2 ± 0.1" in last
 
 
+def test_too_large_a_noise_is_told():
+    field = plane_waves((7, 7, 7), noise=1e-7)
+    for factor, told in ((1, False), (10, True)):
+        stated = field._replace(noise=factor * field.noise)
+        organ = elastography.organ_of(stated, elastography.body_of(stated), DENSITY)
+        said = cautions.cautions_of_elastography(organ, elastography.regions_of(organ), None)
+        assert any("as much as the stated noise, and the standard errors are too large" in s for s in said) == told
+        assert not any("enlarged 1 times" in s for s in said)
+
+
+def test_another_spacing_than_that_of_the_file_is_told(tmp_path):
+    field = plane_waves((3, 3, 3))
+    arrays = {"displacement": field.displacement, "frequencies": HERTZ, "spacing": field.spacing}
+    np.savez(tmp_path / "w.npz", **arrays)
+    (_,) = wave_field.read_waves(tmp_path / "w.npz", spacing=list(field.spacing)).notes  # a component is 0
+    note, _ = wave_field.read_waves(tmp_path / "w.npz", spacing=list(2 * field.spacing)).notes
+    assert "the file states a spacing of" in note and note.endswith("m is used: moduli grow with its square")
+
+
 def test_a_springpot_that_misses_the_moduli_is_told(tmp_path):
     """Solids of three materials at three frequencies: no springpot rises and falls so."""
     rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]

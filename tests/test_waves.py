@@ -245,15 +245,38 @@ def test_each_region_has_the_error_of_waves_of_its_own_length():
     field = plane_waves((9, 9, 9), noise=4e-7)
     organ, G = elastography.organ_of(field, elastography.body_of(field), DENSITY), modulus(HERTZ)[0]
     bias, left = elastography._biases(organ, np.array([[G, 4 * G, 1.1 * G, 2 * G]] * len(HERTZ)))
-    weights = elastography.directions_of_waves(field)
+    strength = elastography.waves_of_field(field)
     for r, factor in ((0, 1), (1, 4), (2, 1.1), (3, 2)):
-        own = elastography.plane_wave_biases(factor * G, 2 * np.pi * HERTZ[0], organ, weights[0])
-        exact = own @ weights[0]
+        own, weights = elastography.plane_wave_biases(factor * G, 2 * np.pi * HERTZ[0], organ, strength[0])
+        exact = own @ weights
         # A modulus near another one takes its waves, as the error goes with the square of the wave number: to a
         # quarter, which is how well this estimate is known.
         assert abs(bias[0, r] - exact) < (1e-12 if r != 2 else 0.25) * abs(exact)
-        assert left[0, r].shape == (len(elastography.DIRECTIONS),)
+        assert left[0, r].shape == (2 * len(elastography.DIRECTIONS),)
     assert abs(bias[0, 0] - bias[0, 1]) > 0.1 * abs(bias[0, 0])
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+def test_the_error_of_the_voxels_of_a_thin_slab_is_known(seed):
+    """Two bricks thick, six waves of any polarisation. One polarisation for each direction, and equal weights, missed
+    the error by 0.8 of its size on average; now 0.3 (12 seeds)."""
+    rng, sizes = np.random.default_rng(seed), np.array([2e-3, 2.2e-3, 1.8e-3])
+    G = 2500 + 1600j
+    X = np.stack(
+        np.meshgrid(*[n * s for n, s in zip(map(np.arange, (9, 9, 5)), sizes, strict=True)], indexing="ij"), -1
+    )
+    X = X - X.mean(axis=(0, 1, 2))
+    k, u = 2 * np.pi * 90.0 * np.sqrt(DENSITY / G), 0.0
+    for _ in range(6):
+        n, p = rng.normal(size=(2, 3))
+        n /= np.linalg.norm(n)
+        p = np.cross(n, p) / np.linalg.norm(np.cross(n, p))
+        u = u + 1e-5 * (rng.normal() + 1j * rng.normal()) * np.exp(-1j * k * (X @ n))[..., None] * p
+    whole = np.ones((9, 9, 5), bool)
+    field = wave_field.WaveField(np.array([90.0]), u[None], sizes, np.zeros(3), whole, None, np.array([1e-9]))
+    found = elastography.regions_of(elastography.organ_of(field, elastography.body_of(field), DENSITY))
+    error = found.whole.modulus[0, 0] / G - 1
+    assert abs(found.mesh_bias[0] - error) < 0.6 * abs(error)
 
 
 def _waves_of_many_directions(shape, seed):

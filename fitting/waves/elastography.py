@@ -154,17 +154,18 @@ ALIKE = 1.15
 
 def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Relative error (F, R) that the elements cause in moduli (F, R): its mean over plane waves, and the remaining
-    uncertainty (F, R, D) from each direction."""
-    bias, left = np.zeros(moduli.shape, complex), np.zeros((*moduli.shape, len(DIRECTIONS)), complex)
-    for f, weights in enumerate(directions_of_waves(organ.field)):
+    uncertainty (F, R, 2 D) from each of these waves."""
+    bias, left = np.zeros(moduli.shape, complex), np.zeros((*moduli.shape, 2 * len(DIRECTIONS)), complex)
+    for f, strength in enumerate(waves_of_field(organ.field)):
         known = 0.0
         for r in np.argsort(np.abs(moduli[f])):
             G = moduli[f, r]
             if not abs(G) < ALIKE * known:
-                each, known = plane_wave_biases(G, organ.waves.omega[f], organ, weights), abs(G)
-            bias[f, r] = each @ weights * known / abs(G)
-            # Each direction that counts has one wave. The error of the mean is the root of the sum of these squares.
-            left[f, r] = weights * (each - each @ weights) * known / abs(G)
+                each, weights = plane_wave_biases(G, organ.waves.omega[f], organ, strength)
+                known, mean = abs(G), each @ weights
+            bias[f, r] = mean * known / abs(G)
+            # The error of the mean is the root of the sum of these squares.
+            left[f, r] = weights * (each - mean) * known / abs(G)
     return bias, left
 
 
@@ -179,27 +180,46 @@ def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.C
     return stiffness_map.course_of(organ.body, organ.matrices, organ.waves, found.whole.modulus[:, 0], length)
 
 
-def directions_of_waves(field: WaveField) -> np.ndarray:
-    """Weights (F, D) of plane waves along `DIRECTIONS`: the squared slopes of the displacement along them, to the power
-    `SHARPNESS`.
+def plane_waves() -> list[tuple[np.ndarray, np.ndarray]]:
+    """Direction and polarisation, (3,) each, of 2 D plane shear waves: two along each of `DIRECTIONS`."""
+    found = []
+    for d in DIRECTIONS:
+        n = np.array(d) / np.linalg.norm(d)
+        across = np.cross(n, np.eye(3)[int(np.argmin(np.abs(n)))])
+        across /= np.linalg.norm(across)
+        found += [(n, across), (n, np.cross(n, across))]
+    return found
 
-    The slopes along each axis are differences between neighbours. The contribution of the noise is subtracted.
+
+def waves_of_field(field: WaveField) -> np.ndarray:
+    """Relative energies (F, 2 D) of `plane_waves` in the displacement.
+
+    A direction has the squared slopes along it, to the power `SHARPNESS`. Its two waves share this in proportion to the
+    squared slopes of their components. Slopes along an axis are differences between neighbours, without those of the
+    noise.
     """
-    n = np.array([np.array(d) / np.linalg.norm(d) for d in DIRECTIONS])
+    waves = plane_waves()
     rows = []
     for u, noise in zip(field.displacement, field.noise, strict=True):
-        steep = np.empty(3)
+        steep = np.empty((3, 3, 3))  # along an axis, products of the components
         for axis in range(3):
-            slope = np.diff(u, axis=axis)
-            steep[axis] = (np.nanmean(np.abs(slope) ** 2) - 4 * noise**2) / field.spacing[axis] ** 2
-        steep = np.maximum(np.nan_to_num(steep), 0.0)
-        along = (n**2 @ steep) ** SHARPNESS
-        rows.append(along / along.sum() if along.sum() > 0 else np.full(len(n), 1 / len(n)))
+            slope = np.diff(u, axis=axis).reshape(-1, 3)
+            slope = slope[np.isfinite(slope).all(axis=1)]
+            products = (slope.conj().T @ slope).real / max(len(slope), 1) - 4 * noise**2 * np.eye(3)
+            steep[axis] = products / field.spacing[axis] ** 2
+        every = np.maximum(np.trace(steep, axis1=1, axis2=2), 0.0)
+        along = np.array([n**2 @ every for n, _ in waves]) ** SHARPNESS
+        own = np.maximum([np.einsum("a,aij,i,j->", n**2, steep, e, e) for n, e in waves], 0.0).reshape(-1, 2)
+        parts = own / np.where(own.sum(axis=1) > 0, own.sum(axis=1), 1.0)[:, None]
+        parts[own.sum(axis=1) <= 0] = 0.5
+        along = along * parts.ravel()
+        rows.append(along / along.sum() if along.sum() > 0 else np.full(len(along), 1 / len(along)))
     return np.array(rows)
 
 
-def plane_wave_biases(G: complex, omega: float, organ: Organ, weights: np.ndarray) -> np.ndarray:
-    """Relative errors (D,) of the modulus that these elements give for plane waves without noise along `DIRECTIONS`.
+def plane_wave_biases(G: complex, omega: float, organ: Organ, strength: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Relative errors (2 D,) of the modulus that these elements give for `plane_waves` without noise; and the weights
+    (2 D,) of these waves in a common modulus: strength times what a wave tells about it.
 
     It takes one Gauss-Newton step from the true modulus, in the body of the organ: its edges and holes add to the error
     of the elements.
@@ -208,19 +228,21 @@ def plane_wave_biases(G: complex, omega: float, organ: Organ, weights: np.ndarra
         G: modulus [Pa].
         omega: angular frequency [rad/s].
         organ: its body and density.
-        weights: weights of the directions (D,). Directions with a weight near 0 are left out, with an error of 0.
+        strength: relative energies (2 D,) of the waves. Waves near 0 are left out, with an error and a weight of 0.
     """
     m, X = organ.matrices, np.asarray(organ.body.mesh.points)
     uniform, X = _uniform(m, organ.body, organ.density), X - X.mean(axis=0)
-    k, found = omega * np.sqrt(organ.density / G), np.zeros(len(DIRECTIONS), complex)
+    k, found, told = omega * np.sqrt(organ.density / G), np.zeros(len(strength), complex), np.zeros(len(strength))
     C = uniform.rows(np.array([G]), omega)
     factor = balance.likeliest(C, uniform.pressure, np.zeros(C.shape[1]), 1.0).factor
-    for d in np.flatnonzero(weights > 1e-3):
-        n = np.array(DIRECTIONS[d]) / np.linalg.norm(DIRECTIONS[d])
-        across = np.cross(n, np.eye(3)[int(np.argmin(np.abs(n)))])
-        wave = (np.exp(-1j * k * (X @ n))[:, None] * across / np.linalg.norm(across)).ravel()
+    for w, (n, across) in enumerate(plane_waves()):
+        if not strength[w] > 1e-3:
+            continue
+        wave = (np.exp(-1j * k * (X @ n))[:, None] * across).ravel()
         q = scipy.linalg.cho_solve_banded((factor, True), C @ wave, check_finite=False)
         slope = uniform.by_moduli(wave - C.conj().T @ q)[:, 0]
         weighted = scipy.linalg.cho_solve_banded((factor, True), slope, check_finite=False)
-        found[d] = -np.vdot(slope, q) / (np.vdot(slope, weighted).real * G)
-    return found
+        told[w] = np.vdot(slope, weighted).real
+        found[w] = -np.vdot(slope, q) / (told[w] * G)
+    weights = strength * told
+    return found, weights / weights.sum()

@@ -67,7 +67,7 @@ def read_waves(
         found["phases"], jumps = unwrapped(name, phases)
         found["unit"] = "rad"
     U, notes = _motion(name, found)
-    notes += jumps
+    notes += [*jumps, *_of_another_spacing(name, found, step)]
     U = np.where(np.isfinite(U), U, np.nan) * _factor(name, unit or found.get("unit") or "m")
     notes += _leave_out_rest(U)
     hertz = _hertz(name, frequencies, found.get("frequencies"), len(U))
@@ -89,6 +89,19 @@ def read_waves(
     order = np.argsort(hertz)
     field = WaveField(hertz[order], U[order], step, origin, inside, regions, np.zeros(len(U)), name, tuple(notes))
     return field._replace(noise=noise_of(field))
+
+
+def _of_another_spacing(name: str, found: Content, step: np.ndarray) -> list[str]:
+    """A note if the file states another spacing than the one that is used [m]."""
+    if found.get("spacing") is None or formats.CONFLICT in found:
+        return []
+    stated = _lengths(name, "spacing", found["spacing"], "its spacing")
+    if np.allclose(stated, step, rtol=1e-3):
+        return []
+    return [
+        f"the file states a spacing of {stated.tolist()} m, and --spacing {step.tolist()} m is used: moduli grow with "
+        "its square"
+    ]
 
 
 def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object, spacing_given: bool) -> np.ndarray:

@@ -17,6 +17,8 @@ from fitting.waves.wave_field import WaveField
 LEAST_RADIUS = 2.5
 #: Above this chi^2 per equation, a warning says that the model misses something.
 TOO_FAR = 1.5
+#: Below this chi^2 per equation, the stated noise is too large, if there are FEW equations or more.
+TOO_NEAR, FEW = 0.4, 50
 #: The chi^2 of a map is reported if it exceeds 1 per equation by more than ROUGH plus BY_CHANCE standard deviations.
 #: ROUGH is for the error of the estimated noise.
 BY_CHANCE, ROUGH = 5.0, 0.03
@@ -165,7 +167,12 @@ def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: boo
             f"{hertz:g} Hz: neighbouring voxels share their residuals (correlation {each.correlations[f].beyond:.2g} "
             f"above that of independent noise): {'the voxels are coarse (mesh_bias), ' if coarse else ''}the data are "
             "smoothed, or the organ is less uniform than its "
-            f"{uniform}; standard errors are enlarged {each.noise_factor[f].max():.3g} times, those of a map are not"
+            f"{uniform}; {_enlarged(each.noise_factor[f].max())}"
+        )
+    if ratio < TOO_NEAR and each.components >= FEW:
+        told.append(
+            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation: the motion scatters {np.sqrt(ratio):.2g} times as much as "
+            "the stated noise, and the standard errors are too large by this factor: give a smaller --noise, or none"
         )
     if ratio > WRONG:
         told.append(
@@ -180,6 +187,12 @@ def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: boo
             "noise larger; the standard errors are enlarged by its root"
         )
     return told
+
+
+def _enlarged(factor: float) -> str:
+    if factor < 1.005:
+        return "standard errors do not contain this"
+    return f"standard errors are enlarged {factor:.3g} times, those of a map are not"
 
 
 #: Speeds [m/s] of shear waves in soft tissue.
@@ -235,9 +248,11 @@ def _sign(organ: Organ, found: Found) -> list[str]:
     If regions are given, the moduli of the regions are checked: one modulus for several materials may have any loss.
     """
     wrong, each = [], found.whole if found.parts is None else found.parts
-    for hertz, G, error in zip(organ.field.frequencies, each.modulus, each.standard_errors, strict=True):
+    for f, (hertz, G, error) in enumerate(
+        zip(organ.field.frequencies, each.modulus, each.standard_errors, strict=True)
+    ):
         known = np.abs(G.imag) > 3 * error.imag
-        if known.any() and np.all(G.imag[known] < 0):
+        if known.any() and not _of_no_motion(organ.field, f) and np.all(G.imag[known] < 0):
             wrong.append(f"{hertz:g} Hz")
     if not wrong:
         return []
