@@ -234,7 +234,7 @@ def test_the_commands_take_a_description(tmp_path):
         ({"drive": "torque"}, "use displacement or force"),
         ({"height": 1e-4}, "more than half of the height"),
         ({"data": 3}, "must name a file"),
-        ({"ramp": 0.5}, "ramp = 0.5 is in the rows already"),
+        ({"ramp": 0.5}, "ramp = 0.5 cannot be used: leave it out"),
         ({"min_time": -3.0}, "min_time = -3 cannot be seconds after the load"),
         ({"data": "none.csv"}, "none.csv"),
         ({"data": "shear.csv"}, "needs columns of time, displacement and force"),

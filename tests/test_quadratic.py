@@ -248,7 +248,7 @@ def test_held_faces_hold_the_middles_of_their_edges_and_pairs_do_not():
     assert np.array_equal(promotion.of_faces(box, face[:2]), face[:2])
 
 
-@pytest.mark.parametrize("cells", [(1, 1, 1), (2, 2, 2), (3, 2, 1)])
+@pytest.mark.parametrize("cells", [(2, 2, 2), (2, 3, 5), (3, 2, 1)])
 def test_middles_of_several_held_sides_lie_on_these_sides(cells):
     """Between two sides that meet there are faces with a vertex on each: they were held too."""
     box = lj.shapes.box((1.0, 2.0, 3.0), cells)
@@ -261,10 +261,24 @@ def test_middles_of_several_held_sides_lie_on_these_sides(cells):
             on_sides = [points[:, axis] == place for axis, place in (sides[name] for name in names)]
             expected = set(np.flatnonzero(np.any(on_sides, axis=0)))
             found = set(promotion.of_faces(box, held))
-            if len(held) == box.number_of_vertices:  # without a node inside, all faces are held
+            if 1 in cells:  # no vertex is inside: it may be a held part of the body
                 assert expected <= found
             else:
                 assert found == expected, names
+
+
+@pytest.mark.parametrize("cells", [(4, 4, 1), (4, 4, 2)])
+@pytest.mark.parametrize("thick", [False, True])
+def test_a_held_part_of_a_plate_holds_the_middles_within_it(cells, thick):
+    """In a plate one element thick, no vertex tells a plane inside the body from two held sides."""
+    plate = lj.shapes.box((0.1, 0.1, 0.02), cells)
+    points = np.asarray(lj.quadratic(plate).points)
+
+    def on_place(x: np.ndarray) -> np.ndarray:
+        return np.flatnonzero(x[:, 0] < 0.051 if thick else abs(x[:, 0] - 0.05) < 1e-9)
+
+    found = promotion.of_faces(plate, on_place(np.asarray(plate.points)))
+    assert set(found) == set(on_place(points))
 
 
 def test_all_faces_of_a_coarse_surface_are_held():

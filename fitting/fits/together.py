@@ -346,13 +346,13 @@ def _of_rises(chosen: Together) -> list[str]:
     own = chosen.model.relaxation_times[np.asarray(chosen.model.ratios) > 0.01]
     out = []
     for test in (t for t in chosen.tests if isinstance(t, TimeTest)):
-        row = test.rises_at
-        if row is None or not len(own) or test.time[row] - test.time[row - 1] < _SHORT * own.min():
+        row = test.jumps[:1].sum()
+        if not row or not len(own) or test.time[row] - test.time[row - 1] < _SHORT * own.min():
             continue
         out.append(
-            f"no row of {test.source} shows how the load rose between {test.time[row - 1]:.4g} and "
-            f"{test.time[row]:.4g} s, and a straight rise is assumed: if it was a step, G0 and the short relaxation "
-            "times are wrong; give more rows of the rise"
+            f"no row of {test.source} shows how the load changed between {test.time[row - 1]:.4g} and "
+            f"{test.time[row]:.4g} s, and a straight change is assumed: if it was a step, G0 and the short relaxation "
+            "times are wrong; give more rows there"
         )
     return out
 

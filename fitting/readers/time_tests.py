@@ -18,6 +18,10 @@ AT_REST = 0.01
 #: the largest answer.
 RELATIVE, CYCLIC = 0.03, 0.1
 
+#: What is known of changes of the load that no row shows: nothing, so it is straight between rows; the same in a test
+#: that a description gives; nothing, and a row at 0 s was added before a first row under load; or how long they took.
+BETWEEN_ROWS, DESCRIBED, BEFORE_ROWS, GIVEN = "between rows", "described", "before the rows", "given"
+
 
 class TimeTest(NamedTuple):
     """A relaxation or creep test in SI units, as quantities of shear."""
@@ -30,7 +34,7 @@ class TimeTest(NamedTuple):
     source: str = ""
     notes: tuple[str, ...] = ()
     constant_noise: bool = False  # whether the noise of all answers has the same size
-    rise_given: bool = False  # whether the user has said how the load rose between two rows
+    rise: str = BETWEEN_ROWS  # what is known of changes of the load that no row shows
 
     @property
     def scales(self) -> np.ndarray:
@@ -67,9 +71,9 @@ class TimeTest(NamedTuple):
         return float(self.time[first])
 
     @property
-    def rises_at(self) -> int | None:
-        """Number of the first row under load, if the load is complete there: no row shows how it rose. Else None."""
-        return None if self.rise_given else _rises_at(self.driven)
+    def jumps(self) -> np.ndarray:
+        """Numbers (j,) of the rows at the ends of jumps of the load, if nobody has said how long they took."""
+        return np.zeros(0, int) if self.rise == GIVEN else _rows_of_jumps(self.driven)
 
     @property
     def answers_at_once(self) -> bool:
@@ -135,10 +139,14 @@ def read_time_test(
         notes += told
         notes += _of_the_other_kind(kind, time, strain, stress)
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
+        begins_loaded = time[0] > 0 and abs(driven[0]) > AT_REST * np.max(np.abs(driven))
         time, driven, answer, told = from_rest(time, driven, answer, ramp, (str(path), "--ramp"))
         test = of_columns(kind, time, driven, answer, (str(path), [*notes, *told]), start)
-        return test._replace(rise_given=ramp is not None)
-    return _checked(TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes)), start)
+        if ramp is not None:
+            return test._replace(rise=GIVEN)
+        return test._replace(rise=BEFORE_ROWS) if begins_loaded else test
+    test = TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes))
+    return _checked(test._replace(rise=GIVEN), start)
 
 
 def of_columns(
@@ -178,27 +186,29 @@ BEGINS_LOADED = (
 def from_rest(
     time: np.ndarray, driven: np.ndarray, answer: np.ndarray, ramp: float | None, names: tuple[str, str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """The rows (n,), with an added row at 0 s if they begin later, and an added row if `ramp` is given; and notes.
+    """The rows (n,), with an added row at 0 s if they begin later, and added rows if `ramp` is given; and notes.
 
     Args:
         time, driven, answer: (n,), see `of_columns`.
-        ramp: None: the load is straight between rows. If the rows begin under load, 0: it acted from 0 s on. If it is 0
-            in a row and complete in the next one, seconds of its rise until that row; 0 for a step.
+        ramp: None: the load is straight between rows. If the rows begin under load, 0: it acted from 0 s on. Where the
+            load changes between two rows alone: seconds of this change until the later row; 0 for a step.
         names: name of the file, and name of `ramp`, for messages.
 
     Raises:
         InputError: the rows show how the load rose, or it rose in less time.
     """
-    size = np.abs(driven)
-    loaded, row = size[0] > AT_REST * np.max(size), _rises_at(driven)
-    at_once = ramp == 0 and (loaded or row is None)
-    if ramp and (row is None or not 0 < ramp <= time[row] - time[row - 1]):
-        shown = "the rows begin under load" if loaded else "the rows show how the load rose"
-        if row is not None:
-            shown = f"the load rose after {time[row - 1]:.4g} s, and is complete at {time[row]:.4g} s"
+    size, rows = np.abs(driven), _rows_of_jumps(driven)
+    loaded = size[0] > AT_REST * np.max(size)
+    at_once = ramp == 0 and loaded
+    if ramp is not None and not at_once and not (len(rows) and 0 <= ramp <= time[rows[0]] - time[rows[0] - 1]):
+        shown = "the rows show how the load rose"
+        if len(rows):
+            shown = f"the load rose between {time[rows[0] - 1]:.4g} and {time[rows[0]]:.4g} s"
+        elif loaded:
+            shown = "the rows begin under load, and only 0 (a step at 0 s) is possible there"
         raise InputError(f"{names[0]}: {names[1]} {ramp:g} cannot be right, since {shown}: leave it out")
-    if ramp is not None and row is not None and not at_once:
-        time, driven, answer = _row_before_the_load(row, ramp, time, driven, answer)
+    if ramp is not None:
+        time, driven, answer = _rows_before_jumps(rows, ramp, time, driven, answer)
     if not time[0] > 0:
         return time, driven, answer, [BEGINS_LOADED] if loaded and not at_once else []
     first, notes = driven[0] if at_once else 0.0, []
@@ -211,36 +221,44 @@ def from_rest(
     return np.append(0.0, time), np.append(first, driven), np.append(0.0, answer), notes
 
 
-#: A load is complete if its next change is below this part of its rise.
-_COMPLETE = 0.1
+#: A load jumps if it changes between two rows by more than this part of its largest value, and if the changes before
+#: and after are below the second part of this change.
+_JUMP, _COMPLETE = 0.05, 0.5
 #: A step takes this part of the time between two rows. Such a short time resolves no relaxation time.
 AT_ONCE = 1e-4
 
 
-def _rises_at(driven: np.ndarray) -> int | None:
-    """Number of the first row under load, if the row before it is at rest and the load is complete there."""
-    size = np.abs(driven)
-    first = int(np.argmax(size > AT_REST * np.max(size)))
-    if first == 0 or first + 1 == len(size):
-        return None
-    complete = abs(size[first + 1] - size[first]) < _COMPLETE * (size[first] - size[first - 1])
-    return first if complete else None
+def _rows_of_jumps(driven: np.ndarray) -> np.ndarray:
+    """Numbers (j,) of the rows at the ends of jumps: no row shows how the load changed there."""
+    change = np.abs(np.diff(driven, prepend=driven[0], append=driven[-1]))
+    before, own, after = change[:-2], change[1:-1], change[2:]
+    least = _JUMP * np.max(np.abs(driven))
+    return 1 + np.flatnonzero((own > least) & (np.maximum(before, after) < _COMPLETE * own))
 
 
-def _row_before_the_load(row: int, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The columns with a row in which the sample is still at rest, `ramp` [s] before row `row`."""
-    before = time[row] - max(ramp, 0.1 * AT_ONCE * (time[row] - time[row - 1]))
-    if not before > time[row - 1]:
-        return time, *columns
-    return np.insert(time, row, before), *(np.insert(values, row, values[row - 1]) for values in columns)
+def _rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple:
+    """The columns with a row before each jump that has the values of the earlier row, `ramp` [s] before the later
+    row."""
+    interval = time[rows] - time[rows - 1]
+    before = time[rows] - np.clip(ramp, 0.1 * AT_ONCE * interval, interval)
+    new = before > time[rows - 1]
+    return tuple(
+        np.insert(values, rows[new], added[new])
+        for values, added in ((time, before), *((c, c[rows - 1]) for c in columns))
+    )
 
 
-def with_a_step(test: TimeTest, ramp: float) -> TimeTest:
-    """The test whose load rises within `ramp` [s] until the row `TimeTest.rises_at`; 0: it is a step there."""
-    row = test.rises_at
-    assert row is not None
-    time, driven, answer = _row_before_the_load(row, ramp, test.time, test.driven, test.answer)
-    used = np.insert(test.used, row, False) if len(time) > len(test.time) else test.used
+def with_steps(test: TimeTest) -> TimeTest:
+    """The test whose load has steps at the later rows of its jumps (`TimeTest.jumps`).
+
+    If the rows begin under load, the step is at 0 s.
+    """
+    driven = test.driven.copy()
+    if test.rise == BEFORE_ROWS:
+        driven[0] = driven[1]
+        return test._replace(driven=driven)
+    time, driven, answer = _rows_before_jumps(test.jumps, 0.0, test.time, test.driven, test.answer)
+    used = np.isin(time, test.time[test.used])
     return test._replace(time=time, driven=driven, answer=answer, used=used)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.ndimage
 
 from fitting.readers.tables.time_columns import read_columns
-from fitting.readers.time_tests import TimeTest, from_rest, of_columns
+from fitting.readers.time_tests import DESCRIBED, GIVEN, TimeTest, from_rest, of_columns
 from fitting.rigs import glued, thin_layer
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
@@ -125,7 +125,8 @@ def read_described(path: str | Path) -> TimeTest:
     kind = _KINDS[described.drive]
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
     notes = [*notes, *told, *told_of_start]
-    return of_columns(kind, time, driven, answer, (str(path), notes), described.min_time)
+    test = of_columns(kind, time, driven, answer, (str(path), notes), described.min_time)
+    return test._replace(rise=GIVEN if described.at_once else DESCRIBED)
 
 
 def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list[str]]:
@@ -199,7 +200,9 @@ def _description(path: Path) -> Described:
         raise InputError(f"{path}: min_time = {first:g} cannot be seconds after the load: give 0 or more")
     ramp = table.get("ramp")
     if ramp is not None and _number_of(path, "ramp", ramp) != 0:
-        raise InputError(f"{path}: ramp = {ramp} is in the rows already: leave it out, or give 0 for a step at 0 s")
+        raise InputError(
+            f"{path}: ramp = {ramp} cannot be used: leave it out, or give 0 for steps where no row shows the load rise"
+        )
     return Described(test, path.parent / table["data"], sizes, poisson, drive, first, ramp is not None)
 
 

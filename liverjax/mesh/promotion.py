@@ -10,15 +10,13 @@ from liverjax.mesh.selection import boundary_triangles, face_codes
 from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Cosines of angles: two neighbours on the surface belong to one place if theirs is above the first. Two neighbours
-#: inside the body lie in one plane if theirs is above the second.
-_ONE_PLACE, _ONE_PLANE = 0.7, 0.999
+#: Two neighbours on the surface have nearly the same direction if the cosine of their angle is above this.
+_ONE_PLACE = 0.7
 
 
 def quadratic(mesh: TetMesh) -> TetMesh:
     """The mesh with 10 nodes in each element. A quadratic mesh is returned unchanged.
 
-    The vertices keep their numbers. The middles of the edges follow in the order of `pattern.edges`. If a node set
     The vertices keep their numbers. The middles of the edges follow in the order of `pattern.edges`. A node set also
     gets the middles of the edges of its faces (`middles_of_set`), so that a fixed face stays fixed.
     """
@@ -62,9 +60,10 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
 
     Two places may meet at an edge of the body, such as two held sides. A face there can have all its vertices in the
     two places without belonging to one of them. On the surface, it meets the faces of the places at an angle, and goes
-    on in its own direction outside them. Inside the body, a face of a place has a vertex that is not on the surface, or
-    it continues the plane of such a face. If the positions of the mesh are traced, directions are not known: then all
-    faces on the surface belong to a place.
+    on in its own direction outside them. If the positions of the mesh are traced, directions are not known: then all
+    faces on the surface belong to a place. Inside the body, a face of a place is at or beside a held vertex that is not
+    on the surface. Where the body is only one element thick, there are no such vertices, and all faces belong to a
+    place.
     """
     V = mesh.number_of_vertices
     inside = np.zeros(V, bool)
@@ -82,13 +81,21 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     inner = own[~np.isin(code, of_outer)]
     deep = np.ones(V, bool)
     deep[surface.ravel()] = False
-    certain = deep[inner].any(axis=1)
+    beside = _and_neighbours(mesh, deep & inside)
+    thin = ~_and_neighbours(mesh, _and_neighbours(mesh, deep))
+    inner = inner[(deep | beside)[inner].any(axis=1) | thin[inner].all(axis=1)]
     if not isinstance(mesh.points, jax.core.Tracer):
         outer = outer[_in_a_place(mesh, surface, inside)]
-        inner = inner[_in_planes(mesh, inner, certain)]
-    else:
-        inner = inner[certain]
     return V + np.unique(np.concatenate([_edges_of(mesh, outer).ravel(), _edges_of(mesh, inner).ravel()]))
+
+
+def _and_neighbours(mesh: TetMesh, inside: np.ndarray) -> np.ndarray:
+    """Vertices `inside` (V,) and all vertices that an edge connects with one of them."""
+    low, high = np.asarray(mesh.pattern.edges)
+    found = inside.copy()
+    found[low[inside[high]]] = True
+    found[high[inside[low]]] = True
+    return found
 
 
 def _edges_of(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
@@ -105,21 +112,12 @@ def _in_a_place(mesh: TetMesh, surface: np.ndarray, inside: np.ndarray) -> np.nd
     """
     own = inside[surface].all(axis=1)
     normal = _normals(mesh, surface)
-    a, b = _pairs_at_edges(_edges_of(mesh, surface), np.ones(len(surface), bool))
+    a, b = _pairs_at_edges(_edges_of(mesh, surface))
     parallel = np.sum(normal[a] * normal[b], axis=1) > _ONE_PLACE
     number = np.arange(len(surface))
     continued, outside = (np.isin(number, a[parallel & which]) for which in (own[b], ~own[b]))
     alone = ~np.isin(number, a[own[b]])
     return (continued | ~outside | alone)[own]
-
-
-def _in_planes(mesh: TetMesh, faces: np.ndarray, certain: np.ndarray) -> np.ndarray:
-    """Which faces (m, 3) inside the body belong to a place: the certain ones, and those in the plane of a neighbour
-    that is certain."""
-    normal = _normals(mesh, faces)
-    a, b = _pairs_at_edges(_edges_of(mesh, faces), certain)
-    in_plane = np.abs(np.sum(normal[a] * normal[b], axis=1)) > _ONE_PLANE
-    return certain | np.isin(np.arange(len(faces)), a[in_plane])
 
 
 def _normals(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
@@ -128,16 +126,14 @@ def _normals(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
-def _pairs_at_edges(edges: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of a triangle and another one, one of `others` (m,), with a common edge; edges (3, m)."""
-    m = edges.shape[1]
-    triangle = np.tile(np.arange(m), 3)
-    known = np.flatnonzero(others[triangle])
-    known = known[np.argsort(edges.ravel()[known], kind="stable")]
-    first, last = (np.searchsorted(edges.ravel()[known], edges.ravel(), side) for side in ("left", "right"))
+def _pairs_at_edges(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of a triangle and another one with a common edge; edges (3, m)."""
+    triangle = np.tile(np.arange(edges.shape[1]), 3)
+    order = np.argsort(edges.ravel(), kind="stable")
+    first, last = (np.searchsorted(edges.ravel()[order], edges.ravel(), side) for side in ("left", "right"))
     number = last - first
     place = np.repeat(first - (np.cumsum(number) - number), number) + np.arange(number.sum())
-    a, b = np.repeat(triangle, number), triangle[known[place]]
+    a, b = np.repeat(triangle, number), triangle[order[place]]
     return a[a != b], b[a != b]
 
 

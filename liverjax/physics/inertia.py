@@ -48,7 +48,7 @@ class Inertia(Physics):
         """
         acceleration = None
         if self.integrator == "newmark":
-            acceleration = _accelerations(*self._masses(start.mesh), start.free, start.free.vectors(-start.force()))
+            acceleration = _accelerations(*self._masses(start.mesh), start.free, -start.force())
         return Motion(jnp.zeros_like(start.x), acceleration)
 
     @classmethod
@@ -88,14 +88,18 @@ class Inertia(Physics):
 
 
 def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: jax.Array) -> jax.Array:
-    """Solution a (V, 3) [m/s^2] of m a = f."""
+    """Solution a (V, 3) [m/s^2] of m a = f in free directions; 0 along others."""
+    force = free.vectors(force)
     if shared is None:
         return force / mass[:, None]
 
     def product(a: jax.Array) -> jax.Array:
-        return free.vectors(_inertia(mass, shared, a))
+        own = free.vectors(a)
+        return free.vectors(_inertia(mass, shared, own)) + mass[:, None] * (a - own)
 
-    return jax.scipy.sparse.linalg.cg(product, force, tol=_EXACT, M=lambda r: r / mass[:, None])[0]
+    # In reverse mode a cotangent may have parts along held directions: the matrix is regular there, too.
+    found = jax.scipy.sparse.linalg.cg(product, force, tol=_EXACT, M=lambda r: r / mass[:, None])[0]
+    return free.vectors(found)
 
 
 def _inertia(mass: jax.Array, shared: Masses | None, a: jax.Array) -> jax.Array:
@@ -149,7 +153,7 @@ class Moving(NodalForce):
     def accelerations(self, force: jax.Array) -> jax.Array | None:
         """Solution a (V, 3) of m a = f in free directions."""
         assert self.free is not None
-        return _accelerations(self.mass, self.shared, self.free, self.free.vectors(force))
+        return _accelerations(self.mass, self.shared, self.free, force)
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:
         """Mass times acceleration."""

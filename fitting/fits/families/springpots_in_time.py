@@ -181,7 +181,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     """
     test, prony = fitted_by_its_noise(test, modes)
     if model == "prony":
-        return _with_ends_of_record(with_own_noise(prony), test)
+        return _with_ends_of_record(with_own_noise(prony), test, prony)
     tried = [prony] if model == "auto" else []
     tried += fractional_in_time(test, prony.model) if model in ("fractional", "auto") else []
     tried += [spectrum_of_tests.spectrum_in_time(test, prony.model)] if model in ("spectrum", "auto") else []
@@ -191,12 +191,12 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     sentences = best.warnings if best is prony else (*best.warnings, *_cautions_in_time(best))
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
     whole = with_own_noise(best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds))
-    return _with_ends_of_record(whole, test)
+    return _with_ends_of_record(whole, test, prony)
 
 
-def _with_ends_of_record(fit: TimeFit, test: TimeTest) -> TimeFit:
+def _with_ends_of_record(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
     fit = fit._replace(details=fit.details | {CONSTANT_NOISE: test.constant_noise})
-    fit = with_rise_of_load(fit, test)
+    fit = with_rise_of_load(fit, test, prony)
     return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise]), test)
 
 

@@ -1,15 +1,13 @@
-"""A load that rises between two rows of a test in time. No row shows how, so a straight rise is assumed.
+"""A load that changes between two rows of a test in time. No row shows how, so a straight change is assumed.
 
-If the load was a step at the later row, less had relaxed until then, and G0 is smaller. The change matters if
-relaxation times are as short as the time between the two rows.
+If the load was a step at the later row, less had relaxed until then, and G0 is smaller. If the rows begin under load,
+it may have been a step at 0 s. The change matters if relaxation times are as short as the time between the two rows.
 """
-
-import numpy as np
 
 from fitting.fits import time_tests
 from fitting.fits.families import limits
 from fitting.fits.time_tests import TimeFit
-from fitting.readers.time_tests import TimeTest, with_a_step
+from fitting.readers.time_tests import BEFORE_ROWS, DESCRIBED, TimeTest, with_steps
 
 #: Key in `TimeFit.details`: changes of G0, ratios, times and equilibrium modulus if the load was a step, by name.
 OF_A_STEP = "change_if_the_load_was_a_step"
@@ -17,29 +15,58 @@ OF_A_STEP = "change_if_the_load_was_a_step"
 SHOWN = 2.0
 
 
-def with_rise_of_load(fit: TimeFit, test: TimeTest) -> TimeFit:
-    """The fit of Prony modes with the changes of its parameters if the load was a step at the first row under load, and
-    a sentence, if G0 changes by more than `SHOWN` standard errors. Other fits are returned unchanged."""
-    row = test.rises_at
-    if row is None or fit.parameters is not None or not fit.converged:
+def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
+    """The fit with a sentence, if G0 changes by more than `SHOWN` standard errors where changes of the load that no row
+    shows were steps. A fit of Prony modes also gets the changes of its parameters.
+
+    Args:
+        fit: of any model.
+        test: data.
+        prony: the fit of Prony modes. It tells the change of G0 for other models.
+    """
+    own = prony if fit.parameters is not None else fit
+    if not len(test.jumps) or not own.converged:
         return fit
-    step = time_tests.refitted(fit, with_a_step(test, 0.0))
-    values, moved = fit.uncertainty.values, step.uncertainty.values - fit.uncertainty.values
-    if not step.converged or not abs(moved[0]) > SHOWN * fit.uncertainty.standard_errors[0]:
+    step = time_tests.refitted(own, with_steps(test))
+    values, moved = own.uncertainty.values, step.uncertainty.values - own.uncertainty.values
+    if not step.converged or not abs(moved[0]) > SHOWN * own.uncertainty.standard_errors[0]:
         return fit
-    changes = dict(zip(fit.uncertainty.names, map(float, moved), strict=True))
-    if fit.kind.name == "prony":
-        changes["equilibrium_modulus"] = limits.equilibrium_of(step.model) - limits.equilibrium_of(fit.model)
-    begin, end = test.time[row - 1], test.time[row]
+    changes = dict(zip(own.uncertainty.names, map(float, moved), strict=True))
+    if own.kind.name == "prony":
+        changes["equilibrium_modulus"] = limits.equilibrium_of(step.model) - limits.equilibrium_of(own.model)
+    known = fit.parameters is None and test.rise != DESCRIBED
     told = (
-        f"no row shows how the load rose between {begin:.4g} and {end:.4g} s: a straight rise is assumed. If it was a "
-        f"step at {end:.4g} s, G0 is {values[0] + moved[0]:.4g} Pa instead of {values[0]:.4g} Pa (the total errors "
-        f"contain this): give more rows of the rise, or its seconds until {end:.4g} s as --ramp, 0 for a step"
+        f"{_assumed_between_rows(test)} G0 is {values[0] + moved[0]:.4g} Pa instead of {values[0]:.4g} Pa"
+        f"{' with Prony modes' if own is not fit else ''} (the total errors "
+        f"{'contain this' if known else 'do not contain this'}): {_remedy_of_jumps(test)}"
     )
-    return fit._replace(warnings=(*fit.warnings, told), details=fit.details | {OF_A_STEP: changes})
+    details = fit.details | {OF_A_STEP: changes} if fit.parameters is None else fit.details
+    return fit._replace(warnings=(*fit.warnings, told), details=details)
+
+
+def _assumed_between_rows(test: TimeTest) -> str:
+    begin, end = test.time[test.jumps[0] - 1], test.time[test.jumps[0]]
+    if test.rise == BEFORE_ROWS:
+        return (
+            f"no row shows how the load rose before {end:.4g} s: a straight rise is assumed. If it was a step at 0 s,"
+        )
+    more = f", and in {len(test.jumps) - 1} more jumps" if len(test.jumps) > 1 else ""
+    steps = "they were steps at the later rows" if more else f"it was a step at {end:.4g} s"
+    return (
+        f"no row shows how the load changed between {begin:.4g} and {end:.4g} s{more}: straight changes are assumed. "
+        f"If {steps},"
+    )
+
+
+def _remedy_of_jumps(test: TimeTest) -> str:
+    name = "ramp = 0 in the description" if test.rise == DESCRIBED else "--ramp 0"
+    if test.rise == BEFORE_ROWS:
+        return f"give the rows of the rise, or {name} for a step at 0 s"
+    seconds = "" if test.rise == DESCRIBED else ", or --ramp with the seconds of the change until the later row"
+    return f"give more rows there, or {name} for a step{seconds}"
 
 
 def share_of_rise(fit: TimeFit, names: list[str]) -> dict[str, float]:
     """Size of the change of each parameter if the load was a step; 0 if `with_rise_of_load` has told none."""
     changes = fit.details.get(OF_A_STEP, {})
-    return {name: float(np.abs(changes.get(name, 0.0))) for name in names}
+    return {name: abs(changes.get(name, 0.0)) for name in names}
