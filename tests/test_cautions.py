@@ -42,7 +42,10 @@ def test_a_sound_run_has_none():
     assert cautions_of_run(scene(one), run(one, gradients[:1], [1.0])) == []
 
 
-@pytest.mark.parametrize(("dt", "grows", "plane"), [(0.01, True, False), (0.01, True, True), (0.002, False, False)])
+@pytest.mark.parametrize(
+    ("dt", "grows", "plane"),
+    [(0.01, True, False), pytest.param(0.01, True, True, marks=pytest.mark.slow), (0.002, False, False)],
+)
 def test_motion_that_grows_by_long_steps_of_newmark_is_told(dt, grows, plane):
     """A block of period 12 ms under constant gravity: its energy is known, and a step of 10 ms multiplies it."""
     mesh = lj.shapes.box((0.002, 0.002, 0.006), (1, 1, 3))

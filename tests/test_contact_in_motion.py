@@ -55,7 +55,11 @@ def test_a_still_obstacle_gives_no_energy():
 
 @pytest.mark.parametrize(
     ("order", "mass"),
-    [(1, "lumped"), (1, "consistent"), pytest.param(2, "consistent", marks=pytest.mark.slow)],
+    [
+        pytest.param(1, "lumped", marks=pytest.mark.slow),
+        (1, "consistent"),
+        pytest.param(2, "consistent", marks=pytest.mark.slow),
+    ],
 )
 def test_the_change_of_momentum_is_the_force_at_the_end(order, mass):
     """Of a block that flies against a plane that rubs: m (v1 - v0) = dt (weight + contact at the end), in each step."""
