@@ -12,6 +12,7 @@ from liverjax.core.struct import replace
 from liverjax.elements import mjed
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics import boundary
+from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.inertia import Motion
 from liverjax.scenes.scene_file import scene_from
 from liverjax.simulation.equations import initial_state
@@ -38,6 +39,17 @@ def test_newmark_keeps_its_order_from_a_stretched_start():
     x = [np.asarray(state.x[-1]) for state, _ in march(scene, (10, 20, 40), 0.05, start)]
     observed = np.log2(np.linalg.norm(x[1] - x[0]) / np.linalg.norm(x[2] - x[1]))
     assert abs(observed - 2) < 0.25
+
+
+def test_an_obstacle_on_its_way_does_not_push_at_the_start():
+    """Its place is that of time 0 there: the force of the first step's end was taken off."""
+    scene = _let_go()
+    top = jnp.asarray(boundary.boundary_triangles(scene.mesh, scene.mesh.node_sets["z_max"]))
+    place, by = jnp.array([0.0, 0.0, float(scene.mesh.points[:, 2].max())]), jnp.array([0.0, 0.0, -0.01])
+    scene = replace(scene, physics=(Obstacle(triangles=top, position=place, by=by, axis=jnp.array([0.0, 0.0, -1.0])),))
+    scene = replace(scene, physics=tuple(p.in_body(scene.mesh, scene.law) for p in scene.physics))
+    (motion,) = (m for m in initial_state(scene, scene.mesh.points).memories if isinstance(m, Motion))
+    assert np.abs(motion.acceleration).max() < 1e-6
 
 
 def test_a_pressed_plate_begins_with_the_acceleration_of_its_force():

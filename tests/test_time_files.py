@@ -253,8 +253,24 @@ def test_every_jump_between_two_rows_may_be_a_step():
     steps = with_steps(test)
     assert len(steps.time) == 83 and steps.used.sum() == 79 and np.all(np.diff(steps.time) > 0)
     assert np.all(np.abs(np.diff(steps.driven)[np.diff(steps.time) > 0.01]) < 1e-12)
+    # Rows at rest may be far apart, and answers dense after the step.
+    time = np.append(np.arange(0.0, 4.0), 4.0 + np.append(0.0, np.geomspace(0.01, 100, 60)))
+    dense = TimeTest("relaxation", time, np.where(time >= 4, 0.1, 0.0), np.ones(65), time >= 4)
+    assert with_steps(dense).answers_at_once and with_steps(dense).resolved[0] == pytest.approx(0.01, rel=1e-3)
     ramp = test._replace(driven=np.clip(np.arange(80) / 40, 0, 1))
     assert not len(ramp.jumps)
+
+
+def test_no_answer_is_made_up_before_a_step(tmp_path):
+    """A second load after 18 s without a row: the row added before it had the stress of 18 s earlier."""
+    time = np.concatenate([np.arange(0.0, 2.0, 0.1), 20 + 0.1 * np.arange(300)])
+    strain = np.where(time >= 20, 0.2, np.where(time > 0.95, 0.1, 0.0))
+    later = [np.where(time >= t0, relaxation(SOLID, np.maximum(time - t0, 0)), 0) for t0 in (time[10], 20.0)]
+    file = write(tmp_path / "t.csv", "time_s,strain [1],stress_Pa", time, strain, 0.1 * (later[0] + later[1]))
+    test = read_time_test(file, "relaxation", ramp=0.0)
+    assert test.used.sum() == len(time) - 10
+    f = fits.fit(test)
+    assert np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=1e-3)
 
 
 @pytest.mark.slow

@@ -18,9 +18,9 @@ AT_REST = 0.01
 #: the largest answer.
 RELATIVE, CYCLIC = 0.03, 0.1
 
-#: What is known of changes of the load that no row shows: nothing, so it is straight between rows; the same in a test
-#: that a description gives; nothing, and a row at 0 s was added before a first row under load; or how long they took.
-BETWEEN_ROWS, DESCRIBED, BEFORE_ROWS, GIVEN = "between rows", "described", "before the rows", "given"
+#: What is known of changes of the load that no row shows: nothing, so it is straight between rows; nothing, and a row
+#: at 0 s was added before a first row under load; or how long they took.
+BETWEEN_ROWS, BEFORE_ROWS, GIVEN = "between rows", "before the rows", "given"
 
 
 class TimeTest(NamedTuple):
@@ -35,6 +35,7 @@ class TimeTest(NamedTuple):
     notes: tuple[str, ...] = ()
     constant_noise: bool = False  # whether the noise of all answers has the same size
     rise: str = BETWEEN_ROWS  # what is known of changes of the load that no row shows
+    described: bool = False  # whether a description in TOML names the file
 
     @property
     def scales(self) -> np.ndarray:
@@ -73,7 +74,10 @@ class TimeTest(NamedTuple):
     @property
     def jumps(self) -> np.ndarray:
         """Numbers (j,) of the rows at the ends of jumps of the load, if nobody has said how long they took."""
-        return np.zeros(0, int) if self.rise == GIVEN else _rows_of_jumps(self.driven)
+        if self.rise == GIVEN:
+            return np.zeros(0, int)
+        shown = np.flatnonzero(np.isfinite(self.answer))  # rows without an answer may have been added between others
+        return shown[_rows_of_jumps(self.driven[shown])]
 
     @property
     def answers_at_once(self) -> bool:
@@ -139,12 +143,9 @@ def read_time_test(
         notes += told
         notes += _of_the_other_kind(kind, time, strain, stress)
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
-        begins_loaded = time[0] > 0 and abs(driven[0]) > AT_REST * np.max(np.abs(driven))
-        time, driven, answer, told = from_rest(time, driven, answer, ramp, (str(path), "--ramp"))
-        test = of_columns(kind, time, driven, answer, (str(path), [*notes, *told]), start)
-        if ramp is not None:
-            return test._replace(rise=GIVEN)
-        return test._replace(rise=BEFORE_ROWS) if begins_loaded else test
+        rows = from_rest(time, driven, answer, ramp, (str(path), "--ramp"))
+        test = of_columns(kind, *rows[:3], (str(path), [*notes, *rows[3]]), start)
+        return with_known_rise(test, time, driven, ramp)
     test = TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes))
     return _checked(test._replace(rise=GIVEN), start)
 
@@ -221,6 +222,19 @@ def from_rest(
     return np.append(0.0, time), np.append(first, driven), np.append(0.0, answer), notes
 
 
+def with_known_rise(test: TimeTest, time: np.ndarray, driven: np.ndarray, ramp: float | None) -> TimeTest:
+    """The test with what is known of its `rise`, from the times and driven values (n,) of its file.
+
+    Answers in rows that `from_rest` has added are not fitted.
+    """
+    test = test._replace(used=test.used & np.isin(test.time, time))
+    if ramp is not None:
+        return test._replace(rise=GIVEN)
+    loaded = time[0] > 0 and abs(driven[0]) > AT_REST * np.max(np.abs(driven))
+    before = loaded and len(test.jumps) > 0 and test.time[test.jumps[0]] == time[0]
+    return test._replace(rise=BEFORE_ROWS) if before else test
+
+
 #: A load jumps if it changes between two rows by more than this part of its largest value, and if the changes before
 #: and after are below the second part of this change.
 _JUMP, _COMPLETE = 0.05, 0.5
@@ -240,7 +254,8 @@ def _rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns
     """The columns with a row before each jump that has the values of the earlier row, `ramp` [s] before the later
     row."""
     interval = time[rows] - time[rows - 1]
-    before = time[rows] - np.clip(ramp, 0.1 * AT_ONCE * interval, interval)
+    after = np.append(np.diff(time), np.inf)[rows]
+    before = time[rows] - np.clip(ramp, 0.1 * AT_ONCE * np.minimum(interval, after), interval)
     new = before > time[rows - 1]
     return tuple(
         np.insert(values, rows[new], added[new])
@@ -253,11 +268,15 @@ def with_steps(test: TimeTest) -> TimeTest:
 
     If the rows begin under load, the step is at 0 s.
     """
-    driven = test.driven.copy()
+    driven, jumps = test.driven.copy(), test.jumps
     if test.rise == BEFORE_ROWS:
-        driven[0] = driven[1]
-        return test._replace(driven=driven)
-    time, driven, answer = _rows_before_jumps(test.jumps, 0.0, test.time, test.driven, test.answer)
+        driven[: jumps[0]] = driven[jumps[0]]
+        jumps = jumps[1:]
+    shown = np.flatnonzero(np.isfinite(test.answer))
+    for row in jumps:
+        last = shown[np.searchsorted(shown, row) - 1]
+        driven[last + 1 : row] = driven[last]
+    time, driven, answer = _rows_before_jumps(jumps, 0.0, test.time, driven, test.answer)
     used = np.isin(time, test.time[test.used])
     return test._replace(time=time, driven=driven, answer=answer, used=used)
 

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.ndimage
 
 from fitting.readers.tables.time_columns import read_columns
-from fitting.readers.time_tests import DESCRIBED, GIVEN, TimeTest, from_rest, of_columns
+from fitting.readers.time_tests import TimeTest, from_rest, of_columns, with_known_rise
 from fitting.rigs import glued, thin_layer
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
@@ -106,9 +106,8 @@ def read_described(path: str | Path) -> TimeTest:
     if described.test in ("sphere", "cone"):
         section = curve(largest) / (largest / size)
     first, then = (d, force) if described.drive == "displacement" else (force, d)
-    time, first, then, told_of_start = from_rest(
-        columns["time"], first, then, 0.0 if described.at_once else None, (str(described.data), "ramp")
-    )
+    ramp, (own_time, own_drive) = 0.0 if described.at_once else None, (columns["time"], first)
+    time, first, then, told_of_start = from_rest(own_time, first, then, ramp, (str(described.data), "ramp"))
     d, force = (first, then) if described.drive == "displacement" else (then, first)
     if described.test in ("sphere", "cone"):
         kept, told_of_way = _while_contact_grows(time, sign * d)
@@ -126,7 +125,7 @@ def read_described(path: str | Path) -> TimeTest:
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
     notes = [*notes, *told, *told_of_start]
     test = of_columns(kind, time, driven, answer, (str(path), notes), described.min_time)
-    return test._replace(rise=GIVEN if described.at_once else DESCRIBED)
+    return with_known_rise(test, own_time, own_drive, ramp)._replace(described=True)
 
 
 def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list[str]]:

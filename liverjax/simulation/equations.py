@@ -130,7 +130,7 @@ def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
     e = _of_physics(scene, physics_of(still), at_rest, jnp.ones((), x.dtype), Sizes(none, none))
     q = unknowns(e, x)
     f = forces(e, q if e.mixed is None else settled(e, q, none), none)
-    return f.total - sum(_at_end(e, x), jnp.zeros_like(x))
+    return f.total - sum(_at_end(e, x, none), jnp.zeros_like(x))
 
 
 def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
@@ -349,7 +349,7 @@ def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.A
     Args:
         total: sum of all forces at positions x (V, 3), as in the step's equations.
     """
-    doubled = _at_end(e, x)
+    doubled = _at_end(e, x, 1.0)
     if not doubled:
         return total, None
     force = sum(doubled[1:], doubled[0])
@@ -357,9 +357,9 @@ def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.A
     return total - 0.5 * (force - mass.inertial(a)), a
 
 
-def _at_end(e: Equations, x: jax.Array) -> list[jax.Array]:
-    """Forces (V, 3) [N] that act at the end of a step only, doubled."""
-    return [a.force(e.mesh, x, 1.0) for a in e.nodal if a.at_end]
+def _at_end(e: Equations, x: jax.Array, s: Number) -> list[jax.Array]:
+    """Forces (V, 3) [N] of the parts that act at the end of a step only, doubled, at fraction s of the step."""
+    return [a.force(e.mesh, x, s) for a in e.nodal if a.at_end]
 
 
 def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:

@@ -7,7 +7,7 @@ it may have been a step at 0 s. The change matters if relaxation times are as sh
 from fitting.fits import time_tests
 from fitting.fits.families import limits
 from fitting.fits.time_tests import TimeFit
-from fitting.readers.time_tests import BEFORE_ROWS, DESCRIBED, TimeTest, with_steps
+from fitting.readers.time_tests import BEFORE_ROWS, TimeTest, with_steps
 
 #: Key in `TimeFit.details`: changes of G0, ratios, times and equilibrium modulus if the load was a step, by name.
 OF_A_STEP = "change_if_the_load_was_a_step"
@@ -34,7 +34,7 @@ def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
     changes = dict(zip(own.uncertainty.names, map(float, moved), strict=True))
     if own.kind.name == "prony":
         changes["equilibrium_modulus"] = limits.equilibrium_of(step.model) - limits.equilibrium_of(own.model)
-    known = fit.parameters is None and test.rise != DESCRIBED
+    known = fit.parameters is None and not test.described
     told = (
         f"{_assumed_between_rows(test)} G0 is {values[0] + moved[0]:.4g} Pa instead of {values[0]:.4g} Pa"
         f"{' with Prony modes' if own is not fit else ''} (the total errors "
@@ -59,10 +59,10 @@ def _assumed_between_rows(test: TimeTest) -> str:
 
 
 def _remedy_of_jumps(test: TimeTest) -> str:
-    name = "ramp = 0 in the description" if test.rise == DESCRIBED else "--ramp 0"
+    name = "ramp = 0 in the description" if test.described else "--ramp 0"
     if test.rise == BEFORE_ROWS:
         return f"give the rows of the rise, or {name} for a step at 0 s"
-    seconds = "" if test.rise == DESCRIBED else ", or --ramp with the seconds of the change until the later row"
+    seconds = "" if test.described else ", or --ramp with the seconds of the change until the later row"
     return f"give more rows there, or {name} for a step{seconds}"
 
 

@@ -3,8 +3,8 @@
 import os
 from pathlib import Path
 
-#: Files of Linux: the memory that is free or can be freed, and the limit of a container [bytes].
-_FREE, _LIMIT = Path("/proc/meminfo"), Path("/sys/fs/cgroup/memory.max")
+#: Files of Linux: the memory that is free or can be freed; limit and use of a container [bytes].
+_FREE, _LIMIT, _USED = Path("/proc/meminfo"), Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
 
 
 def free_memory() -> float:
@@ -18,6 +18,6 @@ def free_memory() -> float:
         except (AttributeError, OSError, ValueError):  # Windows has no sysconf
             return float("inf")
     try:
-        return min(free, float(_LIMIT.read_text()))
+        return min(free, float(_LIMIT.read_text()) - float(_USED.read_text()))
     except (OSError, ValueError):  # no container, or no limit ("max")
         return free
