@@ -300,8 +300,8 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     ]
     elastic = _without_relaxation(test, chosen)
     advice = "try fewer modes" if chosen.modes > 1 else "look at the data"
-    out = [elastic] if elastic else []
-    out += [] if chosen.converged else [f"the fit did not converge; its best point is given: {advice}"]
+    out = [_told_of_elastic(elastic)] if elastic else []
+    out += [] if chosen.converged or elastic else [f"the fit did not converge; its best point is given: {advice}"]
     mean = float(chosen.relative_errors.mean())
     if mean > 0.05:
         out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try more modes, or look at the data")
@@ -309,37 +309,46 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     if lowest < criterion(chosen) - 10 and closer.modes != chosen.modes:
         errors = [float(f.relative_errors.mean()) for f in (closer, chosen)]
         out.append(viscoelastic.closer_but_not_chosen(closer.modes, errors, closer.converged))
-    out += uncertainty.superfluous(test, chosen.uncertainty)
+    out += [] if elastic else uncertainty.superfluous(test, chosen.uncertainty)
     low, high = test.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):
-        if not low <= tau <= high:
+        if not elastic and not low <= tau <= high:
             out.append(f"relaxation_times[{k}] = {tau:.3g} s lies outside the {low:.3g}-{high:.3g} s of the test")
     out += structured_misfit(chosen)
     runs, chance = kramers_kronig.runs_probability(chosen.fitted - chosen.measured)
     details = {"tried": sorted(table, key=lambda row: row["above_the_lowest"]), "answers_fitted": len(chosen.measured)}
     details["residuals"] = {"runs": runs, "probability": chance}
+    details |= {ELASTIC: elastic} if elastic else {}
     seconds = {n: sum(getattr(f, n) for f in tried) for n in ("run_time", "compile_time")}
     return chosen._replace(warnings=tuple(out), details=details, **seconds)
 
 
-def _without_relaxation(test: TimeTest, chosen: TimeFit) -> str:
-    """A sentence if one modulus without any mode explains the test as well as the chosen fit."""
+#: Key in `TimeFit.details`: modulus [Pa] of an elastic material that explains the test as well, with standard error.
+ELASTIC = "elastic"
+
+
+def _without_relaxation(test: TimeTest, chosen: TimeFit) -> dict[str, float] | None:
+    """The modulus of an elastic material, if it explains the test as well as the chosen fit; else None."""
     rows = thinned(test)
     x, y, s = test.driven[rows], test.answer[rows], _scales(test, rows)
     square = float(np.sum((x / s) ** 2))
     if not square > 0:
-        return ""
+        return None
     ratio, m = float(np.sum(x * y / s**2)) / square, len(rows)
     rss = max(float(np.sum(((ratio * x - y) / s) ** 2)), 2e-300 * m)
     if ratio <= 0 or m * np.log(rss / m) + np.log(m) > criterion(chosen):
-        return ""
+        return None
     error = float(np.sqrt(rss / max(m - 1, 1) / square)) / ratio
     modulus = ratio if test.kind == "relaxation" else 1 / ratio
+    return {"shear_modulus": modulus, "standard_error": modulus * error}
+
+
+def _told_of_elastic(elastic: dict[str, float]) -> str:
     return (
-        f"the test shows no relaxation: an elastic material of {modulus:.4g} ± {modulus * error:.2g} Pa explains it as "
-        "well; ratios and relaxation times have no meaning here, and this is the value of G0 and of the equilibrium "
-        "modulus"
-    )
+        "the test shows no relaxation: an elastic material of {shear_modulus:.4g} ± {standard_error:.2g} Pa explains "
+        "it as well; ratios and relaxation times have no meaning here, and this is the value of G0 and of the "
+        "equilibrium modulus"
+    ).format(**elastic)
 
 
 def structured_misfit(fit: TimeFit) -> list[str]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fitting.fits import time_tests
 from fitting.fits.families import limits
 from fitting.fits.honesty import total_error
 from fitting.fits.honesty.long_times import INTERVAL
@@ -88,6 +89,12 @@ def _total_errors_in_time(fit: TimeFit) -> Content:
 def table(test: TimeTest, fit: TimeFit) -> str:
     """Parameters ± standard error, and the criterion of each number of modes."""
     rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
+    if time_tests.ELASTIC in fit.details:
+        elastic = fit.details[time_tests.ELASTIC]
+        rows.append(
+            f"elastic, G {elastic['shear_modulus']:.5g} ± {elastic['standard_error']:.2g} Pa: no relaxation seen;"
+        )
+        rows.append("the modes below have no meaning")
     rows += _rows_of_modes(fit) if fit.parameters is None else own_rows(fit.parameters, fit.kind, fit.details)
     errors = fit.relative_errors
     rows.append(f"mean error {100 * errors.mean():.3g} %, largest {100 * errors.max():.3g} %")

@@ -196,6 +196,8 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
 
 def _with_ends_of_record(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
     fit = fit._replace(details=fit.details | {CONSTANT_NOISE: test.constant_noise})
+    if time_tests.ELASTIC in fit.details and not fit.converged:
+        return fit  # its modes mean nothing
     fit = with_rise_of_load(fit, test, prony)
     return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise]), test)
 
