@@ -350,6 +350,22 @@ def test_a_sphere_starts_where_the_map_is_known(problem):
 
 
 @pytest.mark.slow
+def test_a_map_shows_the_numbers_that_the_runs_use(tmp_path, capsys):
+    """A region of the scene sets mu in its upper half, as in the truth: the map showed 900 to 1,100 there."""
+    (tmp_path / "s.toml").write_text(
+        _SCENE.format(mu=800.0, gravity="4, 0, -3") + "[[region]]\nwhere = {x_min = 0.03}\nlaw = {mu = 3000.0}\n"
+    )
+    scene = lj.load_scene(tmp_path / "s.toml")
+    data = _write(tmp_path / "d.csv", scene, 2e-5, mu=1000.0)
+    assert main(["field", str(tmp_path / "s.toml"), str(data), "--noise", "2e-5", "--out", str(tmp_path / "o")]) == 0
+    assert "keep the law.mu of their [[region]]: the map says nothing there" in capsys.readouterr().err
+    with h5py.File(tmp_path / "o" / "field.h5") as f:
+        modulus, given = f["modulus"][:], f["given"][:]
+    assert given.sum() == len(given) // 2 and np.all(modulus[given] == 3000)
+    assert abs(np.median(modulus[~given]) / 1000 - 1) < 0.15
+
+
+@pytest.mark.slow
 def test_the_command_maps_quadratic_elements(tmp_path):
     (tmp_path / "scene.toml").write_text(
         _SCENE.format(mu=1000.0, gravity="4, 0, -3").replace("[law]", "order = 2\n[law]")

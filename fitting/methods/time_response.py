@@ -32,9 +32,9 @@ def _phi(x: Array) -> tuple[Array, Array]:
     """(1 - e^-x) / x and (x - 1 + e^-x) / x^2, also at 0."""
     xp = arrays_of(x)
     small = x < 1e-3
-    safe = xp.where(small, 1.0, x)
-    one = xp.where(small, 1 - x / 2 + x**2 / 6 - x**3 / 24, -xp.expm1(-safe) / safe)
-    two = xp.where(small, 0.5 - x / 6 + x**2 / 24 - x**3 / 120, (safe + xp.expm1(-safe)) / safe**2)
+    near, safe = xp.where(small, x, 0.0), xp.where(small, 1.0, xp.where(x > 1e100, 1e100, x))  # powers stay finite
+    one = xp.where(small, 1 - near / 2 + near**2 / 6 - near**3 / 24, -xp.expm1(-safe) / safe)
+    two = xp.where(small, 0.5 - near / 6 + near**2 / 24 - near**3 / 120, (safe + xp.expm1(-safe)) / safe**2)
     return one, two
 
 
