@@ -256,14 +256,20 @@ def test_each_region_has_the_error_of_waves_of_its_own_length():
     assert abs(bias[0, 0] - bias[0, 1]) > 0.1 * abs(bias[0, 0])
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
-def test_the_error_of_the_voxels_of_a_thin_slab_is_known(seed):
-    """Two bricks thick, six waves of any polarisation. One polarisation for each direction, and equal weights, missed
-    the error by 0.8 of its size on average; now 0.3 (12 seeds)."""
+@pytest.mark.parametrize(
+    ("layers", "seed"),
+    [(5, 0), (3, 0), *(pytest.param(*own, marks=pytest.mark.slow) for own in ((5, 1), (5, 2), (3, 1)))],
+)
+def test_the_error_of_the_voxels_of_a_thin_slab_is_known(layers, seed):
+    """One or two bricks thick, six waves of any polarisation (12 seeds).
+
+    In two bricks, one polarisation for each direction and equal weights missed the error by 0.8 of its size on average;
+    now 0.3. In one brick they missed it by 0.17, and both polarisations with equal weights by 0.12; now 0.017.
+    """
     rng, sizes = np.random.default_rng(seed), np.array([2e-3, 2.2e-3, 1.8e-3])
     G = 2500 + 1600j
     X = np.stack(
-        np.meshgrid(*[n * s for n, s in zip(map(np.arange, (9, 9, 5)), sizes, strict=True)], indexing="ij"), -1
+        np.meshgrid(*[n * s for n, s in zip(map(np.arange, (9, 9, layers)), sizes, strict=True)], indexing="ij"), -1
     )
     X = X - X.mean(axis=(0, 1, 2))
     k, u = 2 * np.pi * 90.0 * np.sqrt(DENSITY / G), 0.0
@@ -272,11 +278,11 @@ def test_the_error_of_the_voxels_of_a_thin_slab_is_known(seed):
         n /= np.linalg.norm(n)
         p = np.cross(n, p) / np.linalg.norm(np.cross(n, p))
         u = u + 1e-5 * (rng.normal() + 1j * rng.normal()) * np.exp(-1j * k * (X @ n))[..., None] * p
-    whole = np.ones((9, 9, 5), bool)
+    whole = np.ones((9, 9, layers), bool)
     field = wave_field.WaveField(np.array([90.0]), u[None], sizes, np.zeros(3), whole, None, np.array([1e-9]))
     found = elastography.regions_of(elastography.organ_of(field, elastography.body_of(field), DENSITY))
     error = found.whole.modulus[0, 0] / G - 1
-    assert abs(found.mesh_bias[0] - error) < 0.6 * abs(error)
+    assert abs(found.mesh_bias[0] - error) < (0.6 * abs(error) if layers == 5 else 0.05)
 
 
 def _waves_of_many_directions(shape, seed):
