@@ -150,8 +150,8 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
     assert again.chi2 <= found.chi2 * 1.001 and again.deviation == found.deviation
     with pytest.raises(lj.InputError, match="belongs to another fit"):
         field.estimate(problem, name="law.bulk", length=0.02, file=file, resume=True)
-    (one,) = problem.scenes
-    other = problem._replace(scenes=(replace(one, solve=replace(one.solve, newton_iterations=24)),))
+    scenes = (replace(scene, solve=replace(scene.solve, newton_iterations=24)) for scene in problem.scenes)
+    other = problem._replace(scenes=tuple(scenes))
     with pytest.raises(lj.InputError, match=r"another fit \(law or settings differs\)"):
         field.estimate(other, length=0.02, file=file, resume=True)
 
