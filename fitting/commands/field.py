@@ -121,8 +121,8 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     with bar:
         found = field.estimate(problem, options.name, length, how)
     good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR
-    print(field_report.table_of_field(found))
-    content = _files(options) | {"map": field_report.of_field(found) | {"mesh_error_over_noise": beside}}
+    print(field_report.table_of_field(mesh, found))
+    content = _files(options) | {"map": field_report.of_field(mesh, found) | {"mesh_error_over_noise": beside}}
     _warn(field_report.noise_sentence(found))
     _warn(field.distance_sentence(found))
     _warn(field.level_sentence(found))

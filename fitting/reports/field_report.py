@@ -97,15 +97,27 @@ def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
     }
 
 
-def of_field(found: Field) -> Content:
+def _mapped(mesh: TetMesh, found: Field) -> np.ndarray:
+    """Numbers of the nodes at which the map says something: those of elements without a value from a [[region]]."""
+    return np.unique(mesh.element_nodes_on_host[:, ~found.given])
+
+
+def _sd_of_map(mesh: TetMesh, found: Field) -> np.ndarray:
+    """Standard deviations of m at the vertices among these nodes."""
+    mapped = _mapped(mesh, found)
+    return found.sd[mapped[mapped < len(found.sd)]]
+
+
+def of_field(mesh: TetMesh, found: Field) -> Content:
     """The content of field.json for a map."""
+    sd = _sd_of_map(mesh, found)
     return {
         "name": found.name,
         "smallest": float(found.modulus[~found.given].min()),
         "largest": float(found.modulus[~found.given].max()),
         "elements_given_by_regions": int(found.given.sum()),
-        "smallest_standard_deviation_of_ln": float(np.min(found.sd)),
-        "largest_standard_deviation_of_ln": float(np.max(found.sd)),
+        "smallest_standard_deviation_of_ln": float(np.min(sd)),
+        "largest_standard_deviation_of_ln": float(np.max(sd)),
         "prior_deviation": found.deviation,
         "correlation_length_m": found.length,
         "largest_mesh_bias_of_ln": None if found.mesh_bias is None else float(np.abs(found.mesh_bias).max()),
@@ -130,7 +142,7 @@ def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> No
         at_nodes["mesh_bias_of_ln"] = found.mesh_bias
     at_nodes = {name: np.array(on_middles(mesh, jnp.asarray(values))) for name, values in at_nodes.items()}
     at_nodes["factor"] = np.exp(at_nodes["factor"])
-    unknown = np.setdiff1d(np.arange(mesh.number_of_nodes), mesh.element_nodes_on_host[:, ~found.given])
+    unknown = np.setdiff1d(np.arange(mesh.number_of_nodes), _mapped(mesh, found))
     for values in at_nodes.values():
         values[unknown] = np.nan
     write_mesh(out / "field.vtu", mesh, at_nodes)
@@ -161,17 +173,19 @@ def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n:
 def map_figure(mesh: TetMesh, found: Field) -> "Figure":
     """Sections through the node whose value is farthest from the median: the factor on the parameter of the scene, and
     its uncertainty."""
-    middle = np.asarray(mesh.points)[np.argmax(np.abs(found.log_factor - np.median(found.log_factor)))]
+    shown = np.isin(np.arange(len(found.sd)), _mapped(mesh, found))
+    factor, sd = (np.where(shown, values, np.nan) for values in (np.exp(found.log_factor), found.sd))
+    middle = np.asarray(mesh.points)[np.nanargmax(np.abs(np.log(factor) - np.nanmedian(np.log(factor))))]
     figure, axes = pyplot().subplots(2, 3, figsize=(11, 5.5), layout="constrained")
     rows = (
-        (np.exp(found.log_factor), f"{found.name} over the scene's [1]", "viridis"),
-        (found.sd, "standard deviation of its logarithm", "magma"),
+        (factor, f"{found.name} over the scene's [1]", "viridis"),
+        (sd, "standard deviation of its logarithm", "magma"),
     )
     for row, (values, label, colours) in zip(axes, rows, strict=True):
         for axis in range(3):
-            shown, extent = section(mesh, values, middle, axis)
+            plane, extent = section(mesh, values, middle, axis)
             drawn = row[axis].imshow(
-                shown, origin="lower", extent=extent, cmap=colours, vmin=values.min(), vmax=values.max()
+                plane, origin="lower", extent=extent, cmap=colours, vmin=np.nanmin(values), vmax=np.nanmax(values)
             )
             a, b = (name for k, name in enumerate("xyz") if k != axis)
             row[axis].set(xlabel=f"{a} [cm]", ylabel=f"{b} [cm]", title=f"{'xyz'[axis]} = {100 * middle[axis]:.1f} cm")
@@ -190,7 +204,7 @@ def table_of_numbers(found: Estimate) -> str:
     return "\n".join(rows)
 
 
-def table_of_field(found: Field) -> str:
+def table_of_field(mesh: TetMesh, found: Field) -> str:
     """Table of the tried fits, and the result, for the terminal."""
     rows = ["prior sd  chi2/component  iterations  evaluations  seconds"]
     for h in found.history:
@@ -198,8 +212,8 @@ def table_of_field(found: Field) -> str:
             f"{h['deviation']:8g}  {h['chi2_per_component']:14.4f}  {h['iterations']:10.0f}  {h['evaluations']:11.0f}  "
             f"{h['seconds']:7.1f}"
         )
-    own = found.modulus[~found.given]
-    known, factors = int(np.sum(found.eigenvalues > 1)), np.exp([np.min(found.sd), np.max(found.sd)])
+    own, sd = found.modulus[~found.given], _sd_of_map(mesh, found)
+    known, factors = int(np.sum(found.eigenvalues > 1)), np.exp([np.min(sd), np.max(sd)])
     rows.append(
         f"{found.name} from {own.min():.4g} to {own.max():.4g}, known to a factor of "
         f"{factors[0]:.3g} to {factors[1]:.3g} (one standard deviation); the data determine "
