@@ -11,6 +11,7 @@ from liverjax.core.struct import replace
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.contact.friction import RoughObstacle
 from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.physics.rigid_plate import RigidPlate
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -51,6 +52,48 @@ def test_a_still_obstacle_gives_no_energy():
     # The held faces carry what the plane presses, but for the inertia of the motion that is left.
     force = np.asarray(lj.obstacle_forces(scene, result).force)[0, 100:, 2].mean()
     assert np.isclose(np.asarray(result.reactions)[100:, :, 2].sum(axis=1).mean(), force, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("side", "by", "mass"),
+    [
+        ("z_min", "angle", "consistent"),
+        pytest.param("z_max", "torque", "lumped", marks=pytest.mark.slow),
+        pytest.param("z_max", "torque", "consistent", marks=pytest.mark.slow),
+    ],
+)
+def test_an_obstacle_gives_a_body_with_a_rigid_plate_no_energy(side, by, mass):
+    """The body rises against a plane. Its rigid plate touches the plane (z_max) or not (z_min). At the end of each step
+    m (v1 - v0) = dt (weight + contact), along the axis of the plate."""
+    scene, dt, weight = block(1), 0.002, DENSITY * SIDE**3 * 9.81
+    nodes = jnp.asarray(scene.mesh.node_sets[side])
+    centre = jnp.array([SIDE / 2, SIDE / 2, 0.0])
+    plate = RigidPlate(nodes=nodes, turn=0.0, by=by, lifts=True, centre=centre)
+    above = plane(scene, position=jnp.array([0.0, 0.0, SIDE + 1e-3]))
+    scene = replace(
+        scene,
+        body=replace(scene.body, gravity=jnp.array([0.0, 0.0, 9.81]), mass=mass),
+        physics=(plate, above),
+        solve=replace(scene.solve, dt=dt, steps=60),
+    )
+    result = lj.simulate(scene).check()
+    mesh, x = scene.mesh, np.concatenate([np.asarray(scene.mesh.points)[None], np.asarray(result.positions)])
+    velocity = np.diff(x, axis=0) / dt
+    centre = DENSITY * np.einsum("v,tv->t", np.asarray(nodal_volumes(mesh)), x[:, :, 2])
+    if mass == "lumped":
+        moving = 0.5 * DENSITY * np.einsum("v,tvi,tvi->t", np.asarray(nodal_volumes(mesh)), velocity, velocity)
+    else:
+        own = velocity[:, np.asarray(mesh.tetrahedra)]
+        share = DENSITY / 20 * np.asarray(mesh.volumes)
+        moving = 0.5 * np.einsum("e,teai,tebi,ab->t", share, own, own, 1 + np.eye(4))
+    given = 9.81 * (0.5 * (centre[1:] + centre[:-1]) - centre[0])
+    contact = np.asarray(lj.obstacle_forces(scene, result).force)[0, :, 2]
+    assert contact.max() > weight and np.flatnonzero(contact)[0] > 3
+    assert np.all(moving < given + 1e-9 * given.max()) and moving.max() > 0.1 * given.max()
+    momentum = [0.0]
+    for way in np.diff(centre):  # v0 + v1 is twice the way over dt
+        momentum.append(2 * way / dt - momentum[-1])
+    assert np.allclose(np.diff(momentum) / dt - weight, -contact, atol=1e-6 * contact.max())
 
 
 @pytest.mark.parametrize(

@@ -230,8 +230,8 @@ class NodalForce:
         """Positions (V, 3) [m] that the body would reach without forces, as a guess for Newton; None: no such guess."""
         return None
 
-    def accelerations(self, force: jax.Array) -> jax.Array | None:
-        """Accelerations (V, 3) [m/s^2] of free nodes by a force (V, 3) [N]; None: the part has no mass."""
+    def accelerations(self, force: jax.Array, x: jax.Array) -> jax.Array | None:
+        """Accelerations (V, 3) [m/s^2] of free nodes at x (V, 3) by a force (V, 3) [N]; None: the part has no mass."""
         return None
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:

@@ -48,7 +48,8 @@ class Inertia(Physics):
         """
         acceleration = None
         if self.integrator == "newmark":
-            acceleration = _accelerations(*self._masses(start.mesh), start.free, -start.force())
+            force = -start.free.vectors(start.force())
+            acceleration = _accelerations(*self._masses(start.mesh), start.free, force)
         return Motion(jnp.zeros_like(start.x), acceleration)
 
     @classmethod
@@ -88,17 +89,22 @@ class Inertia(Physics):
 
 
 def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: jax.Array) -> jax.Array:
-    """Solution a (V, 3) [m/s^2] of m a = f in free directions; 0 along others."""
-    force = free.vectors(force)
-    if shared is None:
+    """Solution a (V, 3) [m/s^2] of m a = f in free directions, for free parts f (V, 3) [N]; 0 along others."""
+    if shared is None and not free.tied:
         return force / mass[:, None]
+
+    # In reverse mode a cotangent may have parts along held directions: the matrix is regular there, too.
+    mean = jnp.mean(mass)
 
     def product(a: jax.Array) -> jax.Array:
         own = free.vectors(a)
-        return free.vectors(_inertia(mass, shared, own)) + mass[:, None] * (a - own)
+        return free.vectors(_inertia(mass, shared, own)) + mean * (a - own)
 
-    # In reverse mode a cotangent may have parts along held directions: the matrix is regular there, too.
-    found = jax.scipy.sparse.linalg.cg(product, force, tol=_EXACT, M=lambda r: r / mass[:, None])[0]
+    def nearly_solved(r: jax.Array) -> jax.Array:
+        own = free.vectors(r)
+        return free.vectors(own / mass[:, None]) + (r - own) / mean
+
+    found = jax.scipy.sparse.linalg.cg(product, force, tol=_EXACT, M=nearly_solved)[0]
     return free.vectors(found)
 
 
@@ -150,10 +156,10 @@ class Moving(NodalForce):
         """Mass times acceleration."""
         return _inertia(self.mass, self.shared, self.kinematics(x)[1])
 
-    def accelerations(self, force: jax.Array) -> jax.Array | None:
+    def accelerations(self, force: jax.Array, x: jax.Array) -> jax.Array | None:
         """Solution a (V, 3) of m a = f in free directions."""
         assert self.free is not None
-        return _accelerations(self.mass, self.shared, self.free, force)
+        return _accelerations(self.mass, self.shared, self.free, self.free.vectors(force, x))
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:
         """Mass times acceleration."""

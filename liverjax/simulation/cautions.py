@@ -21,6 +21,7 @@ from liverjax.physics.contact.passage import passed_in_step
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.loads import follows, nodal_tractions
+from liverjax.physics.rigid_plate import RigidPlate
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes import regions
 from liverjax.scenes.by_element import by_element
@@ -208,6 +209,8 @@ def _gives_no_energy(physics: Physics) -> bool:
     """Whether a physics without a history begins without stored energy, and nothing else gives it any."""
     if isinstance(physics, Obstacle):
         return not isinstance(physics, PressedObstacle) and physics.by is None
+    if isinstance(physics, RigidPlate):
+        return not np.any(np.asarray(physics.turn))
     return isinstance(physics, SlidingSupport | ElasticSupport | Membrane)
 
 

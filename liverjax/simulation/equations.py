@@ -135,8 +135,7 @@ def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
 
 def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
     moving = scene.solve.kind == "dynamic"
-    # Nodes that move together accelerate together: for them the mean of the forces is taken.
-    averaged = moving and scene.solve.integrator == "newmark" and not any(p.ties for p in scene.physics)
+    averaged = moving and scene.solve.integrator == "newmark"
     return Step(scene.mesh, x, 1, scene.solve.steps, scene.solve.dt, moving, None, free, averaged)
 
 
@@ -313,10 +312,12 @@ def residual(
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
     """Out-of-balance forces (3 V,) [N] at fraction s of the step, sum of the norms of all forces [N], and pressures."""
     f = forces(e, q, s, guess)
-    at_work = e.noise + jnp.linalg.norm(f.internal)
+    at_work = jnp.linalg.norm(f.internal)
     for force in f.nodal:
         at_work = at_work + jnp.linalg.norm(force)
-    r, at_work = flat(e.free.vectors(f.total, f.x)), jax.lax.stop_gradient(at_work)
+    if e.mixed is not None:
+        at_work = e.mixed.counted * at_work
+    r, at_work = flat(e.free.vectors(f.total, f.x)), jax.lax.stop_gradient(e.noise + at_work)
     if e.mixed is not None:
         r = jnp.concatenate([r, e.mixed.unit * e.mixed.balance(e.mesh, f.pressure, determinant(f.F))])
     return r, at_work, f.pressure
@@ -353,7 +354,7 @@ def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.A
     if not doubled:
         return total, None
     force = sum(doubled[1:], doubled[0])
-    (mass, a) = next((part, a) for part in e.nodal if (a := part.accelerations(force)) is not None)
+    (mass, a) = next((part, a) for part in e.nodal if (a := part.accelerations(force, x)) is not None)
     return total - 0.5 * (force - mass.inertial(a)), a
 
 
