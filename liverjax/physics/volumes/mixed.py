@@ -24,6 +24,7 @@ import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, static, struct
+from liverjax.elements.mjed import nodal_force
 from liverjax.laws.base import Law, Volumetric, isochoric_part, volumetric_part
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.adjacency import PAIRS
@@ -73,6 +74,15 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
 _PART = {1: 0.25, 2: 1.0, 3: 1.0}
 
 
+def _confined(step: Step) -> jax.Array:
+    """Whether a constant pressure causes no force in any free direction."""
+    one = jnp.ones_like(step.mesh.weights)
+    zero = jnp.zeros_like(one)
+    force = nodal_force(step.mesh, tuple(tuple(one if r == c else zero for c in range(3)) for r in range(3)))
+    free = jax.lax.stop_gradient(step.free.vectors(force, step.x))
+    return jnp.linalg.norm(free) <= 1e-6 * jnp.linalg.norm(force)
+
+
 @struct
 class MixedVolume(Physics):
     """The volumetric energy of a law, with pressures as unknowns."""
@@ -92,7 +102,10 @@ class MixedVolume(Physics):
         mean = jax.lax.stop_gradient(jnp.sum(jnp.broadcast_to(mu, step.mesh.weights.shape) * step.mesh.weights))
         volume = jax.lax.stop_gradient(jnp.sum(step.mesh.volumes))
         width = (volume / step.mesh.number_of_vertices) ** (1 / 3)
-        return Mixed(part=part, rest=bulk - part, shear=mu, before=memory, unit=mean / volume / width, kind=kind)
+        soft = jax.lax.stop_gradient(jnp.min(jnp.asarray(mu / bulk)))
+        counted = jnp.where(_confined(step), jnp.minimum(soft, 1.0), 1.0)
+        own = {"unit": mean / volume / width, "counted": counted, "kind": kind}
+        return Mixed(part=part, rest=bulk - part, shear=mu, before=memory, **own)
 
     def advance(self, memory: jax.Array, acting: "Mixed", end: End) -> jax.Array:
         """The pressure at the end of the step."""
@@ -108,6 +121,11 @@ class Mixed(VolumeStress):
     shear: Number = param("Pa", "shear modulus")
     before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
     unit: jax.Array = param("N/m^3", "pressure of an unknown of 1 m, so that all residuals are forces")
+    counted: jax.Array = param(
+        "1",
+        "part of the acting forces that sets the tolerance. In a confined body pressures cause nearly all forces, and "
+        "only small volume changes determine them: there it is mu/K",
+    )
     kind: str = static(about="of the volumetric energy")
 
     coupled: ClassVar[bool] = False
