@@ -64,6 +64,23 @@ def test_one_wrong_stretch_is_not_taken_for_several_samples(tmp_path):
         assert not any("turn back" in note for note in curves.read_curves([tmp_path / "c.csv"])[1])
 
 
+def test_several_ratios_of_the_stretches_are_no_return(tmp_path):
+    """Biaxial tests with three ratios in one file were told to keep one of them."""
+
+    def notes_of(ratios) -> list[str]:
+        lines = ["F11,F22,F33,P11_Pa,P22_Pa"]
+        for ratio in ratios:
+            for e in np.linspace(0.02, 0.25, 8):
+                a, b = 1 + e, 1 + ratio * e
+                P, Q = (200 * (own - 1 / (a * b) ** 2 / own) for own in (a, b))
+                lines.append(f"{a:.9f},{b:.9f},{1 / (a * b):.9f},{P:.9g},{Q:.9g}")
+        (tmp_path / "b.csv").write_text("\n".join(lines) + "\n")
+        return [note for note in curves.read_curves([tmp_path / "b.csv"])[1] if "turn back" in note]
+
+    assert not notes_of((1.0, 0.5, 0.0)) and not notes_of((0.2, 0.0))
+    assert "turn back once" in notes_of((0.5, 0.5))[0]
+
+
 def test_unloading_preload_and_decimal_commas_are_seen(tmp_path, capsys):
     up = np.linspace(1.0, 1.4, 41)
     stress = 1e3 * (up - up**-2)

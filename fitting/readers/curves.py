@@ -330,15 +330,21 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
     F[:, 2, 2] /= J
     driven = Curve(label, test, F, component, stress).driven
     order = np.argsort(driven, kind="stable")
-    return Curve(label, test, F[order], component, stress[order], _returns(driven))
+    return Curve(label, test, F[order], component, stress[order], _returns(driven, F.reshape(len(F), 9)))
 
 
 #: A curve turns if it goes back by more than this part of its range.
 _TURN = 0.05
 
 
-def _returns(driven: np.ndarray) -> int:
-    """How often the rows (n,) turn back and pass again through a range that they have passed before."""
+def _returns(driven: np.ndarray, F: np.ndarray) -> int:
+    """How often the rows turn back and pass again through deformations that they have passed before.
+
+    Args:
+        driven: (n,) the component of the deformation that the test changes.
+        F: (n, 9) all components. Rows with other deformations at the same `driven`, as in biaxial tests with several
+            ratios of the stretches, do not pass through the same again.
+    """
     turns, low, high, least = [0], 0, 0, _TURN * np.ptp(driven)
     rises: bool | None = None
     for k, value in enumerate(driven):
@@ -350,12 +356,18 @@ def _returns(driven: np.ndarray) -> int:
         elif rises is not True and value - driven[low] > least:
             turns += [low] if rises is False else []
             rises, high = True, k
-    parts = [driven[a + (a > 0) : b + 1] for a, b in zip(turns, [*turns[1:], len(driven) - 1], strict=True)]
+    parts = [np.arange(a + (a > 0), b + 1) for a, b in zip(turns, [*turns[1:], len(driven) - 1], strict=True)]
     # A jump back to the start is not a separate part. The extreme value of each part is left out, so that one wrong
     # value does not make a range.
-    parts = [np.sort(part)[1:-1] for part in parts if len(part) >= 3]
-    return sum(
-        1
-        for before, after in itertools.pairwise(parts)
-        if min(before[-1], after[-1]) - max(before[0], after[0]) > 2 * least
-    )
+    parts = [rows[np.argsort(driven[rows], kind="stable")][1:-1] for rows in parts if len(rows) >= 3]
+    return sum(_same_again(driven, F, before, after) for before, after in itertools.pairwise(parts))
+
+
+def _same_again(driven: np.ndarray, F: np.ndarray, before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether the rows `after` have the deformations of the rows `before` over a range, both with rising `driven`."""
+    low, high = max(driven[before[0]], driven[after[0]]), min(driven[before[-1]], driven[after[-1]])
+    if not high - low > 2 * _TURN * np.ptp(driven):
+        return False
+    inside = after[(driven[after] >= low) & (driven[after] <= high)]
+    passed = np.stack([np.interp(driven[inside], driven[before], column[before]) for column in F.T], axis=1)
+    return bool(np.abs(F[inside] - passed).max(initial=0.0) <= _TURN * np.ptp(F, axis=0).max())
