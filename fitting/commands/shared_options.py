@@ -87,11 +87,16 @@ def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") ->
     from fitting.fits import sample_inertia
     from fitting.methods import kramers_kronig
     from fitting.readers.rheometer import some
+    from fitting.rigs import compression
+    from liverjax import laws
 
     density = getattr(options, "density", None)
     if density is None or options.height is None:
         return kramers_kronig.without_instrument(sweep)
+    strain = getattr(options, "precompression", 0.0)
     try:
+        if strain:
+            density = compression.torsional_density(laws.typical(options.law), strain, density)
         bare = sample_inertia.taken_off(sweep, density, options.height)
     except InputError:  # the later step that subtracts the inertia raises this error with its remedy
         return kramers_kronig.without_instrument(sweep)

@@ -412,8 +412,8 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     from fitting.rigs import compression
 
     simulation = _simulation(options)
-    if options.density is not None:
-        sweep, noted = sample_inertia.taken_off(sweep, options.density, simulation.height), sweep.notes
+    if simulation.inertia is not None:
+        sweep, noted = sample_inertia.taken_off(sweep, *simulation.inertia), sweep.notes
         for note in sweep.notes[len(noted) :]:
             print(f"note: {note}", file=sys.stderr)
     if options.modes != "auto":
@@ -450,15 +450,15 @@ def _simulated(options: argparse.Namespace, sweep: "Sweep", closed: "Fit", simul
     contain the inertia."""
     from fitting.fits import sample_inertia, simulated_rheometer
 
-    density, height = simulation.density, simulation.height
-    if density is not None:
-        sweep = sample_inertia.put_back(sweep, density, height)
+    inertia = simulation.inertia
+    if inertia is not None:
+        sweep = sample_inertia.put_back(sweep, *inertia)
     bar, told = cost_bar("evaluations", f"torsion simulation of {len(sweep.angular_frequency)} frequencies")
     with bar:
         fit = simulated_rheometer.through_torsion(sweep, closed, simulation, options.optimizer, told)
-    if density is None:
+    if inertia is None:
         return fit
-    G = sample_inertia.modulus_of(fit.storage + 1j * fit.loss, sweep.angular_frequency, density, height)
+    G = sample_inertia.modulus_of(fit.storage + 1j * fit.loss, sweep.angular_frequency, *inertia)
     return fit._replace(storage=G.real, loss=G.imag)
 
 
@@ -490,8 +490,8 @@ def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Post
         return None
     if fit.method == "torsion":
         simulation = _simulation(options)
-        if simulation.density is not None:  # the simulated moduli contain the inertia
-            inertia = (simulation.density, simulation.height)
+        inertia = simulation.inertia
+        if inertia is not None:  # the simulated moduli contain the inertia
             G = sample_inertia.shown(fit.storage + 1j * fit.loss, sweep.angular_frequency, *inertia)
             fit, sweep = fit._replace(storage=G.real, loss=G.imag), sample_inertia.put_back(sweep, *inertia)
         return posterior.of_simulation(fit, sweep, simulation, options.samples)

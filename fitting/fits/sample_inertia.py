@@ -67,9 +67,8 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
     lost = np.flatnonzero(~(np.isfinite(G) & (G.real > 0) & (G.imag > 0)))
     if lost.size:
         raise InputError(
-            f"{sweep.source or 'sweep'}: at {hertz[lost[0]]:.3g} Hz a sample of {density:g} kg/m^3 and {height:g} m "
-            "has more inertia than modulus: leave such frequencies out by --max-frequency, or check --density and "
-            "--height"
+            f"{sweep.source or 'sweep'}: at {hertz[lost[0]]:.3g} Hz the sample has more inertia than modulus: leave "
+            "such frequencies out by --max-frequency, or check --density and --height"
         )
     change = np.abs(G / seen - 1)
     k, notes = int(change.argmax()), sweep.notes

@@ -49,6 +49,14 @@ class Simulation(NamedTuple):
         with inertia."""
         return self.strain <= LINEAR_STRAIN and not (self.density is not None and self.precompression)
 
+    @property
+    def inertia(self) -> tuple[float, float] | None:
+        """Density [kg/m^3] and height [m] for `sample_inertia`; None if the instrument has subtracted the inertia."""
+        if self.density is None:
+            return None
+        density = compression.torsional_density(laws.typical(self.law), self.precompression, self.density)
+        return density, self.height
+
 
 #: Up to this strain at the rim, the linear rig gives the derivatives. Their relative error is below the strain. With
 #: inertia, it is the error of the mesh in the inertial part.
@@ -126,10 +134,9 @@ def small_strain_moduli(
         scale = model.shear_modulus / law.shear_modulus()
         return scale * torsion.held_moduli(torsion.held(rig, law), rig, prony, omega, simulation.steps)
     G = torsion.linear_moduli(scaled, prony, omega, simulation.steps)
-    if simulation.density is None:
+    if simulation.inertia is None:
         return G
-    rate = sample_inertia.rate_in_steps(omega, simulation.steps)
-    return sample_inertia.shown(G, rate, simulation.density, simulation.height)
+    return sample_inertia.shown(G, sample_inertia.rate_in_steps(omega, simulation.steps), *simulation.inertia)
 
 
 def rig_of(simulation: Simulation) -> torsion.Rig:
@@ -290,8 +297,8 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     else:
         program = compiled(partial(_of_no_mesh, steps=simulation.steps), scaled, prony, omega, short=True)
         meshless, exact = (np.asarray(G) for G in program(scaled, prony, omega))
-    if simulation.density is not None:
-        inertia, rate = (simulation.density, simulation.height), np.asarray(omega)
+    if simulation.inertia is not None:
+        rate, inertia = np.asarray(omega), simulation.inertia
         exact = sample_inertia.shown(exact, rate, *inertia)
         meshless = sample_inertia.shown(meshless, sample_inertia.rate_in_steps(rate, simulation.steps), *inertia)
     natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)

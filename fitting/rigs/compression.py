@@ -94,6 +94,16 @@ def side_stretch(law: Law, strain: float) -> float:
     return float(brentq(lambda a: _cauchy(law, a, axial)[0], 0.9, 1.1 / np.sqrt(axial), xtol=1e-14))
 
 
+def torsional_density(law: Law, strain: float, density: float) -> float:
+    """The density [kg/m^3] that gives the inertia of a compressed sample in `fitting.fits.sample_inertia`, with the
+    moduli that the instrument reports and the gap.
+
+    The compressed cylinder has the radius a R, the density rho / (a^2 l) and a modulus G. The instrument reports a^4 G.
+    So the wave number omega sqrt(rho / (a^2 l G)) is omega sqrt(rho a^2 / (l a^4 G)).
+    """
+    return density if strain == 0 else density * side_stretch(law, strain) ** 2 / (1 - strain)
+
+
 def smooth_force(law: Law, strain: float, radius: float) -> float:
     """Force [N] with which the sample pushes smooth plates apart before relaxation. `radius`: radius of the sample at
     rest [m]."""
