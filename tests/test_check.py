@@ -64,7 +64,7 @@ MISTAKES = {
         def isochoric_derivatives(self, I1, I2):
             return {"I1": self.mu / 2 + self.more * (I1 - 3)}, {("I1", "I1"): self.more}
         """,
-        "stress by hand against autodiff, numbers times 0.8",
+        "stress by hand against autodiff, parameters times 0.8",
     ),
     "another energy than its parts": (
         """
@@ -191,7 +191,7 @@ def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):
 """
     )
     assert main(["check", f"{file}:Law", "--out", str(tmp_path)]) == 1  # a misspelt energy showed in no code
-    (row,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("numbers without effect")]
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("parameters without effect")]
     assert row.split()[3:5] == ["FAILED", "more"]
 
 
@@ -233,7 +233,7 @@ _UNUSABLE = {
         return self.mu / 2 * (I.J ** (-2 / 3) * I.I1 - 3) + self.bulk / 2 * (I.J - 1) ** 2
 """,
     # A run traces the numbers of a law.
-    "decide by its numbers with jnp.where": """
+    "decide by its parameters with jnp.where": """
     def isochoric_energy(self, I1, I2):
         return self.mu / 2 * (I1 - 3) if self.mu > 1 else 0 * I1
 """,

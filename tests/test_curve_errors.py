@@ -91,10 +91,10 @@ def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
     law = lj.laws.Ogden(mu=(333.3,), alpha=(6.0,), bulk=None)
     (shear,) = (c for c in synthetic(law, 0.02, 0) if c.label.startswith("simple"))
     (candidate,) = stress_stretch.candidates("ogden", terms=1)
-    told = [s for s in stress_stretch.fit(candidate, [shear], 32).warnings if s.startswith("other numbers follow")]
+    told = [s for s in stress_stretch.fit(candidate, [shear], 32).warnings if s.startswith("other parameters follow")]
     assert len(told) == 1 and "add a test of tension or compression" in told[0]
     every = stress_stretch.fit(candidate, synthetic(law, 0.02, 0), 32).warnings
-    assert not [s for s in every if s.startswith("other numbers follow")]
+    assert not [s for s in every if s.startswith("other parameters follow")]
 
 
 def test_a_parameter_without_data_is_told():

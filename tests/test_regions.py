@@ -187,7 +187,7 @@ def test_regions_that_lie_over_each_other_may_add_to_each_other(tmp_path):
     ("region", "words"),
     [
         ('[[region]]\nset = "lesion"\nlaw = {bulk = 1.0}', "no element set 'lesion'"),
-        ("[[region]]\nwhere = {x_min = 0.02}", "needs the numbers"),
+        ("[[region]]\nwhere = {x_min = 0.02}", "needs the parameters"),
         ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {c10 = 3.0}", "no number 'c10'"),
         ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {mu = 3.0}", "is a list of 2"),
         ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {bulk = -3.0}", "must be above 0"),

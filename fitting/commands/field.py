@@ -27,8 +27,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
     """Options of the command; --help shows `prog` as its name."""
     command = argparse.ArgumentParser(
         prog=prog,
-        description="Find a map of stiffness, or a few numbers of a scene, from displacements measured at some points. "
-        "Several loads on one body: a scene and a file of displacements for each.",
+        description="Find a map of stiffness, or a few parameters of a scene, from displacements measured at some "
+        "points. Several loads on one body: a scene and a file of displacements for each.",
         epilog=EXIT_CODES,
     )
     command.add_argument(
@@ -44,7 +44,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--sphere", action="store_true", help="also fit a sphere of another stiffness, with a start from the map"
     )
     command.add_argument(
-        "--parameters", metavar="NAME,…", help="these numbers instead of a map, e.g. law.mu,viscosity.ratios"
+        "--parameters", metavar="NAME,…", help="these parameters instead of a map, e.g. law.mu,viscosity.ratios"
     )
     command.add_argument("--noise", type=float, metavar="M", help="standard deviation [m] if a file has no column sd")
     command.add_argument("--unit", default="m", help="unit of the lengths in the displacement files (default m)")

@@ -107,7 +107,7 @@ def run(options: argparse.Namespace) -> int:
     if options.modes != "auto" and options.model != "prony":
         raise InputError(f"--modes works with --model prony only: leave it out for --model {options.model}")
     if options.samples is not None and options.model == "spectrum":
-        raise InputError("--samples works with models of a few numbers only; leave it out for --model spectrum")
+        raise InputError("--samples works with models of a few parameters only; leave it out for --model spectrum")
     out = options.out
     sample = reader.Sample(options.radius, options.height)
     if options.file.suffix.lower() == ".toml":

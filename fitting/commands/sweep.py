@@ -280,7 +280,7 @@ def _check(options: argparse.Namespace) -> None:
     shared_options.refuse_copies([*options.sweep, *options.others])
     shared_options.check_samples(options.samples)
     if options.samples and options.model == "spectrum":
-        raise InputError("--samples works with models of a few numbers only; leave it out for --model spectrum")
+        raise InputError("--samples works with models of a few parameters only; leave it out for --model spectrum")
     laws.find(options.law)
 
 

@@ -280,7 +280,7 @@ def estimate(
     _deviations_in_turn(search, options.max_iterations)
     here = search.at(search.z)
     if not here.finite:
-        raise InputError("the scene has no answer at the numbers where the map begins: run simulate on it first")
+        raise InputError("the scene has no answer at the parameters where the map begins: run simulate on it first")
     deviation, m = here.deviation, np.asarray(here.m)
     values, vectors = _measured_directions(here, len(m), options.modes)
     before, after = smooth.variances(p, vectors, 1 / (1 + values))

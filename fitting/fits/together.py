@@ -390,7 +390,7 @@ def structured(fit: Together) -> list[str]:
             if chance < kramers_kronig.CHANCE:
                 out.append(
                     f"structured misfit of {test.source or name_of(test)}{what}: the residuals change sign {runs - 1} "
-                    f"times over {len(part)} numbers (by chance: {chance:.1g}); the model misses something, or the "
+                    f"times over {len(part)} values (by chance: {chance:.1g}); the model misses something, or the "
                     "tests do not agree there"
                 )
     return out

@@ -146,7 +146,7 @@ def warnings(found: Samples) -> list[str]:
         ("mark of the instrument", "the last points show the instrument"),
         ("Kramers-Kronig", "the data do not agree with themselves"),
         ("structured misfit", "the misfit has structure"),
-        ("half decade", "the ends of the band decide some numbers"),
+        ("half decade", "the ends of the band decide some parameters"),
         (SHORT, "the test ends before the material has relaxed, and no interval of G_inf contains the rest"),
         ("(a fluid)", "the equilibrium modulus cannot be distinguished from zero"),
         ("have merged", "two relaxation times have merged"),
@@ -211,7 +211,7 @@ def table(found: Samples) -> str:
         rows.append(f"{'model':28s} {'criterion':>10s}")
         for row in found.compared:
             label = row["model"] + (f", {row['modes']} modes" if "modes" in row else "")
-            free = "" if row["identifiable"] else "   numbers left free"
+            free = "" if row["identifiable"] else "   parameters left free"
             rows.append(f"{label:28s} {'+' + format(row['above_the_lowest'], '.1f'):>10s}{free}")
     return "\n".join(rows)
 

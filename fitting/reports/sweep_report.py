@@ -476,7 +476,7 @@ def _compression(fits: list[Fit]) -> list[str]:
     kept = one["modulus_if_incompressible"]
     if_kept = "" if kept is None else f"; smooth plates: G0 is {kept:.4g} times as large if the volume is kept"
     return [
-        f"numbers describe the sample before it was compressed by {100 * one['strain']:.3g} % from "
+        f"moduli and ratios describe the sample before it was compressed by {100 * one['strain']:.3g} % from "
         f"{one['height_at_rest_m']:.4g} m (law {one['law']}, K / G {one['bulk_over_shear_modulus']:.3g}{if_kept})",
         f"axial force after relaxation, with all known errors, to be compared with the instrument's: {forces}",
     ]

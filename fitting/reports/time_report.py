@@ -99,7 +99,7 @@ def table(test: TimeTest, fit: TimeFit) -> str:
     errors = fit.relative_errors
     rows.append(f"mean error {100 * errors.mean():.3g} %, largest {100 * errors.max():.3g} %")
     for row in fit.details["tried"] if len(fit.details["tried"]) > 1 else []:
-        free = "" if row["identifiable"] else "   numbers left free"
+        free = "" if row["identifiable"] else "   parameters left free"
         modes = f"{row['modes']:2d} modes, " if row["model"].startswith("prony") else 10 * " "
         rows.append(f"{row['model']:24s} {modes}criterion +{row['above_the_lowest']:.1f}{free}")
     return "\n".join(rows)

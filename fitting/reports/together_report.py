@@ -159,7 +159,7 @@ def table(found: Together, relative: float) -> str:
     for k, s in enumerate(found.shares, 1):
         rows.append(f"{k}: misfit {100 * s.misfit:.2g} %, by itself {100 * s.misfit_alone:.2g} %")
     for row in found.tried if len(found.tried) > 1 else []:
-        free = "" if row["identifiable"] else "   numbers left free"
+        free = "" if row["identifiable"] else "   parameters left free"
         modes = f"{row['modes']:2d} modes, " if row["model"].startswith("prony") else 10 * " "
         rows.append(f"{row['model']:24s} {modes}criterion +{row['above_the_lowest']:.1f}{free}")
     return "\n".join(rows)

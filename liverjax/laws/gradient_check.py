@@ -109,7 +109,8 @@ def _try(law: Law, name: str) -> None:
             except Exception as error:
                 raise InputError(
                     f"{name}: its {what} cannot be evaluated ({_reason(error)}): mend the law, name every invariant "
-                    "it uses in `invariants`, give one direction for fibres, and decide by its numbers with jnp.where"
+                    "it uses in `invariants`, give one direction for fibres, and decide by its parameters with "
+                    "jnp.where"
                 ) from None
             if found != expected:
                 raise InputError(f"{name}: its {what} of F {F.shape} has shape {found}, not {expected}: mend the law")
@@ -170,7 +171,7 @@ def check(law: Law) -> Check:
     rows.append(_exact("tangent symmetric", A, np.transpose(A, (0, 3, 4, 1, 2))))
     rows += _rest_state(law, energy, stress, tangent)
     rows += _limits_of_energy(energy)
-    rows += _parts_row(law, F, W, size) + _idle_numbers_row(law, programs[:2], F)
+    rows += _parts_row(law, F, W, size) + _idle_parameters_row(law, programs[:2], F)
     return Check(law, rows + more, STEPS, errors, stable)
 
 
@@ -200,7 +201,7 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
     sets = [("", law, F)]
     if low < high:  # if only rest is stable, the stress is roundoff
         sets.append((f", stretches {low:.2g} to {high:.2g}", law, _samples(low, high)[0]))
-    sets.append((", numbers times 0.8 (0: 0.1)", _with_other_numbers(law), F))
+    sets.append((", parameters times 0.8 (0: 0.1)", _with_other_parameters(law), F))
     rows = []
     oracles = (autodiff.first_piola, autodiff.tangent)
     for name, program, oracle in zip(("stress", "tangent"), programs, oracles, strict=True):
@@ -215,7 +216,7 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
     return rows
 
 
-def _with_other_numbers(law: Law) -> Law:
+def _with_other_parameters(law: Law) -> Law:
     """The law with other parameters, none of which is 0."""
     return jax.tree.map(lambda v: jnp.where(jnp.asarray(v) == 0, 0.1, 0.8 * jnp.asarray(v)), law)
 
@@ -229,9 +230,9 @@ def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]
     return [_exact("energy is that of its parts", both, W, size)]
 
 
-def _idle_numbers_row(law: Law, programs: Sequence[Callable], F: np.ndarray) -> list[Row]:
+def _idle_parameters_row(law: Law, programs: Sequence[Callable], F: np.ndarray) -> list[Row]:
     """A row with the parameters that change neither energy nor stress; no row if there is none."""
-    law = _with_other_numbers(law)
+    law = _with_other_parameters(law)
     leaves, structure = jax.tree_util.tree_flatten_with_path(law)
     before, idle = [_as_numbers(partial(f, law), F) for f in programs], []
     for k, (path, value) in enumerate(leaves):
@@ -240,7 +241,7 @@ def _idle_numbers_row(law: Law, programs: Sequence[Callable], F: np.ndarray) -> 
         other = jax.tree.unflatten(structure, values)
         if all(np.array_equal(_as_numbers(partial(f, other), F), b) for f, b in zip(programs, before, strict=True)):
             idle.append(jax.tree_util.keystr(path).lstrip("."))
-    return [Row("numbers without effect", ", ".join(idle), "is the energy complete?", False)] if idle else []
+    return [Row("parameters without effect", ", ".join(idle), "is the energy complete?", False)] if idle else []
 
 
 #: Methods of a law. Each is compiled once for all values of the parameters.

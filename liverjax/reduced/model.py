@@ -155,7 +155,9 @@ def refuse_unknown_physics(scene: Scene) -> None:
     if any(region.viscosity for region in scene.region):
         raise InputError("a reduced model has one viscosity: leave the viscosity of regions out, or run the full model")
     if len(laws_of(scene.law, scene.region)) > 1:
-        raise InputError("a reduced model has one kind of law: give regions other numbers of it, or run the full model")
+        raise InputError(
+            "a reduced model has one kind of law: give regions other parameters of it, or run the full model"
+        )
     if scene.porosity is not None and scene.porosity.inlet:
         raise InputError("a reduced model has no [[porosity.inlet]]: leave it out, or run the full model")
     if scene.points_are == "loaded":

@@ -196,7 +196,7 @@ def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) ->
 
     if not len(G):
         raise InputError(
-            "the runs give no forces from which points can be chosen: give at least two rows with different numbers"
+            "the runs give no forces from which points can be chosen: give at least two rows with different parameters"
         )
     # The rows have length 1, so small singular vectors have the same weight as large ones.
     V = principal_fields(G, tolerance)

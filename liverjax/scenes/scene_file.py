@@ -280,7 +280,7 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
         if not isinstance(part, kinds):
             raise InputError(f"{name} {key} = {part!r} must be a table: write e.g. law = {{mu = 2000.0}}")
     if not given and not viscous and not porous:
-        raise InputError(f"{name} needs the numbers that differ there: write law = {{mu = 2000.0}}")
+        raise InputError(f"{name} needs the parameters that differ there: write law = {{mu = 2000.0}}")
     elements = regions.select_elements(mesh, where, table.get("set"), name)
     return Region(
         elements=node_numbers(elements),

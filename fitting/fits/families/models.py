@@ -276,7 +276,7 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
         apart = information_criterion(chosen) - information_criterion(best)
         out.append(
             f"{best.kind.name} would follow the data more closely (criterion {apart:.2g} lower), but the data leave "
-            "some of its numbers free"
+            "some of its parameters free"
         )
     others = [f for f in able if f is not chosen and not contains(label_of(f), label_of(chosen))]
     if not others:
@@ -300,7 +300,7 @@ def comparison(fit: Fit) -> list[str]:
         return []
     lines = [f"{'model':24s} {'parameters':>10s} {'criterion':>10s} {'mean error':>11s}"]
     for row in rows:
-        free = "" if row["identifiable"] else "   numbers left free"
+        free = "" if row["identifiable"] else "   parameters left free"
         lines.append(
             f"{row['model']:24s} {row['parameters']:10.3g} {'+' + format(row['above_the_lowest'], '.1f'):>10s} "
             f"{100 * row['mean_relative_error']:9.2g} %{free}"

@@ -49,8 +49,8 @@ def of_other_minima(
         if not 1 / _RATIO < ratios[k] < _RATIO:
             numbers = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, other, strict=True))
             return [
-                f"other numbers follow these tests as well ({numbers}), but their stress at a stretch of "
-                f"{stretches[k]:.2g} is {ratios[k]:.2g} times that of the numbers given: add a test of tension or "
+                f"other parameters follow these tests as well ({numbers}), but their stress at a stretch of "
+                f"{stretches[k]:.2g} is {ratios[k]:.2g} times that of the given parameters: add a test of tension or "
                 "compression"
             ]
     return []

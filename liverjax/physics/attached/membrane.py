@@ -39,7 +39,10 @@ class Membrane(Physics):
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "Membrane":
         """Read [[membrane]]: a place (by default the whole surface), a thickness and a law."""
-        for key, example in (("thickness", "thickness = 5e-5, in m"), ("law", "[membrane.law] with name and numbers")):
+        for key, example in (
+            ("thickness", "thickness = 5e-5, in m"),
+            ("law", "[membrane.law] with name and parameters"),
+        ):
             if key not in table:
                 raise InputError(f"{name} needs {key}: write {example}")
         whole = "where" not in table and "set" not in table

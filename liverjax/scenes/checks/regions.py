@@ -115,8 +115,8 @@ def _check_hidden(regions: tuple[Region, ...], elements: int) -> None:
         law = taken.get("law", nothing)[own]  # a complete law replaces all parameters
         if all(np.all(taken.get(n, nothing)[own] | (law if n.startswith("law.") else False)) for n in names):
             raise InputError(
-                f"region.{k} changes nothing: later regions give all of its elements the same numbers anew; leave it "
-                "out, or give other places"
+                f"region.{k} changes nothing: later regions give all of its elements the same parameters again; leave "
+                "it out, or give other places"
             )
         for name in names:
             taken.setdefault(name, nothing.copy())[own] = True
@@ -141,5 +141,5 @@ def _check_own_laws(regions: tuple[Region, ...]) -> None:
             if other.law and np.isin(np.asarray(other.elements), elements).any():
                 raise InputError(
                     f"region.{later} changes the law of elements to which region.{k} gives a law of its own: give them "
-                    "separate elements, or write the numbers into that law"
+                    "separate elements, or write the parameters into that law"
                 )
