@@ -234,6 +234,8 @@ def test_pressures_of_a_confined_body_are_exact_to_the_tolerance(order, ratio, t
     top = np.asarray(result.reactions)[-1, np.asarray(mesh.node_sets["z_max"]), 2].sum()
     assert np.isclose(top, exact, rtol=tolerance)
     assert np.allclose(result.positions[-1], np.asarray(mesh.points) * stretch, rtol=0, atol=tolerance * abs(down))
+    if tolerance == 1e-4:  # single precision cannot reach a residual of mu/K of it
+        lj.simulate(replace(scene, solve=replace(scene.solve, precision="float32"))).check()
 
 
 @pytest.mark.slow

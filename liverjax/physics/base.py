@@ -62,6 +62,10 @@ class Tied(Protocol):
         such node.
         """
 
+    def rigid(self, x: jax.Array, velocity: jax.Array, acceleration: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Velocity and acceleration (V, 3) of a rigid motion of the nodes at positions x (V, 3), from those of every
+        node by itself."""
+
 
 class Free(NamedTuple):
     """The directions in which the body can move, as a projection of nodal vectors."""

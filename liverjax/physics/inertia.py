@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from liverjax.core.struct import Number, param, static, struct
 from liverjax.mesh.nodal import mass_parts, nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
-from liverjax.physics.base import End, Free, NodalForce, Physics, Start, Step, diagonal
+from liverjax.physics.base import End, Free, NodalForce, Physics, Start, Step, Tied, diagonal
 from liverjax.solvers import attached
 from liverjax.solvers.attached import Masses, masses
 from liverjax.solvers.block_matrix import Block
@@ -68,6 +68,7 @@ class Inertia(Physics):
             mask, axes = nodes.not_given(mask, axes)
         own = {"x": step.x, "motion": memory, "dt": step.dt, "mask": mask, "integrator": self.integrator}
         own["free"] = step.free if step.averaged else None
+        own["tied"] = step.free.tied if step.averaged else ()
         return Moving(mass=mass, shared=shared, axes=axes, **own)
 
     def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
@@ -83,6 +84,8 @@ class Inertia(Physics):
     def advance(self, memory: Motion, acting: "Moving", end: End) -> Motion:
         """Velocity and acceleration at the end of the step."""
         velocity, acceleration = acting.kinematics(end.x)
+        for nodes in acting.tied:
+            velocity, acceleration = nodes.rigid(end.x, velocity, acceleration)
         if end.by_end_forces is not None:
             acceleration = acceleration + end.by_end_forces
         return Motion(velocity, None if memory.acceleration is None else acceleration)
@@ -128,6 +131,8 @@ class Moving(NodalForce):
     axes: jax.Array | None = param("1", "(V, 3) axis of a lifting plate with a given angle, 0 elsewhere", default=None)
 
     free: Free | None = param("1", "free directions; None if no force acts at the end only", default=None)
+
+    tied: tuple[Tied, ...] = param("1", "nodes that move together, for Newmark's method", default=())
 
     everywhere: ClassVar[bool] = True
 

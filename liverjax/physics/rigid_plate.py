@@ -137,6 +137,22 @@ class Plate(NamedTuple):
             axes = (jnp.zeros_like(mask) if axes is None else axes).at[nodes].set(self._axis(mask))
         return mask.at[nodes].set(0.0), axes
 
+    def rigid(self, x: jax.Array, velocity: jax.Array, acceleration: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """See `liverjax.physics.base.Tied`. Newmark's method for every node by itself would not find the acceleration
+        towards the axis: its error would change its sign in every step, and grow."""
+        if self.plate.by == "angle":
+            return velocity, acceleration
+        nodes, axis, arms = self.plate.nodes, self._axis(x), self.arms(x)
+
+        def motion(field: jax.Array) -> tuple[jax.Array, jax.Array]:
+            lift = jnp.mean(field[nodes] @ axis) if self.plate.lifts else jnp.zeros((), x.dtype)
+            return jnp.sum(arms * field[nodes]) / self.radius**2, lift * axis[None]
+
+        (rate, lift), (growth, up) = motion(velocity), motion(acceleration)
+        towards = rate**2 * jnp.cross(axis[None], arms)
+        velocity = velocity.at[nodes].set(rate * arms + lift)
+        return velocity, acceleration.at[nodes].set(growth * arms + towards + up)
+
     def spread(self, field: jax.Array, turn: Number, lift: Number) -> jax.Array:
         """The field (V, 3) with the plate's rows computed from the amplitudes of its two motions."""
         rows = turn * self._arms(self.carrier) / self.radius

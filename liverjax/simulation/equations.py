@@ -115,6 +115,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
         forces = [a.force(scene.mesh, x, 0.0) for a in acting if isinstance(a, NodalForce) and not a.at_end]
         return sum(forces, jnp.zeros_like(x))
 
+    free = _with_tied(physics, _first_step(scene, x, free)).free
     begin = Start(scene.mesh, x, free, force, moved=start is not None and scene.solve.kind == "dynamic")
     return State(x, tuple(p.begin(begin) for p in physics))
 
@@ -137,6 +138,12 @@ def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
     moving = scene.solve.kind == "dynamic"
     averaged = moving and scene.solve.integrator == "newmark"
     return Step(scene.mesh, x, 1, scene.solve.steps, scene.solve.dt, moving, None, free, averaged)
+
+
+def _with_tied(physics: tuple[Physics, ...], step: Step) -> Step:
+    """The step with the nodes that move together."""
+    tied = tuple(nodes for nodes in (p.tied(step) for p in physics) if nodes is not None)
+    return step._replace(free=step.free._replace(tied=tied))
 
 
 def force_sizes(scene: Scene) -> Sizes:
@@ -188,9 +195,8 @@ def equations(scene: Scene, state: State, k: Number, sizes: Sizes | None = None)
 def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Number, sizes: Sizes) -> Equations:
     free = free_directions(scene)
     tolerance = jax.lax.stop_gradient(scene.solve.tolerance)
-    step = _first_step(scene, state.x, free)._replace(k=k, tolerance=tolerance)
-    free = free._replace(tied=tuple(nodes for nodes in (p.tied(step) for p in physics) if nodes is not None))
-    step = step._replace(free=free)
+    step = _with_tied(physics, _first_step(scene, state.x, free)._replace(k=k, tolerance=tolerance))
+    free = step.free
     return Equations(
         scene=scene,
         physics=physics,

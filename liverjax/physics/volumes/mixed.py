@@ -74,6 +74,10 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
 _PART = {1: 0.25, 2: 1.0, 3: 1.0}
 
 
+#: Newton's method reaches residuals of this multiple of the precision.
+_REACHED = 4096
+
+
 def _confined(step: Step) -> jax.Array:
     """Whether a constant pressure causes no force in any free direction."""
     one = jnp.ones_like(step.mesh.weights)
@@ -103,7 +107,8 @@ class MixedVolume(Physics):
         volume = jax.lax.stop_gradient(jnp.sum(step.mesh.volumes))
         width = (volume / step.mesh.number_of_vertices) ** (1 / 3)
         soft = jax.lax.stop_gradient(jnp.min(jnp.asarray(mu / bulk)))
-        counted = jnp.where(_confined(step), jnp.minimum(soft, 1.0), 1.0)
+        reached = _REACHED * float(jnp.finfo(step.x.dtype).eps) / (1.0 if step.tolerance is None else step.tolerance)
+        counted = jnp.where(_confined(step), jnp.minimum(jnp.maximum(soft, reached), 1.0), 1.0)
         own = {"unit": mean / volume / width, "counted": counted, "kind": kind}
         return Mixed(part=part, rest=bulk - part, shear=mu, before=memory, **own)
 
