@@ -434,11 +434,11 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     if corrected is not sweep:
         dense = generalised_maxwell.spectrum(corrected)
     fits = [edges.honest(closed, corrected, dense)]
-    if options.density is not None:
-        fits[0].details["density_kg_m3"] = options.density
     if options.method != "closed-form":
-        fits.append(_simulated(options, corrected, fits[0], simulation))
+        fits.append(_simulated(options, corrected, fits[0], simulation.run))
     for fit in fits:
+        if options.density is not None:
+            fit.details["density_kg_m3"] = options.density
         fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
     for fit in fits if options.precompression else ():  # its errors contain the errors from the size of the sample
         fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
@@ -446,8 +446,8 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
 
 
 def _simulated(options: argparse.Namespace, sweep: "Sweep", closed: "Fit", simulation: "Simulation") -> "Fit":
-    """The fit through the torsion simulation. If a density is given, the simulation is compared with moduli that
-    contain the inertia."""
+    """The fit through the torsion simulation. If the simulation has a density, it is compared with moduli that contain
+    the inertia."""
     from fitting.fits import sample_inertia, simulated_rheometer
 
     inertia = simulation.inertia
@@ -489,7 +489,7 @@ def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Post
         )
         return None
     if fit.method == "torsion":
-        simulation = _simulation(options)
+        simulation = _simulation(options).run
         inertia = simulation.inertia
         if inertia is not None:  # the simulated moduli contain the inertia
             G = sample_inertia.shown(fit.storage + 1j * fit.loss, sweep.angular_frequency, *inertia)

@@ -57,6 +57,12 @@ class Simulation(NamedTuple):
         density = compression.torsional_density(laws.typical(self.law), self.precompression, self.density)
         return density, self.height
 
+    @property
+    def run(self) -> "Simulation":
+        """The simulation that is fitted to data of a sample. A compressed sample is simulated without its inertia,
+        which is subtracted from the data instead: the error of the mesh is known only then."""
+        return self._replace(density=None) if self.precompression else self
+
 
 #: Up to this strain at the rim, the linear rig gives the derivatives. Their relative error is below the strain. With
 #: inertia, it is the error of the mesh in the inertial part.
@@ -380,7 +386,10 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
     error."""
     shift = simulated.uncertainty.values - closed.uncertainty.values
     errors = simulated.uncertainty.standard_errors
+    of_mesh, of_steps = simulated.uncertainty.mesh_bias, simulated.uncertainty.time_step_bias
     cause, remedy = "the simulation's discretisation moves", "raise --steps or trust the closed form"
+    if of_mesh is not None and of_steps is not None and np.abs(of_mesh).sum() > np.abs(of_steps).sum():
+        cause, remedy = "the mesh of the simulation moves", "trust the closed form"
     if simulated.details.get("precompression_strain"):
         cause, remedy = "the plates, which hold the sides of the sample, move", "for smooth plates use closed-form"
     if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):  # the closed form has none
