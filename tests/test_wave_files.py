@@ -74,6 +74,13 @@ def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
     np.savez(tmp_path / "phases.npz", phases=1e6 * phases, spacing=H, unit="um")
     found = wave_field.read_waves(tmp_path / "phases.npz", list(HERTZ))
     np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-18)
+    assert not any("instants" in note for note in found.notes)
+    # The end of the period repeats its beginning: the moduli would be 5 % off.
+    phases = np.concatenate([phases, phases[:, :1]], axis=1)
+    noise = np.random.default_rng(0).normal(size=phases.shape) * 0.1 * np.std(phases)
+    np.savez(tmp_path / "phases.npz", phases=phases + noise, spacing=H)
+    (note,) = wave_field.read_waves(tmp_path / "phases.npz", list(HERTZ)).notes
+    assert "the 9 instants fit a period of 8 steps better" in note
 
 
 def test_an_array_of_hdf5_may_name_its_own_unit_spacing_and_frequencies(tmp_path):

@@ -177,9 +177,10 @@ def with_noise(field: WaveField, noise: float | None) -> WaveField:
 
 def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
     """Complex displacements (F, nx, ny, nz, 3) in the unit of the file, and notes."""
+    told: list[str] = []
     if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, equally spaced
         u = _instants(name, "phases", found["phases"])
-        U = 2 * np.fft.fft(u, axis=-5)[..., 1, :, :, :, :] / u.shape[-5]
+        U, told = 2 * np.fft.fft(u, axis=-5)[..., 1, :, :, :, :] / u.shape[-5], _of_a_last_instant(u)
     elif found.get("displacement") is not None:
         U = _array_of_numbers(name, "displacement", found["displacement"])
     elif found.get("real") is not None and found.get("imag") is not None:
@@ -209,9 +210,9 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
         )
     U = U.astype(complex)
     if U.shape[-1] == 3:
-        return U, []
+        return U, told
     blank = np.full(U.shape, np.nan + 0j)
-    return np.concatenate([U, blank, blank], axis=-1), ["one component is measured: the other two are unknown"]
+    return np.concatenate([U, blank, blank], axis=-1), [*told, "one component is measured: the other two are unknown"]
 
 
 def _is_image(name: str) -> bool:
@@ -233,6 +234,32 @@ def _instants(name: str, field: str, values: Numbers) -> np.ndarray:
             f"{name}: {field} has shape {u.shape}: give real (F, T, nx, ny, nz, 3) with 3 instants or more"
         )
     return u if u.ndim == 6 else u[None]
+
+
+#: If the instants miss a motion of a period by this factor less when the last instant repeats the first, a note is
+#: given.
+_REPEATED = 0.5
+
+
+def _of_a_last_instant(u: np.ndarray) -> list[str]:
+    """A note if the last of the instants u (F, T, nx, ny, nz, 3) seems to be the end of the period."""
+    T = u.shape[1]
+    if T < 5:  # with 4 instants, a mean and one harmonic may pass near every value
+        return []
+    values = u.reshape(len(u), T, -1)
+    values = np.concatenate([one[:, np.isfinite(one).all(axis=0)] for one in values], axis=1)
+
+    def missed(steps: int) -> float:
+        angle = 2 * np.pi * np.arange(T) / steps
+        basis = np.linalg.qr(np.stack([np.ones(T), np.cos(angle), np.sin(angle)], axis=1))[0]
+        return float(np.linalg.norm(values - basis @ (basis.T @ values)))
+
+    if not missed(T - 1) < _REPEATED * missed(T):
+        return []
+    return [
+        f"the {T} instants fit a period of {T - 1} steps better: if the last one is the end of the period, it repeats "
+        "the first one, so leave it out"
+    ]
 
 
 def _array_of_numbers(name: str, field: str, values: Numbers) -> np.ndarray:
