@@ -84,10 +84,10 @@ class Inertia(Physics):
     def advance(self, memory: Motion, acting: "Moving", end: End) -> Motion:
         """Velocity and acceleration at the end of the step."""
         velocity, acceleration = acting.kinematics(end.x)
-        for nodes in acting.tied:
-            velocity, acceleration = nodes.rigid(end.x, velocity, acceleration)
         if end.by_end_forces is not None:
             acceleration = acceleration + end.by_end_forces
+        for nodes in acting.tied:
+            velocity, acceleration = nodes.rigid(end.x, velocity, acceleration)
         return Motion(velocity, None if memory.acceleration is None else acceleration)
 
 
