@@ -71,6 +71,38 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     assert "map: chi2" in capsys.readouterr().out
 
 
+def test_a_large_organ_is_fitted_in_parts(tmp_path, monkeypatch, capsys):
+    """Regions, edges, the map and its files go across the parts."""
+    from fitting.commands import waves
+
+    labels = np.ones((9, 9, 13), int)
+    labels[..., 8:] = 4
+    field = plane_waves((9, 9, 13), noise=1e-7, labels=labels)
+    monkeypatch.setattr(elastography, "SIDES", (3,))
+    one, parts = (elastography.gigabytes(elastography.body_of(field, side)) for side in (None, 3))
+    assert parts < 0.5 * one
+    monkeypatch.setattr(waves, "MOST_MEMORY", 0.5 * (one + parts))
+    path, out = written(tmp_path, ".npz", field), tmp_path / "out"
+    ask = ["waves", str(path), "--density", "1000", "--out", str(out), "--samples", "2"]
+    assert command.main(ask) == 0
+    assert "divided in 8 parts" in capsys.readouterr().err
+    found = json.loads((out / "waves.json").read_text())
+    assert found["parts"] == 8 and found["voxels"] == 9 * 9 * 13
+    for row in (found["whole"], *found["regions"].values()):
+        for f, G in enumerate(modulus(HERTZ)):
+            error = row["storage_Pa"][f] - row["mesh_bias_storage_Pa"][f] - G.real
+            assert abs(error) < 4 * row["standard_error_storage_Pa"][f] + 0.005 * abs(G)
+    with h5py.File(out / "waves.h5") as file:
+        G, sd = file["modulus"][:], file["sd"][:]
+        assert G.shape == (2, 9, 9, 13) and np.isfinite(G).all()
+        assert np.mean(np.abs(G[0].real - 3000) < 3 * sd[0].real) > 0.97
+    assert command.main([*ask, "--resume"]) == 0
+    assert elastography.body_that_fits(field, 0.5 * (one + parts), most_corners=10) is None
+    monkeypatch.setattr(waves, "MOST_MEMORY", 0.5 * parts)
+    assert command.main([*ask, "--stride", "1"]) == 2
+    assert "--stride 1 needs more than" in capsys.readouterr().err
+
+
 def test_regions_of_a_run_that_was_killed_are_not_searched_for_again(tmp_path, monkeypatch):
     """Killed in the map: the regions are read from their file, to the last bit, and only for the same waves."""
     from fitting.waves import regions

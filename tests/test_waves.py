@@ -376,3 +376,54 @@ def test_waves_of_the_other_sign_are_told(small):
     found = elastography.regions_of(small)
     uniform = found.whole._replace(modulus=np.conj(found.whole.modulus))
     assert not cautions._sign(small, found._replace(whole=uniform, parts=found.whole, labels=np.array([1])))
+
+
+def test_a_body_in_parts_has_the_same_elements_and_keeps_faces_out_of_the_balance():
+    mask = np.ones((13, 9, 7), bool)
+    mask[0, 0, 0] = False
+    one, parts = (voxels.voxel_body(mask, np.full(3, 1e-3), side=side) for side in (None, 3))
+    assert one.part.max() == 0 and parts.part.max() + 1 == 2 * 2 * 1
+    assert np.array_equal(parts.whole.tetrahedra, one.linear.tetrahedra)
+    points = np.asarray(parts.linear.points)[np.asarray(parts.linear.tetrahedra)]
+    assert np.array_equal(points, np.asarray(one.linear.points)[np.asarray(one.linear.tetrahedra)])
+    assert np.array_equal(np.asarray(parts.whole.points)[parts.corner], np.asarray(parts.linear.points))
+    # Parts meet at voxels 6 and 4; there both have nodes, and none has a balance.
+    assert np.array_equal(np.unique(parts.voxel, axis=0), np.unique(one.voxel, axis=0))
+    inside, all_inside = (set(map(tuple, b.voxel[b.inner])) for b in (parts, one))
+    assert inside == {v for v in all_inside if v[0] != 6 and v[1] != 4}
+    field = np.arange(one.whole.number_of_nodes) + 0.5
+    at = dict(zip(map(tuple, one.voxel), voxels.on_all_nodes(one, field), strict=True))
+    values = voxels.on_all_nodes(parts, field)
+    assert all(at[tuple(v)] == value for v, value in zip(parts.voxel, values, strict=True))
+
+
+@pytest.mark.slow
+def test_moduli_and_errors_of_a_body_in_parts():
+    """The errors know that parts share the noise of their common voxels: without it they would be a tenth too small."""
+    rng, G, omega = np.random.default_rng(0), 2500 + 800j, 2 * np.pi * 60.0
+    spacing, shape = 0.003, (17, 13, 9)
+    x = spacing * np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1)
+    clean = np.zeros((*shape, 3), complex)
+    for _ in range(12):
+        n, across = rng.normal(size=(2, 3))
+        n /= np.linalg.norm(n)
+        across = np.cross(n, across)
+        wave = np.exp(-1j * omega * np.sqrt(1000.0 / G) * (x @ n - 0.5 * np.max(x @ n)))
+        clean += across * rng.normal() * wave[..., None]
+    sd = 0.02 * np.sqrt(np.mean(np.abs(clean) ** 2))
+    apart, sure = [], []
+    for _ in range(12):
+        noise = sd * (rng.normal(size=clean.shape) + 1j * rng.normal(size=clean.shape))
+        field = wave_field.WaveField(
+            np.array([60.0]), (clean + noise)[None], np.full(3, spacing), np.zeros(3), np.ones(shape, bool), None,
+            np.array([sd]), "", (),
+        )  # fmt: skip
+        organ = elastography.organ_of(field, elastography.body_of(field, 4), 1000.0)
+        assert len(organ.matrices.parts) == 2 * 2 * 1
+        found = elastography.regions_of(organ)
+        own = found.whole
+        error = own.modulus[0, 0] - G * (1 + found.mesh_bias[0])
+        apart += [error.real / own.standard_errors[0, 0].real, error.imag / own.standard_errors[0, 0].imag]
+        sure.append(own.correlations[0].enlarged[0])
+    assert 1.0 < np.mean(sure) < 1.3
+    assert 0.7 < np.sqrt(np.mean(np.square(apart))) < 1.4

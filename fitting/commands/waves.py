@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from fitting.waves.kept_regions import Keep
 
 FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5", "progress_of_regions.h5")
-#: Maximum memory of one matrix factor [GB]. A grid that needs more is made coarser; if --stride is given, a larger
-#: value is demanded.
-MOST_MEMORY = 4.0
+#: Maximum memory of one matrix factor [GB]. A body that needs more is divided in parts, or the grid is made coarser.
+#: MOST_OF_MAP: largest number of values of a map in a divided body (its matrices are dense).
+MOST_MEMORY, MOST_OF_MAP = 4.0, 5000
 #: Maximum correlation length of a map, divided by the size of the organ. Above it, the map would be uniform.
 LONGEST = 5.0
 
@@ -133,24 +133,31 @@ def _forces_that_balance(data: Path) -> Iterator[None]:
 
 
 def _organ(options: argparse.Namespace, field) -> "Organ":
-    """The organ with the body of its voxels. The voxels are made coarser if they do not fit into the memory."""
+    """The organ with the body of its voxels. If this is too large, the body is divided in parts; if that is not enough,
+    the voxels are made coarser."""
     from fitting.waves import elastography, wave_field
 
     stride = options.stride or 1
     while True:
         coarse = wave_field.coarsened(field, stride)
-        body = elastography.body_of(coarse)
-        needed = elastography.gigabytes(body)
-        if needed < MOST_MEMORY:
+        body = elastography.body_that_fits(coarse, MOST_MEMORY, None if options.no_map else MOST_OF_MAP)
+        if body is not None:
             break
         if options.stride:
             raise InputError(
-                f"--stride {stride} needs {needed:.1f} GB for each of {len(field.frequencies)} frequencies: give "
-                f"--stride {stride + 1}, or a smaller --mask"
+                f"--stride {stride} needs more than {MOST_MEMORY:g} GB for each of {len(field.frequencies)} "
+                f"frequencies, or for the map: give --stride {stride + 1}, or a smaller --mask"
             )
         stride += 1
     if stride > 1:
         print(f"note: means of {stride} x {stride} x {stride} voxels are used", file=sys.stderr)
+    parts = int(body.part.max()) + 1
+    if parts > 1:
+        print(
+            f"note: the organ is divided in {parts} parts. Forces are not balanced where parts meet, so errors are "
+            "larger than without parts",
+            file=sys.stderr,
+        )
     for note in (*elastography.notes_on_gaps(coarse), *elastography.notes_on_layers(coarse)):
         print(f"note: {note}", file=sys.stderr)
     return elastography.organ_of(coarse, body, options.density)

@@ -13,6 +13,7 @@ function of the modulus, chi^2 / 2 has the gradient Re(q^H C' u) / sd^2 and the 
 u and not on d, noise does not lower the modulus. In the direct inversion of second derivatives, noise lowers it.
 """
 
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -39,6 +40,7 @@ class Matrices(NamedTuple):
     entries: np.ndarray  # indices of these entries among all
     pressure: np.ndarray  # g B B^H (bandwidth + 1, I), by diagonals
     balances: int  # real equations that chi^2 sums over
+    parts: tuple[slice, ...]  # rows of C of each part of the body: rows of different parts have no common unknowns
 
 
 #: FREE: ratio of two parts of S, the part of the pressures to the part of the shear stress at the modulus `TYPICAL`
@@ -65,6 +67,10 @@ class Balanced(NamedTuple):
     motion: np.ndarray  # u (3 V,) complex [m]
     multipliers: np.ndarray  # q (I,)
     factor: np.ndarray  # (bandwidth + 1, I): L of S = L L^H, by diagonals
+
+    def of(self, rows: slice) -> "Balanced":
+        """The result for some rows that have no common unknowns with the others. The motion stays that of all."""
+        return self._replace(multipliers=self.multipliers[rows], factor=self.factor[:, rows])
 
     def whitened(self, columns: scipy.sparse.csc_array, kind: type = np.complex128) -> np.ndarray:
         """L^-1 times columns (I, k). The scalar product of two such results is a product of the columns with S^-1."""
@@ -102,7 +108,9 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
     pattern = scipy.sparse.csr_array((np.zeros(len(known), complex), known % len(number), ends), shape=shape)
     B = _forces_of_pressures(body, rows, len(inner))
     balances = 2 * (len(inner) - B.shape[1])
-    m = Matrices(A.relaxing, A.mass, unknowns, rows, pattern, places, entries, np.zeros((1, 1)), balances)
+    starts = np.flatnonzero(np.diff(body.part[inner // 3], prepend=-1, append=-1))
+    parts = tuple(slice(a, b) for a, b in itertools.pairwise(starts))
+    m = Matrices(A.relaxing, A.mass, unknowns, rows, pattern, places, entries, np.zeros((1, 1)), balances, parts)
     shear = rows_of_balance(m, np.full(rows.shape[-1], TYPICAL + 0j), 0.0)
     B = freely(B, np.abs(shear.data))
     return m._replace(pressure=by_diagonals(B @ B.T))
@@ -116,11 +124,13 @@ def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_arr
 
 
 def _in_order(body: VoxelBody) -> np.ndarray:
-    """Unknowns of the inner nodes, slice by slice along the longest side, so that coupled nodes have close indices."""
+    """Unknowns of the inner nodes, part by part, and slice by slice along the longest side, so that coupled nodes have
+    close indices."""
     nodes = np.flatnonzero(body.inner)
     voxel = body.voxel[nodes]
     longest_last = voxel[:, np.argsort(np.ptp(voxel, axis=0))]
-    return (3 * nodes[np.lexsort(longest_last.T)][:, None] + np.arange(3)).ravel()
+    order = np.lexsort((*longest_last.T, body.part[nodes]))
+    return (3 * nodes[order][:, None] + np.arange(3)).ravel()
 
 
 def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy.sparse.csr_array:
@@ -204,9 +214,9 @@ def by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:
 
 def gigabytes(body: VoxelBody) -> float:
     """Memory [GB] of the factor of S for one frequency."""
-    voxel = body.voxel[body.inner]
-    sides = np.sort(np.ptp(voxel, axis=0) + 1)
-    return 16e-9 * 3 * len(voxel) * 3 * (4 * sides[0] * sides[1] + 4 * sides[0] + 5)
+    voxel, part = body.voxel[body.inner], body.part[body.inner]
+    sides = [np.sort(np.ptp(voxel[part == k], axis=0) + 1) for k in np.unique(part)]
+    return 16e-9 * 3 * len(voxel) * 3 * max(4 * a * b + 4 * a + 5 for a, b, _ in sides)
 
 
 def by_modulus(m: Matrices, u: np.ndarray) -> scipy.sparse.csc_array:

@@ -34,7 +34,7 @@ class Correlation(NamedTuple):
 
     beyond: float  # largest correlation of neighbours along an axis, minus that for white noise
     seen: bool  # whether this is more than chance
-    enlarged: np.ndarray  # (R,) error of each modulus over its error for white noise with the given sd
+    enlarged: np.ndarray  # (R,) error of each modulus over its error for white noise with the given sd at each node
 
 
 class _Projection(NamedTuple):
@@ -81,7 +81,8 @@ def correlation(
     rows = [_drawn(own, 0.0, draws)]
     beyond = float(np.max(seen - rows[0][0]))
     if beyond <= max(SEEN, BY_CHANCE / np.sqrt(2 * own.measured)):
-        return Correlation(beyond, False, np.ones(columns.shape[1]))
+        white = np.zeros(3)
+        return Correlation(beyond, False, np.array([_enlargement(own, column, white) for column in columns.T]))
     for width in WIDTHS[1:]:
         rows.append(_drawn(own, width, draws))
         if np.mean(rows[-1][0]) > np.max(seen):
@@ -131,13 +132,15 @@ def _filter(width: float) -> np.ndarray:
 
 def _enlargement(own: _Projection, column: np.ndarray, widths: np.ndarray) -> float:
     """Error of one modulus for noise smoothed with these widths (3,), divided by its error for white noise of the same
-    size."""
+    size at each node. Nodes on the same voxel, of different parts of the body, share its noise."""
     q = scipy.linalg.cho_solve_banded((own.here.factor, True), column, check_finite=False)
-    v = own.grid(own.C.conj().T @ q)
+    each = (own.C.conj().T @ q)[: own.measured]
+    v = np.zeros((*(own.voxel.max(axis=0) + 1), 3), complex)
+    np.add.at(v, tuple(own.voxel.T), each.reshape(-1, 3))
     smooth = v
     for axis, width in enumerate(widths):
         if width > 0:
             kernel = _filter(width)
             both = np.correlate(kernel, kernel, "full")  # autocorrelation of the filtered noise
             smooth = scipy.ndimage.convolve1d(smooth, both / both.max(), axis=axis, mode="constant")
-    return float(np.sqrt(max(np.sum(v.conj() * smooth).real, 0.0) / max(np.sum(np.abs(v) ** 2), 1e-300)))
+    return float(np.sqrt(max(np.sum(v.conj() * smooth).real, 0.0) / max(np.sum(np.abs(each) ** 2), 1e-300)))

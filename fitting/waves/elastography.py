@@ -50,8 +50,9 @@ class Found(NamedTuple):
     parts_bias_left: np.ndarray | None = None  # (F, R, D)
 
 
-def body_of(field: WaveField) -> VoxelBody:
-    """The body of elements on the voxels that are measured and in the mask.
+def body_of(field: WaveField, side: int | None = None) -> VoxelBody:
+    """The body of elements on the voxels that are measured and in the mask, in parts of at most `side` bricks along
+    each side.
 
     Raises:
         InputError: there are too few such voxels, or the displacements have fewer than three components.
@@ -62,7 +63,24 @@ def body_of(field: WaveField) -> VoxelBody:
             f"{field.source or 'waves'}: the balance of forces needs three components of the displacement: measure "
             "all three"
         )
-    return voxels.voxel_body(field.mask & np.all(measured, axis=-1), field.spacing, field.origin)
+    return voxels.voxel_body(field.mask & np.all(measured, axis=-1), field.spacing, field.origin, side)
+
+
+#: Most bricks along the side of a part. Larger parts would take much longer to factorise; in smaller ones, most of the
+#: balance would be lost at their faces.
+SIDES = (8, 7, 6)
+
+
+def body_that_fits(field: WaveField, most_memory: float, most_corners: int | None = None) -> VoxelBody | None:
+    """The body in one part, or else in parts as large as possible, whose factor for one frequency needs less than
+    `most_memory` [GB]; None: there is none. A body with more corners than `most_corners` is not divided.
+    """
+    body = body_of(field)
+    if gigabytes(body) < most_memory:
+        return body
+    few = most_corners is None or body.whole.number_of_nodes <= most_corners
+    divided = (body_of(field, side) for side in SIDES if few)
+    return next((body for body in divided if gigabytes(body) < most_memory), None)
 
 
 #: If gaps within the organ leave less than this part of the bricks, a note is given.

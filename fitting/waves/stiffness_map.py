@@ -161,7 +161,7 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
         whole: modulus of the whole organ at each frequency (F,) complex [Pa].
         length: correlation length of the prior [m].
     """
-    mean, p, number = _mean_of_corners(body), smooth.prior(body.linear, length), len(whole)
+    mean, p, number = _mean_of_corners(body), smooth.prior(body.whole, length), len(whole)
     levels = np.eye(number) if number > 1 else np.zeros((1, 0))
     every = np.ones((mean.shape[0], 1))
     exponents = tuple(scipy.sparse.hstack([mean, scipy.sparse.csr_array(every * own)], "csr") for own in levels)
@@ -231,9 +231,9 @@ def _with_place(sd: np.ndarray, slopes: np.ndarray) -> np.ndarray:
 
 
 def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
-    tets = np.asarray(body.linear.tetrahedra)
+    tets = np.asarray(body.whole.tetrahedra)
     rows = np.repeat(np.arange(len(tets)), 4)
-    shape = (len(tets), body.linear.number_of_nodes)
+    shape = (len(tets), body.whole.number_of_nodes)
     return scipy.sparse.csr_array((np.full(rows.size, 0.25), (rows, tets.ravel())), shape=shape)
 
 
@@ -245,11 +245,11 @@ def _changes_over_slopes(
 
     The slope at a corner is the mean over the elements around it, weighted by volume.
     """
-    tets, volumes = np.asarray(body.linear.tetrahedra), np.asarray(body.linear.volumes)
-    D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
+    tets, volumes = np.asarray(body.whole.tetrahedra), np.asarray(body.whole.volumes)
+    D = np.moveaxis(np.asarray(body.whole.shape_vectors), -1, 0)
     gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3)
     around = scipy.sparse.diags_array(1 / (mean.T @ volumes)) @ mean.T @ scipy.sparse.diags_array(volumes)
-    over = np.maximum(np.ptp(np.asarray(body.linear.points)[tets[0]], axis=0), length)
+    over = np.maximum(np.ptp(np.asarray(body.whole.points)[tets[0]], axis=0), length)
     rows, columns = np.repeat(np.arange(len(tets)), 4), tets.ravel()
     of_elements = [
         scipy.sparse.csr_array((w * gradients[:, :, a].ravel(), (rows, columns)), shape=mean.shape)
@@ -332,8 +332,12 @@ def _information(course: Course, point: _Reached) -> np.ndarray:
     y = course.natural(course.scales(point.k) * point.z)
     H = np.zeros((len(y), len(y)), complex)
     for J, b in zip(course.jacobians(y, point.here), point.here, strict=True):
-        X = b.whitened(J, np.complex64)  # single precision is enough for the direction of steps
-        H += X.conj().T @ X
+        every = J.tocsr()
+        for rows in course.m.parts:
+            own = every[rows].tocsc()
+            known = np.flatnonzero(np.diff(own.indptr))
+            X = b.of(rows).whitened(own[:, known], np.complex64)  # single precision is enough for directions of steps
+            H[np.ix_(known, known)] += X.conj().T @ X
     # This is T^T H T, where T is the real matrix of `natural`.
     half = course.whitened(H)
     return course.whitened(half.conj().T).conj().T

@@ -12,21 +12,30 @@ from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 class VoxelBody(NamedTuple):
     """Bricks of 3 x 3 x 3 voxels, each cut into six quadratic elements. Neighbouring bricks share their outer
-    voxels."""
+    voxels.
+
+    A large body has parts. Neighbouring parts have nodes of their own on the voxels that they share.
+    """
 
     linear: TetMesh  # linear mesh of the corners
     mesh: TetMesh  # quadratic; the nodes of `linear` come first
     voxel: np.ndarray  # (V, 3) index of the voxel of each node
-    inner: np.ndarray  # (V,) bool: nodes with elements on all sides, where forces must balance
+    inner: np.ndarray  # (V,) bool: nodes with elements of their part on all sides, where forces must balance
+    part: np.ndarray  # (V,) number of the part of each node
+    whole: TetMesh  # linear mesh of the same elements, without parts: for fields that are continuous in the body
+    corner: np.ndarray  # (P,) node of `whole` at each node of `linear`
 
 
-def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None = None) -> VoxelBody:
+def voxel_body(
+    mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None = None, side: int | None = None
+) -> VoxelBody:
     """The body of all bricks whose 27 voxels are in the mask.
 
     Args:
         mask: (nx, ny, nz) bool.
         spacing: spacing of the voxels (3,) [m].
         origin: centre of the first voxel (3,) [m]; None: 0.
+        side: most bricks along the side of a part; None: one part.
 
     Raises:
         InputError: the mask has no room for a brick, or for a node with bricks on all sides.
@@ -39,16 +48,37 @@ def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None 
             "3 along every axis, and better 5 or more; measure more slices"
         )
     kept = _whole_bricks(mask[tuple(slice(f, None) for f in first)], cells)
-    inner = _surrounded(kept)
-    if not inner.any():
+    if not _surrounded(kept).any():
         raise InputError("no voxel has two more voxels of the mask on every side: give a larger mask")
+    parts = _part_of_each_brick(kept, side)
     used, tets = np.unique(_sixths(np.argwhere(kept), kept.shape), return_inverse=True)
     at = 2 * np.stack(np.unravel_index(used, tuple(n + 1 for n in kept.shape)), axis=1)
     start = np.zeros(3) if origin is None else np.asarray(origin)
-    linear = tet_mesh((at + first) * spacing + start, tets.reshape(-1, 4))
+    whole = tet_mesh((at + first) * spacing + start, tets.reshape(-1, 4))
+    # Corners of different parts are different nodes.
+    own, split = np.unique(np.repeat(parts[kept], 24) * len(used) + tets.ravel(), return_inverse=True)
+    corner = own % len(used)
+    linear = tet_mesh(np.asarray(whole.points)[corner], split.reshape(-1, 4))
     mesh = quadratic(linear)
     place = np.rint((np.asarray(mesh.points) - start) / spacing).astype(int)
-    return VoxelBody(linear, mesh, place, inner[tuple((place - first).T)])
+    part = np.empty(len(place), int)
+    part[mesh.element_nodes_on_host] = np.repeat(parts[kept], 6)
+    inner = np.zeros(len(place), bool)
+    for k in range(parts.max() + 1):
+        inner[part == k] = _surrounded(parts == k)[tuple((place[part == k] - first).T)]
+    return VoxelBody(linear, mesh, place, inner, part, whole, corner)
+
+
+def _part_of_each_brick(kept: np.ndarray, side: int | None) -> np.ndarray:
+    """The part of every brick, -1 where no brick is kept. Parts along an axis are about equally long."""
+    parts = np.zeros(kept.shape, int)
+    for axis, n in enumerate(kept.shape):
+        number = 1 if side is None else -(-n // side)
+        along = np.arange(n) * number // n
+        parts = parts * number + along.reshape([-1 if a == axis else 1 for a in range(3)])
+    out = np.full(kept.shape, -1)
+    out[kept] = np.unique(parts[kept], return_inverse=True)[1]
+    return out
 
 
 def number_of_bricks(mask: np.ndarray) -> int:
@@ -104,11 +134,12 @@ def _every_second(offset: tuple[int, ...], cells: tuple[int, ...]) -> tuple[slic
 
 
 def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
-    """Values (V,) at all nodes of a field that is linear in the elements, from its values at the corners."""
+    """Values (V,) at all nodes of a field that is linear in the elements, from its values at the corners
+    (the nodes of `body.whole`)."""
     from liverjax.mesh.adjacency import PAIRS
 
     values = np.empty(body.mesh.number_of_nodes, corners.dtype)
-    values[: len(corners)] = corners
+    values[: len(body.corner)] = corners[body.corner]
     nodes = body.mesh.element_nodes_on_host
     for middle, (i, j) in zip(nodes[4:], PAIRS, strict=True):
         values[middle] = 0.5 * (values[nodes[i]] + values[nodes[j]])

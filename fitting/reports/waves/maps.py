@@ -48,7 +48,7 @@ def write_for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
     for hertz, G, sd in zip(organ.field.frequencies, drawn.modulus, drawn.sd, strict=True):
         data |= {f"storage_{hertz:g}_Hz": G.real, f"loss_{hertz:g}_Hz": G.imag}
         data |= {f"sd_of_logarithm_{hertz:g}_Hz": sd.real, f"sd_of_loss_angle_{hertz:g}_Hz": sd.imag}
-    mesh = organ.body.linear
+    mesh = organ.body.whole
     meshio.write_points_cells(path, np.asarray(mesh.points), {"tetra": np.asarray(mesh.tetrahedra)}, data)
 
 
