@@ -184,7 +184,7 @@ def test_a_factor_that_does_not_fit_in_memory_is_told(monkeypatch):
 
 
 def test_memory_of_an_elimination_is_foretold(monkeypatch):
-    monkeypatch.setattr(multifrontal, "_cores", lambda: 1)
+    monkeypatch.setattr(multifrontal, "cores", lambda: 1)
     A, plan = system(complex)
     tracemalloc.start()
     multifrontal.factorised(A, plan, False)

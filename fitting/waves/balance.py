@@ -14,6 +14,7 @@ u and not on d, noise does not lower the modulus. In the direct inversion of sec
 """
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -25,6 +26,8 @@ import scipy.sparse
 import liverjax as lj
 from fitting.waves.voxels import VoxelBody
 from liverjax.mesh.adjacency import PAIRS
+from liverjax.solvers.blas import one_blas_thread
+from liverjax.solvers.factors.multifrontal import cores
 from liverjax.waves.harmonic import element_operator
 
 
@@ -196,10 +199,27 @@ def likeliest(
         S = np.pad(S, ((0, len(B) - len(S)), (0, 0)))
     S[: len(B)] += B
     # A banded factor is faster here than a sparse one, which would fill the band too.
-    factor = scipy.linalg.cholesky_banded(S, overwrite_ab=True, lower=True, check_finite=False)
+    factor = _factor_of_blocks(S)
     r = C @ d
     q = scipy.linalg.cho_solve_banded((factor, True), r, check_finite=False)
     return Balanced(float(np.real(np.vdot(r, q))) / sd**2, d - WCH @ q, q, factor)
+
+
+def _factor_of_blocks(S: np.ndarray) -> np.ndarray:
+    """L of S = L L^H, by diagonals. Blocks that are not coupled, as of the parts of a body, are factorised in
+    parallel."""
+    far = len(S) - 1 - np.argmax(S[::-1] != 0, axis=0)  # how far below the diagonal a column reaches
+    ends = np.flatnonzero(np.maximum.accumulate(np.arange(S.shape[1]) + far) == np.arange(S.shape[1])) + 1
+    blocks = [slice(a, b) for a, b in itertools.pairwise([0, *ends])]
+    if len(blocks) == 1:
+        return scipy.linalg.cholesky_banded(S, overwrite_ab=True, lower=True, check_finite=False)
+
+    def factorise(block: slice) -> None:
+        S[:, block] = scipy.linalg.cholesky_banded(S[:, block], lower=True, check_finite=False)
+
+    with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
+        list(pool.map(factorise, blocks))
+    return S
 
 
 def by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:

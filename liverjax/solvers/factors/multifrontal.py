@@ -166,7 +166,7 @@ class _Elimination(NamedTuple):
 
     def idle(self) -> int:
         """Cores that a piece may use: its own, and those without a piece."""
-        return max(1, _cores() + 1 - len(self.running))
+        return max(1, cores() + 1 - len(self.running))
 
     def piece(self, groups: list[int]) -> None:
         """Eliminate `groups` one after the other, with the tiles of each group on the cores that are idle."""
@@ -192,7 +192,7 @@ def _all_pieces(own: _Elimination) -> list[Eliminated]:
     """Eliminate all pieces, as many at a time as there are cores. The sums do not depend on which ends first."""
     pieces, waits_for = _work_in_pieces(own.plan)
     running = own.running
-    with ThreadPoolExecutor(_cores()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         ready = [k for k, missing in enumerate(waits_for) if not missing]
         while ready or running:
             running |= {pool.submit(own.piece, pieces[k]): k for k in ready}
@@ -206,7 +206,7 @@ def _all_pieces(own: _Elimination) -> list[Eliminated]:
     return [step for steps in own.steps for step in steps]
 
 
-def _cores() -> int:
+def cores() -> int:
     """Cores that the process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
