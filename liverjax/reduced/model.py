@@ -181,7 +181,7 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
     """Refuse a scene for which the model was not made.
 
     Raises:
-        InputError: as `refuse_unknown_physics`, or another mesh, held nodes, law, viscosity or kind of run.
+        InputError: as `refuse_unknown_physics`, or another mesh, held nodes, law, viscosity, supports or kind of run.
     """
     refuse_unknown_physics(scene)
     if isinstance(scene.mesh.points, jax.core.Tracer):
@@ -190,7 +190,7 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
     if own != model.identity:
         raise InputError(
             f"the reduced model was made for scene {model.identity}, and this is {own} (mesh, held nodes, law, "
-            "viscosity or kind differ): run python -m liverjax reduce for this scene"
+            "viscosity, supports or kind differ): run python -m liverjax reduce for this scene"
         )
 
 
