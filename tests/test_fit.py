@@ -1,5 +1,7 @@
 """Identification: recovery, statistics, other optimisers, choice of modes, what the user is told."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -277,6 +279,13 @@ def test_a_shift_by_inertia_is_not_called_discretisation():
     assert "relaxation_times[0]: the simulation's discretisation moves it by 1e+02 %" in plain[0]
     assert "relaxation_times[0]: the sample's inertia and the discretisation move it by 1e+02 %" in heavy[0]
     assert "closed form" in plain[0] and "closed form" not in heavy[0]
+
+
+def test_the_larger_of_mesh_and_time_steps_is_named_for_each_parameter():
+    own = SimpleNamespace(mesh_bias=np.array([-50.0, 1e-4]), time_step_bias=np.array([5.0, 1e-3]))
+    simulated, closed = SimpleNamespace(details={}, uncertainty=own), SimpleNamespace(details={})
+    causes = [simulated_rheometer._cause(closed, simulated, k)[0] for k in (0, 1)]
+    assert "the mesh" in causes[0] and "discretisation" in causes[1]
 
 
 def test_what_auto_chooses_is_not_advised_against():

@@ -392,6 +392,7 @@ def test_a_body_in_parts_has_the_same_elements_and_keeps_faces_out_of_the_balanc
     inside, all_inside = (set(map(tuple, b.voxel[b.inner])) for b in (parts, one))
     assert inside == {v for v in all_inside if v[0] != 6 and v[1] != 4}
     m = balance.matrices(parts, DENSITY)
+    assert 0.7 < 16e-9 * m.pressure.size / balance.gigabytes(parts) <= 1  # slices along the longest side of a part
     columns = [set(m.pattern[rows].indices) for rows in m.parts]
     assert len(columns) == 4 and sum(map(len, columns)) == len(set().union(*columns))
     field = np.arange(one.whole.number_of_nodes) + 0.5

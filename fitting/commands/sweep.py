@@ -434,11 +434,12 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     if corrected is not sweep:
         dense = generalised_maxwell.spectrum(corrected)
     fits = [edges.honest(closed, corrected, dense)]
+    heavy = {} if options.density is None else {"density_kg_m3": options.density}
+    fits[0].details.update(heavy)
     if options.method != "closed-form":
         fits.append(_simulated(options, corrected, fits[0], simulation.run))
+        fits[1].details.update(heavy)
     for fit in fits:
-        if options.density is not None:
-            fit.details["density_kg_m3"] = options.density
         fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
     for fit in fits if options.precompression else ():  # its errors contain the errors from the size of the sample
         fit.details["precompression"] = instrument.compression_numbers(fit, simulation)

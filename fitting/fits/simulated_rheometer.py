@@ -385,20 +385,25 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
     """A warning with the cause if a parameter differs between simulation and closed form by more than its standard
     error."""
     shift = simulated.uncertainty.values - closed.uncertainty.values
-    errors = simulated.uncertainty.standard_errors
-    of_mesh, of_steps = simulated.uncertainty.mesh_bias, simulated.uncertainty.time_step_bias
-    cause, remedy = "the simulation's discretisation moves", "raise --steps or trust the closed form"
-    if of_mesh is not None and of_steps is not None and np.abs(of_mesh).sum() > np.abs(of_steps).sum():
-        cause, remedy = "the mesh of the simulation moves", "trust the closed form"
-    if simulated.details.get("precompression_strain"):
-        cause, remedy = "the plates, which hold the sides of the sample, move", "for smooth plates use closed-form"
-    if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):  # the closed form has none
-        cause, remedy = "the sample's inertia and the discretisation move", "raise --steps to see which it is"
-    out = []
-    for name, d, e, v in zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True):
+    errors, out = simulated.uncertainty.standard_errors, []
+    each = zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True)
+    for k, (name, d, e, v) in enumerate(each):
         if abs(d) > e and abs(d) > 1e-6 * abs(v):
+            cause, remedy = _cause(closed, simulated, k)
             out.append(
                 f"{name}: {cause} it by {100 * d / v:.2g} %, more than its standard error ({100 * e / v:.2g} %); "
                 f"{remedy}"
             )
     return out
+
+
+def _cause(closed: Fit, simulated: Fit, k: int) -> tuple[str, str]:
+    """What moves parameter k in the simulation, and the remedy."""
+    if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):  # the closed form has none
+        return "the sample's inertia and the discretisation move", "raise --steps to see which it is"
+    if simulated.details.get("precompression_strain"):
+        return "the plates, which hold the sides of the sample, move", "for smooth plates use closed-form"
+    of_mesh, of_steps = simulated.uncertainty.mesh_bias, simulated.uncertainty.time_step_bias
+    if of_mesh is not None and of_steps is not None and abs(of_mesh[k]) > abs(of_steps[k]):
+        return "the mesh of the simulation moves", "trust the closed form"
+    return "the simulation's discretisation moves", "raise --steps or trust the closed form"

@@ -127,13 +127,20 @@ def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_arr
 
 
 def _in_order(body: VoxelBody) -> np.ndarray:
-    """Unknowns of the inner nodes, part by part, and slice by slice along the longest side, so that coupled nodes have
-    close indices."""
+    """Unknowns of the inner nodes in the order of `by_part_and_slice`."""
     nodes = np.flatnonzero(body.inner)
-    voxel = body.voxel[nodes]
-    longest_last = voxel[:, np.argsort(np.ptp(voxel, axis=0))]
-    order = np.lexsort((*longest_last.T, body.part[nodes]))
+    order = by_part_and_slice(body.voxel[nodes], body.part[nodes])
     return (3 * nodes[order][:, None] + np.arange(3)).ravel()
+
+
+def by_part_and_slice(voxel: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Order (n,) of nodes on voxels (n, 3), part by part, and slice by slice along the longest side of each part. So
+    coupled nodes have close indices."""
+    longest_last = voxel.copy()
+    for k in np.unique(part):
+        own = voxel[part == k]
+        longest_last[part == k] = own[:, np.argsort(np.ptp(own, axis=0))]
+    return np.lexsort((*longest_last.T, part))
 
 
 def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy.sparse.csr_array:
@@ -215,7 +222,9 @@ def _factor_of_blocks(S: np.ndarray) -> np.ndarray:
         return scipy.linalg.cholesky_banded(S, overwrite_ab=True, lower=True, check_finite=False)
 
     def factorise(block: slice) -> None:
-        S[:, block] = scipy.linalg.cholesky_banded(S[:, block], lower=True, check_finite=False)
+        L = scipy.linalg.cholesky_banded(S[:, block], overwrite_ab=True, lower=True, check_finite=False)
+        if not np.may_share_memory(L, S):
+            S[:, block] = L
 
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
         list(pool.map(factorise, blocks))

@@ -120,14 +120,12 @@ def _nodes_of_elements(body: VoxelBody) -> np.ndarray:
 
 
 def _numbers_of_rows(body: VoxelBody, kinked: np.ndarray) -> np.ndarray:
-    """Index of the row of each unknown, -1 if it has no row. The rows are ordered part by part, and slice by slice
-    along the longest side."""
+    """Index of the row of each unknown, -1 if it has no row. The rows have the order of
+    `balance.by_part_and_slice`."""
     inner, hidden = np.flatnonzero(body.inner), np.flatnonzero(body.inner[kinked])
     at = np.concatenate([inner, kinked[hidden]])
-    voxel, part = body.voxel[at], body.part[at]
     functions = np.concatenate([inner, len(body.inner) + hidden])
-    longest_last = np.argsort(np.ptp(body.voxel[inner], axis=0))
-    order = functions[np.lexsort((*voxel[:, longest_last].T, part))]
+    order = functions[balance.by_part_and_slice(body.voxel[at], body.part[at])]
     rows = np.full(3 * (len(body.inner) + len(kinked)), -1)
     rows[(3 * order[:, None] + np.arange(3)).ravel()] = np.arange(3 * len(order))
     return rows

@@ -49,7 +49,7 @@ class Regions(NamedTuple):
         factor = np.repeat(np.maximum(1.0, np.sqrt(self.chi2 / self.components))[:, None], self.modulus.shape[1], 1)
         for f, own in enumerate(self.correlations):
             # Also without correlated noise, parts of the body share the noise of their common voxels.
-            factor[f] = np.maximum(1.0, own.enlarged) if own.seen else factor[f] * own.enlarged
+            factor[f] = np.maximum(1.0, own.enlarged if own.seen else factor[f] * own.enlarged)
         return factor
 
     @property
