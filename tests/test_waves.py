@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.ndimage
+import scipy.sparse
 
 from fitting.reports.waves import cautions
 from fitting.waves import (
@@ -404,31 +405,31 @@ def test_a_body_in_parts_has_the_same_elements_and_keeps_faces_out_of_the_balanc
 @pytest.mark.slow
 def test_moduli_and_errors_of_a_body_in_parts():
     """The errors know that parts share the noise of their common voxels."""
-    rng, G, omega = np.random.default_rng(0), 2500 + 800j, 2 * np.pi * 60.0
-    spacing, shape = 0.003, (17, 13, 9)
-    x = spacing * np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1)
-    clean = np.zeros((*shape, 3), complex)
-    for _ in range(12):
-        n, across = rng.normal(size=(2, 3))
-        n /= np.linalg.norm(n)
-        across = np.cross(n, across)
-        wave = np.exp(-1j * omega * np.sqrt(1000.0 / G) * (x @ n - 0.5 * np.max(x @ n)))
-        clean += across * rng.normal() * wave[..., None]
-    sd = 0.1 * np.sqrt(np.mean(np.abs(clean) ** 2))
-    apart, sure = [], []
-    for _ in range(12):
-        noise = sd * (rng.normal(size=clean.shape) + 1j * rng.normal(size=clean.shape))
-        field = wave_field.WaveField(
-            np.array([60.0]), (clean + noise)[None], np.full(3, spacing), np.zeros(3), np.ones(shape, bool), None,
-            np.array([sd]), "", (),
-        )  # fmt: skip
-        organ = elastography.organ_of(field, elastography.body_of(field, 4), 1000.0)
-        assert len(organ.matrices.parts) == 2 * 2 * 1
-        found = elastography.regions_of(organ)
+    apart, shared = [], []
+    for seed in range(8):
+        field = plane_waves((17, 13, 9), noise=1e-6, seed=seed)
+        found = elastography.regions_of(elastography.organ_of(field, elastography.body_of(field, 4), DENSITY))
         own = found.whole
-        error = own.modulus[0, 0] - G * (1 + found.mesh_bias[0])
-        apart += [error.real / own.standard_errors[0, 0].real, error.imag / own.standard_errors[0, 0].imag]
-        assert not own.correlations[0].seen
-        sure.append(own.correlations[0].enlarged[0])
-    assert 1.02 < np.mean(sure) < 1.05  # below 1 if only one of two nodes on a voxel counted
+        error = own.modulus[:, 0] - modulus(HERTZ) * (1 + found.mesh_bias)
+        apart += [*(error.real / own.standard_errors[:, 0].real), *(error.imag / own.standard_errors[:, 0].imag)]
+        shared += [each.enlarged[0] for each in own.correlations if not each.seen]
     assert 0.7 < np.sqrt(np.mean(np.square(apart))) < 1.4
+    assert len(shared) > 8 and 1.02 < np.mean(shared) < 1.05  # below 1 if only one of two nodes on a voxel counted
+
+
+def test_blocks_that_are_not_coupled_have_the_factor_of_the_whole():
+    rng, A = np.random.default_rng(0), np.zeros((11, 11), complex)
+    for a, b in ((0, 4), (4, 5), (5, 11)):
+        own = rng.normal(size=(b - a, b - a)) + 1j * rng.normal(size=(b - a, b - a))
+        A[a:b, a:b] = own @ own.conj().T + np.eye(b - a)
+    A[6, 5] = A[5, 6] = 0  # neighbours without a coupling, in one block
+    band = balance.by_diagonals(scipy.sparse.csr_array(A))
+    L = np.linalg.cholesky(A)
+    found = balance._factor_of_blocks(band)
+    assert np.allclose(found, balance.by_diagonals(scipy.sparse.csr_array(L + np.tril(L, -1).conj().T)), atol=1e-14)
+    assert [balance._coupled_across(balance.by_diagonals(scipy.sparse.csr_array(A)), k) for k in (3, 4, 5, 8)] == [
+        False,
+        False,
+        True,
+        True,
+    ]

@@ -23,7 +23,7 @@ def shown(G: Array, omega: Array, density: float, height: float) -> Array:
     Args:
         G: complex modulus (n,) [Pa].
         omega: angular frequency (n,) [rad/s].
-        density: of the sample [kg/m^3].
+        density: of the sample [kg/m^3]; of a compressed one `fitting.rigs.compression.torsional_density`.
         height: of the sample [m].
     """
     xp = arrays_of(G)

@@ -215,9 +215,9 @@ def likeliest(
 def _factor_of_blocks(S: np.ndarray) -> np.ndarray:
     """L of S = L L^H, by diagonals. Blocks that are not coupled, as of the parts of a body, are factorised in
     parallel."""
-    far = len(S) - 1 - np.argmax(S[::-1] != 0, axis=0)  # how far below the diagonal a column reaches
-    ends = np.flatnonzero(np.maximum.accumulate(np.arange(S.shape[1]) + far) == np.arange(S.shape[1])) + 1
-    blocks = [slice(a, b) for a, b in itertools.pairwise([0, *ends])]
+    gaps = np.flatnonzero(~S[1:2, :-1].any(axis=0))  # rows that are not coupled with the next one
+    ends = [k + 1 for k in gaps.tolist() if not _coupled_across(S, k)]
+    blocks = [slice(a, b) for a, b in itertools.pairwise([0, *ends, S.shape[1]])]
     if len(blocks) == 1:
         return scipy.linalg.cholesky_banded(S, overwrite_ab=True, lower=True, check_finite=False)
 
@@ -229,6 +229,11 @@ def _factor_of_blocks(S: np.ndarray) -> np.ndarray:
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
         list(pool.map(factorise, blocks))
     return S
+
+
+def _coupled_across(S: np.ndarray, k: int) -> bool:
+    """Whether a row up to k is coupled with a later one, by the diagonals S. In one part, the first column tells."""
+    return any(S[k - j + 1 :, j].any() for j in range(k, max(-1, k - len(S)), -1))
 
 
 def by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:

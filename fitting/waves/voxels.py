@@ -58,7 +58,7 @@ def voxel_body(
     # Corners of different parts are different nodes.
     own, split = np.unique(np.repeat(parts[kept], 24) * len(used) + tets.ravel(), return_inverse=True)
     corner = own % len(used)
-    linear = tet_mesh(np.asarray(whole.points)[corner], split.reshape(-1, 4))
+    linear = whole if len(own) == len(used) else tet_mesh(np.asarray(whole.points)[corner], split.reshape(-1, 4))
     mesh = quadratic(linear)
     place = np.rint((np.asarray(mesh.points) - start) / spacing).astype(int)
     part = np.empty(len(place), int)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from liverjax.core.struct import Number, param, static, struct
 from liverjax.mesh.nodal import mass_parts, nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
-from liverjax.physics.base import End, Free, NodalForce, Physics, Start, Step, Tied, diagonal
+from liverjax.physics.base import End, Free, NodalForce, Physics, Start, Step, diagonal
 from liverjax.solvers import attached
 from liverjax.solvers.attached import Masses, masses
 from liverjax.solvers.block_matrix import Block
@@ -68,7 +68,6 @@ class Inertia(Physics):
             mask, axes = nodes.not_given(mask, axes)
         own = {"x": step.x, "motion": memory, "dt": step.dt, "mask": mask, "integrator": self.integrator}
         own["free"] = step.free if step.averaged else None
-        own["tied"] = step.free.tied if step.averaged else ()
         return Moving(mass=mass, shared=shared, axes=axes, **own)
 
     def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
@@ -86,7 +85,7 @@ class Inertia(Physics):
         velocity, acceleration = acting.kinematics(end.x)
         if end.by_end_forces is not None:
             acceleration = acceleration + end.by_end_forces
-        for nodes in acting.tied:
+        for nodes in () if acting.free is None else acting.free.tied:
             velocity, acceleration = nodes.rigid(end.x, velocity, acceleration)
         return Motion(velocity, None if memory.acceleration is None else acceleration)
 
@@ -130,9 +129,7 @@ class Moving(NodalForce):
     shared: Masses | None = param("kg", "other part of the consistent mass; None: lumped", default=None)
     axes: jax.Array | None = param("1", "(V, 3) axis of a lifting plate with a given angle, 0 elsewhere", default=None)
 
-    free: Free | None = param("1", "free directions; None if no force acts at the end only", default=None)
-
-    tied: tuple[Tied, ...] = param("1", "nodes that move together, for Newmark's method", default=())
+    free: Free | None = param("1", "free directions; None for implicit Euler", default=None)
 
     everywhere: ClassVar[bool] = True
 

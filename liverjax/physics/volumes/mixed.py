@@ -33,7 +33,7 @@ from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Physics, Start, Step, VolumeStress
 from liverjax.solvers.block_matrix import BlockMatrix, off_diagonal
-from liverjax.tensors.matrices import Matrix, cofactor, determinant, scale_matrix
+from liverjax.tensors.matrices import IDENTITY, Matrix, cofactor, determinant, scale_matrix
 from liverjax.tensors.places import given, taken
 
 
@@ -80,9 +80,7 @@ _REACHED = 4096
 
 def _confined(step: Step) -> jax.Array:
     """Whether a constant pressure causes no force in any free direction."""
-    one = jnp.ones_like(step.mesh.weights)
-    zero = jnp.zeros_like(one)
-    force = nodal_force(step.mesh, tuple(tuple(one if r == c else zero for c in range(3)) for r in range(3)))
+    force = nodal_force(step.mesh, IDENTITY)
     free = jax.lax.stop_gradient(step.free.vectors(force, step.x))
     return jnp.linalg.norm(free) <= 1e-6 * jnp.linalg.norm(force)
 
