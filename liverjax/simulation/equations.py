@@ -85,6 +85,7 @@ class Forces(NamedTuple):
     pressure: jax.Array | None  # (V,) [Pa]
     x: jax.Array  # (V, 3) [m]
     F: Matrix
+    isochoric: jax.Array | None = None  # (V, 3) [N] part of `internal` without the unknown pressures' stress
 
     @property
     def total(self) -> jax.Array:
@@ -270,14 +271,15 @@ def forces(
     P = first
     for other in rest:
         P = add_matrices(P, other)
+    isochoric = None
     if e.mixed is not None:
-        pressure = _unknown_pressure(e, q)
+        pressure, isochoric = _unknown_pressure(e, q), mjed.nodal_force(e.mesh, P)
     elif e.volume is not None and pressure is None:
         pressure = e.volume.pressure(e.mesh, determinant(F), guess)
     if e.volume is not None:
         assert pressure is not None
         P = add_matrices(P, e.volume.stress(e.mesh, pressure, F))
-    return Forces(mjed.nodal_force(e.mesh, P), [a.force(e.mesh, x, s) for a in e.nodal], pressure, x, F)
+    return Forces(mjed.nodal_force(e.mesh, P), [a.force(e.mesh, x, s) for a in e.nodal], pressure, x, F, isochoric)
 
 
 def forces_at(scene: Scene, x: jax.Array) -> jax.Array:
@@ -316,13 +318,17 @@ def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.A
 def residual(
     e: Equations, q: jax.Array, s: Number, guess: Guess | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Out-of-balance forces (3 V,) [N] at fraction s of the step, sum of the norms of all forces [N], and pressures."""
+    """Out-of-balance forces (3 V,) [N] at fraction s of the step, sum of the norms of all forces [N], and pressures.
+
+    With unknown pressures, the sum of all forces counts mu/K times and the isochoric forces count in full, see
+    `Mixed.counted`.
+    """
     f = forces(e, q, s, guess)
     at_work = jnp.linalg.norm(f.internal)
     for force in f.nodal:
         at_work = at_work + jnp.linalg.norm(force)
-    if e.mixed is not None:
-        at_work = e.mixed.counted * at_work
+    if f.isochoric is not None:
+        at_work = (1 - e.mixed.counted) * jnp.linalg.norm(f.isochoric) + e.mixed.counted * at_work
     r, at_work = flat(e.free.vectors(f.total, f.x)), jax.lax.stop_gradient(e.noise + at_work)
     if e.mixed is not None:
         r = jnp.concatenate([r, e.mixed.unit * e.mixed.balance(e.mesh, f.pressure, determinant(f.F))])

@@ -24,7 +24,6 @@ import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, static, struct
-from liverjax.elements.mjed import nodal_force
 from liverjax.laws.base import Law, Volumetric, isochoric_part, volumetric_part
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.adjacency import PAIRS
@@ -33,7 +32,7 @@ from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Physics, Start, Step, VolumeStress
 from liverjax.solvers.block_matrix import BlockMatrix, off_diagonal
-from liverjax.tensors.matrices import IDENTITY, Matrix, cofactor, determinant, scale_matrix
+from liverjax.tensors.matrices import Matrix, cofactor, determinant, scale_matrix
 from liverjax.tensors.places import given, taken
 
 
@@ -78,13 +77,6 @@ _PART = {1: 0.25, 2: 1.0, 3: 1.0}
 _REACHED = 4096
 
 
-def _confined(step: Step) -> jax.Array:
-    """Whether a constant pressure causes no force in any free direction."""
-    force = nodal_force(step.mesh, IDENTITY)
-    free = jax.lax.stop_gradient(step.free.vectors(force, step.x))
-    return jnp.linalg.norm(free) <= 1e-6 * jnp.linalg.norm(force)
-
-
 @struct
 class MixedVolume(Physics):
     """The volumetric energy of a law, with pressures as unknowns."""
@@ -106,7 +98,7 @@ class MixedVolume(Physics):
         width = (volume / step.mesh.number_of_vertices) ** (1 / 3)
         soft = jax.lax.stop_gradient(jnp.min(jnp.asarray(mu / bulk)))
         reached = _REACHED * float(jnp.finfo(step.x.dtype).eps) / (1.0 if step.tolerance is None else step.tolerance)
-        counted = jnp.where(_confined(step), jnp.minimum(jnp.maximum(soft, reached), 1.0), 1.0)
+        counted = jnp.minimum(jnp.maximum(soft, reached), 1.0)
         own = {"unit": mean / volume / width, "counted": counted, "kind": kind}
         return Mixed(part=part, rest=bulk - part, shear=mu, before=memory, **own)
 
@@ -126,8 +118,8 @@ class Mixed(VolumeStress):
     unit: jax.Array = param("N/m^3", "pressure of an unknown of 1 m, so that all residuals are forces")
     counted: jax.Array = param(
         "1",
-        "part of the acting forces that sets the tolerance. In a confined body pressures cause nearly all forces, and "
-        "only small volume changes determine them: there it is mu/K",
+        "mu/K, the part of all forces that sets the tolerance. The isochoric forces count in full. In a confined body "
+        "the pressures cause nearly all forces, but small volume changes determine the pressures",
     )
     kind: str = static(about="of the volumetric energy")
 
