@@ -8,7 +8,9 @@ from test_field import SURFACE, _scene, _write
 
 import liverjax as lj
 from fitting.__main__ import main
+from fitting.fits import field, scene_numbers
 from fitting.readers import displacements
+from liverjax.core.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -109,3 +111,11 @@ def test_displacements_in_another_unit_are_told(tmp_path, capsys):
     assert "per component, so the fit misses the displacements" in capsys.readouterr().err
     found = json.loads((tmp_path / "out" / "field.json").read_text())
     assert found["chi2_per_component"] > 1.5 and "look at the unit" in found["warnings"][0]
+
+
+def test_scenes_of_two_orders_have_different_meshes(tmp_path):
+    """Their elements are as many, but not their nodes: this ended with a traceback of NumPy."""
+    scenes = [_scene(tmp_path)]
+    scenes.append(replace(scenes[0], mesh=lj.quadratic(scenes[0].mesh)))
+    with pytest.raises(lj.InputError, match="a field needs one mesh in all scenes"):
+        field.start_of(scene_numbers.Problem(tuple(scenes), ()), "law.mu")

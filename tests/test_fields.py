@@ -182,3 +182,5 @@ def test_a_field_of_a_result_is_drawn(tmp_path, capsys):
     (tmp_path / "other.h5").write_text("no")
     assert main(["plot", str(tmp_path / "other.h5")]) == 2
     assert "is not a result of liverjax simulate" in capsys.readouterr().err
+    assert main(["plot", str(tmp_path)]) == 2  # it counted as the name of a law
+    assert "is a file or a folder, and not a law: give the result.h5" in capsys.readouterr().err

@@ -142,3 +142,41 @@ def test_workbooks_that_cannot_be_read_are_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "python_calamine", None)  # as where it is not installed
     with pytest.raises(InputError, match=r"pip install '\.\[excel\]'"):
         read_sweep(old)
+
+
+BELOW = "Point,Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)\n1,0.1,1000,100\n2,0.5,1100,120\n3,1,1200,150\n"
+
+
+@pytest.mark.parametrize("word", ["Mean", "SD", "Average:", "Std. Dev.", "Mittelwert", "CV (%)"])
+def test_a_summary_below_a_table_is_no_point(tmp_path, word):
+    """A row "Mean" was fitted as a sixth point, with the mean of the frequencies."""
+    s = read_sweep(_write(tmp_path, f"{BELOW}4,5,1400,200\n{word},1.65,1175,142\n"))
+    assert list(s.storage) == [1000, 1100, 1200, 1400] and f"line 6 is a summary of other rows ({word})" in s.notes[0]
+
+
+def test_a_word_that_most_rows_have_marks_no_summary(tmp_path):
+    text = "Value,Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)\n" + 3 * "mean,{},1000,100\n"
+    s = read_sweep(_write(tmp_path, text.format(0.1, 1, 10)))
+    assert len(s.storage) == 3 and s.notes == ()
+
+
+@pytest.mark.parametrize("between", "\t;")
+def test_commas_before_units_are_no_delimiters(tmp_path, between):
+    rows = (("Frequency, Hz", "G', Pa", "G'', Pa"), ("0,1", "1000", "100"), ("1", "1200", "150"), ("10", "1500", "260"))
+    s = read_sweep(_write(tmp_path, "\n".join(between.join(row) for row in rows)))
+    assert list(s.storage) == [1000, 1200, 1500] and np.isclose(s.angular_frequency[0], 0.2 * np.pi)
+
+
+def test_a_row_of_units_that_are_not_known_is_refused_by_name(tmp_path):
+    """The rows below were not read: "there are no numbers below the header"."""
+    text = "Frequency\tStorage modulus\tLoss modulus\nrad/s\tmPa\tmPa\n0.1\t1000\t100\n1\t1200\t150\n10\t1500\t260\n"
+    with pytest.raises(InputError, match="unit 'mPa' of column Storage modulus is not known"):
+        read_sweep(_write(tmp_path, text))
+
+
+def test_quoted_headings_may_have_line_breaks(tmp_path):
+    text = '"Frequency\n(Hz)","G\'\n(Pa)","G\'\' (Pa)"\n0.1,1000,100\n1,1200,150\n10,x,260\n'
+    path = _write(tmp_path, text)
+    with pytest.raises(InputError, match=r"line 6: G' .Pa. = 'x' is not a number"):
+        read_sweep(path)
+    assert list(read_sweep(_write(tmp_path, text.replace("x", "1500"))).storage) == [1000, 1200, 1500]

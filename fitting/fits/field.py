@@ -75,7 +75,8 @@ def start_of(problem: Problem, name: str) -> jax.Array:
     scene = problem.scenes[0]
     E = scene.mesh.number_of_elements
     for other in problem.scenes[1:]:
-        if other.mesh.number_of_elements != E or not np.allclose(other.mesh.points, scene.mesh.points):
+        same = other.mesh.number_of_elements == E and other.mesh.order == scene.mesh.order
+        if not same or not np.allclose(other.mesh.points, scene.mesh.points):
             raise InputError("the scenes have different meshes: a field needs one mesh in all scenes")
     base = numbers_at(scene, name)
     if isinstance(base, tuple) or jnp.ndim(base) > 1 or (jnp.ndim(base) == 1 and base.shape != (E,)):

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, Numbers, param, replace, static, struct
+from liverjax.core.struct import Indices, Number, Numbers, param, replace, static, struct
 from liverjax.mesh.tetrahedra import TetMesh
-from liverjax.physics.base import NodalForce, Physics, Step
+from liverjax.physics.base import Free, NodalForce, Physics, Step
 
 
 @struct
@@ -34,6 +34,9 @@ class RigidPlate(Physics):
     centre: jax.Array = param("m", "a point of the axis (3,)", default=(0.0, 0.0, 0.0))
     by: str = static(default="angle", about="what is given: angle or torque", words=("angle", "torque"))
     lifts: bool = static(default=False, about="free to move along the axis, without axial force")
+    still: Indices | None = param(
+        "1", "numbers (m,) of cubic functions between the nodes; the plate keeps them at 0", default=None
+    )
 
     section: ClassVar[str] = "plate"
     ties: ClassVar[bool] = True
@@ -76,8 +79,16 @@ class RigidPlate(Physics):
         return Torque(plate=self.tied(step))
 
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "RigidPlate":
-        """The plate with the nodes that the richer mesh adds between its nodes."""
-        return replace(self, nodes=more(self.nodes))
+        """The plate with the nodes that the richer mesh adds between its nodes.
+
+        Cubic functions are not nodes: they have no position. A rigid motion does not need them.
+        """
+        nodes = more(self.nodes)
+        return replace(self, nodes=nodes) if mesh.order < 3 else replace(self, still=nodes[len(self.nodes) :])
+
+    def constrain(self, free: Free) -> Free:
+        """The cubic functions of the plate are fixed."""
+        return free if self.still is None else free._replace(mask=free.mask.at[self.still].set(0.0))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """The plate is held across its axis; along it if `lifts` is false; against rotation if the angle is given."""

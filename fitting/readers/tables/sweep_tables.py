@@ -20,8 +20,15 @@ from fitting.readers.tables.sweep_columns import (
     names_shear,
 )
 from fitting.readers.tables.sweep_headings import DEVIATION_WORDS
-from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, means_nothing, split_cells, to_number
-from fitting.readers.units import MODULUS_UNITS
+from fitting.readers.tables.text_tables import (
+    decimal_sign,
+    find_delimiter,
+    means_nothing,
+    split_cells,
+    summary_rows,
+    to_number,
+)
+from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS
 from liverjax.core.errors import InputError
 
 #: First characters of a comment line.
@@ -133,13 +140,18 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
         if rows:
             units = [split_cells(line, delimiter) for line in lines[headers[-1] : above]]
             own = [split_cells(lines[n - 1], delimiter) for n in numbers]
+            left_out = summary_rows(own)
+            notes = [
+                f"line {numbers[j]} is a summary of other rows ({word}) and is left out" for j, word in left_out.items()
+            ]
+            rows, numbers, own = ([v for j, v in enumerate(a) if j not in left_out] for a in (rows, numbers, own))
             sign = decimal_sign(row[c.place] for row in own for c in columns if c.place < len(row))
             raw = _raw(cells, units, own, delimiter, sign)
             unit = raw_torque.unit_of("strain", cells, units[-1] if units else [])
             others = [c for c in columns_beside(cells, units[-1] if units else [], columns) if c.place < len(cells)]
             beside = tuple((c, _cells_of(c.place, own, delimiter, sign)) for c in others)
             unread = raw_torque.without_unit(cells, units[-1] if units else [])
-            told = (*_nameless_deviations(cells), *_perhaps_thousands(own, columns, sign), *unread)
+            told = (*notes, *_nameless_deviations(cells), *_perhaps_thousands(own, columns, sign), *unread)
             told += tuple(_perhaps_tensile(cells, columns))
             tables.append(Table(name, columns, rows, numbers, raw, unit, beside, told))
         free = k
@@ -233,7 +245,9 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
         cells = split_cells(lines[ahead], delimiter)
         units = {c.place: cells[c.place].strip('"[]() ') for c in columns if c.place < len(cells)}
         moduli = [units.get(c.place) in MODULUS_UNITS for c in columns if c.quantity in MODULI]
-        if any(moduli):
+        # If only the unit of the frequency is known, the units of the moduli are refused later.
+        known = [units.get(c.place, "").lower() in FREQUENCY_UNITS for c in columns if c.quantity == "frequency"]
+        if any(moduli) or any(known):
             return [c._replace(unit=units.get(c.place) or c.unit) for c in columns], ahead + 1
         if any(re.match(r"[-+]?\d", cell) for cell in cells):
             break

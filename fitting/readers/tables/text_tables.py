@@ -40,7 +40,24 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
         if found is None:
             raise InputError(f"{path} is JSON, but not the export of TRIOS (it has no Results): give CSV or text")
         return found
-    return text
+    return _with_whole_headings(text)
+
+
+#: A quoted cell that the line does not close.
+_OPEN = re.compile(r'(?:^|[,;\t])\s*"[^"]*$')
+
+
+def _with_whole_headings(text: str) -> str:
+    """The text in which quoted headings with line breaks stand on one line. Line numbers below stay the same."""
+    lines = text.splitlines()
+    for k in range(min(len(lines), _HEAD) - 1):
+        if _OPEN.search(lines[k]) and re.match(r'[^",;\t]*"\s*(?:[,;\t]|$)', lines[k + 1]):
+            lines[k], lines[k + 1] = "", f"{lines[k]} {lines[k + 1]}"
+    return "\n".join(lines)
+
+
+#: Headings stand in the first lines of a file.
+_HEAD = 200
 
 
 def _decoded(path: Path, data: bytes) -> str:
@@ -59,8 +76,13 @@ def _decoded(path: Path, data: bytes) -> str:
 
 
 def find_delimiter(line: str) -> str:
-    """Delimiter between the cells of a line: the most frequent of tab, semicolon, comma and bar; or else spaces."""
+    """Delimiter between the cells of a line: the most frequent of tab, semicolon, comma and bar; or else spaces.
+
+    In "Frequency, Hz;Modulus, Pa" the commas are within the cells: a comma with a space counts only if there is no tab
+    and no semicolon.
+    """
     plain = re.sub(r"\|\s*\w+\s*\*?\s*\|", "", line) if "*|" in line else line  # the bars of |G*| are not delimiters
+    plain = re.sub(r", +", "", plain) if re.search(r"[\t;]", plain) else plain
     best = max("\t;,|", key=plain.count)
     return best if best in plain else ("  " if "  " in line.strip() else " ")
 
@@ -129,3 +151,24 @@ def to_number(text: str, delimiter: str, sign: str | None = None) -> float | Non
 def means_nothing(cells: Iterable[str]) -> bool:
     """Whether no cell begins like a number. Then the line has only words."""
     return not any(re.match(r"[-+]?[.,]?\d|nan|[-+]?inf", cell.strip('" ').lower()) for cell in cells)
+
+
+#: Words that mark a row as a summary of other rows.
+_SUMMARY = re.compile(
+    r"(mean|average|avg|median|sd|std|st\.? ?dev|std\.? ?dev|standard deviation|sem|standard error|min|max|minimum"
+    r"|maximum|range|cv|mittelwert|mittel|standardabweichung|moyenne|.cart[- ]type|media|promedio)\.?( ?\(?%?\)?)?:?",
+    re.I,
+)
+
+
+def summary_rows(rows: list[list[str]]) -> dict[int, str]:
+    """Rows such as "Mean" and "SD" below a table, and the word that each one has in one of its cells.
+
+    If most rows have such a word, it does not mark a summary.
+    """
+    found: dict[int, str] = {}
+    for k, row in enumerate(rows):
+        word = next((cell.strip('" ') for cell in row if _SUMMARY.fullmatch(cell.strip('" '))), None)
+        if word is not None:
+            found[k] = word
+    return found if 2 * len(found) < len(rows) else {}

@@ -10,7 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from fitting.readers.tables.text_tables import EMPTY, decimal_sign, means_nothing, split_line, text_of, to_number
+from fitting.readers.tables.text_tables import (
+    EMPTY,
+    decimal_sign,
+    means_nothing,
+    split_line,
+    summary_rows,
+    text_of,
+    to_number,
+)
 from fitting.readers.units import TIME_TEST_UNITS
 from liverjax.core.errors import InputError
 
@@ -290,7 +298,7 @@ def _known_column(quantity: str, unit: str) -> bool:
 
 def _rows_in_time(path, lines, k, delimiter, found):
     """Numbers below the header, the units from a line of units, and notes. An empty cell is NaN."""
-    kept, numbers, units, notes = [], [], {}, []
+    kept, numbers, every, units, notes = [], [], [], {}, []
     needed = {q: place for q, (place, _) in found.items()}
     while k < len(lines):
         line = lines[k]
@@ -299,6 +307,7 @@ def _rows_in_time(path, lines, k, delimiter, found):
         own = [cells[p] if p < len(cells) else "" for p in needed.values()]
         if not means_nothing(own):
             kept.append(own)
+            every.append(cells)
             numbers.append(k)
             continue
         named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known_column(q, cells[p])}
@@ -310,6 +319,9 @@ def _rows_in_time(path, lines, k, delimiter, found):
             if not _rows_follow(lines[k:], delimiter, list(needed.values())):
                 break
             notes.append(f"line {k}, {line.strip()[:40]!r}, has no numbers and is left out")
+    left_out = summary_rows(every)
+    notes += [f"line {numbers[j]} is a summary of other rows ({word}) and is left out" for j, word in left_out.items()]
+    kept, numbers = ([v for j, v in enumerate(a) if j not in left_out] for a in (kept, numbers))
     sign = decimal_sign(cell for own in kept for cell in own)
     rows = [[to_number(cell, delimiter, sign) for cell in own] for own in kept]
     for number, row in zip(numbers, rows, strict=True):
