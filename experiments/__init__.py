@@ -1,1 +1,3 @@
-"""The evidence: one script a question, its results, and the pages that quote them."""
+"""Numerical evidence: one script for each question, the results of the scripts, and the pages that quote these
+results.
+"""

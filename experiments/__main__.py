@@ -1,4 +1,4 @@
-"""``python -m experiments all | pages | NAME … [--quick]``: run the scripts, and write the pages that quote them."""
+"""``python -m experiments all | pages | NAME … [--quick]``: run scripts, then write the pages that quote them."""
 
 import argparse
 import subprocess
@@ -14,13 +14,15 @@ HERE = Path(__file__).parent
 
 
 def module(script: str) -> str:
-    """The module of a script, by its name."""
+    """Return the module name of a script, given the name of the script."""
     (file,) = (found for found in HERE.glob(f"*/{script}.py") if found.parent.name != "pages")
     return f"experiments.{file.parent.name}.{script}"
 
 
 def run(script: str, quick: bool) -> bool:
-    """One script in a process of its own; whether it ended well, or says that it needs what is not here."""
+    """Run one script in a separate process. Return whether it ended without error or reported that this machine lacks
+    what it needs.
+    """
     begin = time.perf_counter()
     command = [sys.executable, "-m", module(script), *(["--quick"] if quick else [])]
     code = subprocess.run(command, cwd=HERE.parent).returncode
@@ -33,7 +35,7 @@ def run(script: str, quick: bool) -> bool:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command; 0 if every script ended well."""
+    """Run the command. Return 0 if every script ended without error."""
     parser = argparse.ArgumentParser(prog="python -m experiments", description="Run experiments and write the pages.")
     parser.add_argument("names", nargs="+", choices=["all", "pages", *ROWS], metavar="all | pages | NAME")
     parser.add_argument(

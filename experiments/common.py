@@ -1,4 +1,4 @@
-"""What every experiment does alike: time a compiled function, record the environment, write JSON and PNG."""
+"""Tasks common to all experiments: time a compiled function, record the environment, write JSON and PNG."""
 
 import json
 import os
@@ -19,11 +19,12 @@ import matplotlib.pyplot as plt
 
 from liverjax.core.versions import versions
 
-# Compile times are those of a machine that has compiled nothing yet.
+# Compile times are those without a cache of compiled programs.
 os.environ["LIVERJAX_CACHE"] = "off"
-#: Fewer cases and smaller ones, for a look at whether everything runs; published results stay as they are.
+#: With this option, scripts run fewer and smaller cases, to check that everything runs. Published results stay as they
+#: are.
 QUICK = "--quick" in sys.argv[1:]
-#: Exit code of a script that needs what this machine lacks: its results and its time stay as they are.
+#: Exit code of a script that needs what this machine lacks. Its stored results and run time stay as they are.
 SKIPPED = 77
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "experiments" / "results" / ("quick" if QUICK else "")
@@ -31,14 +32,16 @@ plt.rcParams.update({"font.size": 9, "axes.titlesize": 9, "axes.grid": True, "gr
 
 
 class Timing(NamedTuple):
-    """Seconds: compilation, and the median of the rounds."""
+    """Seconds of compilation, and median seconds of the rounds."""
 
     compile: float
     run: float
 
 
 def timed(function: Callable, *arguments: Any, rounds: int = 5) -> tuple[Any, Timing]:
-    """Result and timing of a jitted function; compile time apart, median of `rounds` runs after a first one."""
+    """Return the result and timing of a jitted function: compile time, and median of `rounds` runs after a
+    first one.
+    """
     begin = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()
     compiling = time.perf_counter() - begin
@@ -52,17 +55,17 @@ def timed(function: Callable, *arguments: Any, rounds: int = 5) -> tuple[Any, Ti
 
 
 def either(full: Any, quick: Any) -> Any:
-    """The second with --quick on the command line."""
+    """Return `quick` with --quick on the command line, otherwise `full`."""
     return quick if QUICK else full
 
 
 def environment() -> dict[str, Any]:
-    """Where the numbers come from, without naming a machine."""
+    """Return software versions and kind of machine for the results, without the name of the machine."""
     return versions() | {"cores": os.cpu_count(), "architecture": platform.machine(), "backend": jax.default_backend()}
 
 
 def plain_ticks(*axes: Any) -> None:
-    """1, 2, 5, 10 … as plain numbers on logarithmic axes."""
+    """Label logarithmic axes with the plain numbers 1, 2, 5, 10 …."""
     for axis in axes:
         axis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))

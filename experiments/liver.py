@@ -1,4 +1,4 @@
-"""The liver phantom of `scenes/liver_gravity.toml` in its three models, and timed runs of it."""
+"""The liver phantom of `scenes/liver_gravity.toml` in its three models, and timed runs of these models."""
 
 import time
 from pathlib import Path
@@ -15,28 +15,30 @@ SCENE = Path(__file__).parent / "scenes" / "liver_gravity.toml"
 
 
 def models() -> dict[str, lj.Scene]:
-    """Hyperelastic, with viscosity, and the chapter's complete model."""
+    """Return the three models: hyperelastic, viscous, and the chapter's complete model."""
     complete = lj.load_scene(SCENE)
     viscous = replace(complete, porosity=None)
     return {"hyperelastic": replace(viscous, viscosity=None), "viscous": viscous, "complete": complete}
 
 
 def with_solve(scene: lj.Scene, seconds: float, dt: float, **changes) -> lj.Scene:
-    """The scene over some seconds in steps of dt."""
+    """Return the scene with a duration of `seconds` in steps of `dt`, and other changes of its solver settings."""
     return replace(scene, solve=replace(scene.solve, dt=dt, steps=round(seconds / dt), **changes))
 
 
-#: The chapter's scheme: one linear solve a step, to 1e-4.
+#: The chapter's scheme: one linear solve per step, to a relative residual of 1e-4.
 ONE_STEP: dict[str, Any] = {"newton": "one_step", "tolerance": 1e-3}
 
 
 def found(result: lj.Result) -> np.ndarray:
-    """Whether each step ended as its scheme means it to: one step of Newton need not meet the tolerance."""
+    """Return whether each step ended as its scheme intends. One Newton iteration need not meet the tolerance."""
     return np.isin(np.asarray(result.status), (status.CONVERGED, status.ONE_STEP))
 
 
 def timed_run(scene: lj.Scene, rounds: int = 2) -> tuple[lj.Result, dict]:
-    """The result and what it took: the fastest of some runs after compilation."""
+    """Return the result, and times and iterations of the run. The run time is the shortest of some runs after
+    compilation.
+    """
     begin = time.perf_counter()
     program = jax.jit(lj.simulate).lower(scene).compile()
     compiling, seconds = time.perf_counter() - begin, []
@@ -58,7 +60,9 @@ def timed_run(scene: lj.Scene, rounds: int = 2) -> tuple[lj.Result, dict]:
 
 
 def error(times: np.ndarray, x: np.ndarray, reference_times: np.ndarray, reference: np.ndarray, at: tuple) -> float:
-    """Largest distance of a node from the reference at some times, relative to the largest displacement there [1]."""
+    """Return the largest distance of a node from the reference at some times, over the largest displacement
+    there [1].
+    """
     pick = [np.argmin(abs(np.asarray(times) - t)) for t in at]
     of = [np.argmin(abs(np.asarray(reference_times) - t)) for t in at]
     x, exact = np.asarray(x)[pick], np.asarray(reference)[of]

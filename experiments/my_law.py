@@ -1,7 +1,8 @@
-"""A law of one's own, in ten lines and without touching the package.
+"""A user-defined law in ten lines, without changes to the package.
 
-``python -m liverjax check experiments/my_law.py:Gent`` checks it, ``python -m liverjax plot experiments/my_law.py:Gent
-yeoh`` draws it, and it simulates and differentiates like a shipped one: its derivatives come from its energy.
+``python -m liverjax check experiments/my_law.py:Gent`` checks it. ``python -m liverjax plot experiments/my_law.py:Gent
+yeoh`` plots it. It simulates and differentiates like a law of the package, because its derivatives are computed from
+its energy.
 """
 
 import jax.numpy as jnp
@@ -19,5 +20,5 @@ class Gent(lj.Law):
     volumetric: str = lj.static("quadratic")
 
     def isochoric_energy(self, I1, I2):
-        """The energy of the class's first line."""
+        """Return the isochoric energy in the first line of the class docstring."""
         return -self.mu * self.limit / 2 * jnp.log1p(-(I1 - 3) / self.limit)

@@ -2,7 +2,7 @@
 
 from types import ModuleType
 
-from liverjax.core import addresses  # 64-bit mode and the check of the jax release come first
+from liverjax.core import addresses  # first: this import sets 64-bit mode and checks the jax release
 
 
 def __getattr__(name: str) -> ModuleType:

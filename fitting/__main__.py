@@ -1,4 +1,4 @@
-"""``python -m fitting SWEEP.csv …``, and other tests: ``… curves | field | relaxation | creep | … | waves FILE …``."""
+"""The command line ``python -m fitting SWEEP.csv …``; for other tests ``… curves | field | relaxation | … FILE …``."""
 
 import importlib
 import sys
@@ -6,19 +6,19 @@ import sys
 from liverjax.commands.arguments import with_joined_numbers
 from liverjax.commands.exit_codes import exit_code, show_unknown_letters
 
-#: Names of the other commands; without one of them the command line is for a frequency sweep.
+#: Names of the other commands. A command line without one of these names is for a frequency sweep.
 COMMANDS = ("curves", "field", "relaxation", "creep", "indentation", "amplitude", "waves")
 
 
 def main(arguments: list[str] | None = None, prog: str = "python -m fitting") -> int:
-    """Entry point; returns the exit code: 0 done, 1 not converged, 2 unusable input."""
+    """Run a command line and return the exit code: 0 (done), 1 (not converged) or 2 (unusable input)."""
     show_unknown_letters()
     arguments = sys.argv[1:] if arguments is None else arguments
     name = "sweep"
     if arguments[:1] and arguments[0] in COMMANDS:
         name, arguments = arguments[0], arguments[1:]
         prog = f"{prog} {name}"
-    command = importlib.import_module(f"fitting.commands.{name}")  # other commands stay unloaded, for a quick start
+    command = importlib.import_module(f"fitting.commands.{name}")  # only this command is loaded, for a quick start
     return exit_code(command.run, command.parser(prog).parse_args(with_joined_numbers(arguments)))
 
 

@@ -1,3 +1,3 @@
-"""Fits of several tests, under the name that users import: all of `fitting.fits.joint`."""
+"""The module that users import for fits of several tests: all of `fitting.fits.joint`."""
 
 from fitting.fits.joint import *  # noqa: F403

@@ -1,3 +1,3 @@
-"""Readers of frequency sweeps, under the name that users import: all of `fitting.readers.rheometer`."""
+"""The module that users import for readers of frequency sweeps: all of `fitting.readers.rheometer`."""
 
 from fitting.readers.rheometer import *  # noqa: F403

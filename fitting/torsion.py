@@ -1,3 +1,3 @@
-"""The simulated rheometer, under the name that users import: all of `fitting.rigs.torsion`."""
+"""The module that users import for the simulated rheometer: all of `fitting.rigs.torsion`."""
 
 from fitting.rigs.torsion import *  # noqa: F403

@@ -1,7 +1,7 @@
 """liverjax: soft-tissue mechanics as one differentiable JAX program.
 
-The import turns on JAX's 64-bit mode, and matrix products with full float32 precision, unless the environment sets
-``JAX_ENABLE_X64`` or ``JAX_DEFAULT_MATMUL_PRECISION``.
+The import turns on JAX's 64-bit mode and matrix products with full float32 precision. The environment variables
+``JAX_ENABLE_X64`` and ``JAX_DEFAULT_MATMUL_PRECISION`` override these two settings.
 """
 
 import os
@@ -17,7 +17,7 @@ if jax.__version__ in ("0.10.2", "0.11.0"):
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 if "JAX_DEFAULT_MATMUL_PRECISION" not in os.environ:
-    # By default a GPU multiplies float32 with 11 bits: results of quadratic elements had errors of up to 6 %.
+    # By default, a GPU multiplies float32 numbers with 11 bits. Quadratic elements then had errors of up to 6 %.
     jax.config.update("jax_default_matmul_precision", "highest")
 if len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)) == 1:
     # On one core JAX has one thread. A direct solve on the host would wait for this thread (deadlock). So use two.

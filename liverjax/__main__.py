@@ -1,4 +1,7 @@
-"""``liverjax simulate | sweep | reduce | design | laws | check | plot | play | fit``, or ``python -m liverjax …``."""
+"""Command line ``liverjax simulate | sweep | reduce | design | laws | check | plot | play | fit``.
+
+``python -m liverjax …`` is the same.
+"""
 
 import argparse
 import sys
@@ -12,7 +15,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=prog,
         description="Soft-tissue mechanics in JAX.",
-        epilog="Exit code 0: done; 1: a check or a step failed; 2: unusable input.",
+        epilog="Exit codes: 0 = done, 1 = a check or a step failed, 2 = unusable input.",
     )
     parsers = parser.add_subparsers(dest="command", required=True)
     for command in (simulate, sweep, reduce, design, laws, check, plot, play, fit):
@@ -21,7 +24,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None, prog: str = "liverjax") -> int:
-    """Entry point. Return the exit code: 0 done, 1 failed, 2 unusable input."""
+    """Run one command. Return its exit code: 0 (done), 1 (failed) or 2 (unusable input)."""
     show_unknown_letters()
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["fit"]:

@@ -1,3 +1,3 @@
-"""The gradient check of laws under its short name for users: everything of `liverjax.laws.gradient_check`."""
+"""Short name for the gradient check of material laws, `liverjax.laws.gradient_check`."""
 
 from liverjax.laws.gradient_check import *  # noqa: F403

@@ -1,8 +1,8 @@
-"""Strict numerics for every test: 64 bit, no silent rank promotion; data of other programs where it is present."""
+"""Settings for all tests: 64 bit, no silent rank promotion, and data of other programs where they are present."""
 
 import os
 
-# Two workers have two cores: threads of their own would wait for each other.
+# The two test processes share two cores, so threads of the BLAS would wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import gc
@@ -31,15 +31,15 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 ROOT = Path(__file__).parent.parent
 #: Results of other programs and measured data that are not part of the project.
 SHARED = Path(os.environ.get("LIVERJAX_SHARED", ROOT.parent / "shared"))
-# XLA's newer way to write kernels takes two thirds of the time of a compilation; 0.11 knows no other. And a program in
-# one part compiles a seventh faster on the one core that a worker has.
+# XLA's newer code generation takes two thirds of the compile time; jax 0.11 has no other. A program compiled as one
+# part compiles a seventh faster on the one core of a test process.
 if "XLA_FLAGS" not in os.environ:
-    # A GPU adds in no fixed order unless it is told to: without this, equal runs differ in their last digits there.
+    # A GPU adds in no fixed order by default, so equal runs differ in their last digits. This option fixes the order.
     os.environ["XLA_FLAGS"] = "--xla_gpu_deterministic_ops=true"
     if version("jaxlib").startswith(("0.8.", "0.9.", "0.10.")):
         os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
-#: Files that take seconds: with -x they tell within half a minute what is broken.
+#: Files that take only seconds. They run first, so that with -x an error shows within half a minute.
 QUICK = {
     f"test_{name}"
     for name in (
@@ -60,27 +60,29 @@ QUICK = {
         "stretches",
     )
 }
-#: Programs after which a file begins without any. Each takes a megabyte or two, and ten of the 65,530 memory maps that
-#: Linux grants a process, or 150 if it is compiled in parts: some 430 of these made jax 0.10.1 crash. Files that
-#: compile few go on with what is there.
+#: Caches are emptied at the beginning of a file if more programs than this are compiled. Each program needs one or two
+#: megabytes, and 10 of the 65,530 memory maps that Linux grants a process, or 150 if it is compiled in parts. About 430
+#: such programs made jax 0.10.1 crash. Files with few programs keep those that are there.
 MANY_PROGRAMS = 400 if "parallel_codegen_split_count=1" in os.environ.get("XLA_FLAGS", "") else 100
 
 
 def pytest_addoption(parser):
-    """The page of known answers."""
+    """Add the option for the verification page."""
     text = "run the tests that have a known answer, slow ones too, and put their rows into a JSON file"
     parser.addoption("--verification", metavar="FILE", type=Path, help=text)
 
 
 def pytest_collection_modifyitems(config, items):
-    """With --verification only tests of known answers run. Otherwise files that compile little come first."""
+    """Select the tests. With --verification, only tests with a known solution run; otherwise files with few programs
+    first.
+    """
     if config.getoption("--verification"):
         items[:] = [item for item in items if "verified" in item.fixturenames]
     items.sort(key=lambda item: item.path.stem not in QUICK)
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """Rows of the tests that passed, in the order of their names; rows of tests that did not run stay as they are."""
+    """Write the rows of the passed tests, sorted by their names. Rows of tests that did not run stay as they are."""
     file = config.getoption("--verification")
     if file:
         stats = terminalreporter.stats
@@ -88,7 +90,7 @@ def pytest_terminal_summary(terminalreporter, config):
         passed = stats.get("passed", [])
         rows = [dict(row, test=r.nodeid) for r in passed for name, row in r.user_properties if name == "verified"]
         before = json.loads(file.read_text())["rows"] if file.exists() else []
-        made = {row["benchmark"] for row in rows}  # a test may have got another name
+        made = {row["benchmark"] for row in rows}  # a test may have been renamed
         old = [r for r in before if r["test"] not in ran and r["benchmark"] not in made]
         old = [r for r in old if Path(config.rootpath, r["test"].split("::")[0]).exists()]
         rows = sorted(rows + old, key=lambda row: row["test"])
@@ -98,7 +100,10 @@ def pytest_terminal_summary(terminalreporter, config):
 
 @pytest.fixture
 def verified(record_property):
-    """Puts a row on the page of known answers, if the test passes: what, whose, largest difference [1], order."""
+    """Return a function that adds a row to the verification page if the test passes.
+
+    The row holds the benchmark, its source, the largest difference [1], the allowed difference and the order.
+    """
 
     def row(benchmark: str, source: str, difference: float, allowed: float, order: float | None = None, **values):
         numbers = {"difference": float(difference), "allowed": float(allowed)}
@@ -110,7 +115,7 @@ def verified(record_property):
 
 
 def pytest_configure(config):
-    """Programs compiled once are found again by the other worker and by commands that tests start."""
+    """Share compiled programs with the other test process and with commands that tests start."""
     config.addinivalue_line("markers", "slow: run by python -m pytest -m slow, not by default")
     config.addinivalue_line("markers", "core: each public entry once, for other versions of Python and jax: -m core")
     config.addinivalue_line("markers", "draws: its pictures are drawn; those of other tests are files of one point")
@@ -119,22 +124,23 @@ def pytest_configure(config):
         config.option.markexpr = ""
     if not hasattr(config, "workerinput"):
         config.compiled = tempfile.mkdtemp()
-        os.environ["LIVERJAX_CACHE"] = "off"  # the user's own stays as it is
+        os.environ["LIVERJAX_CACHE"] = "off"  # the user's own cache stays as it is
         os.environ["JAX_COMPILATION_CACHE_DIR"] = config.compiled
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # found again in a few milliseconds
-    # Tracing makes millions of objects that live on: Python would look through all of them again and again.
+    # Tracing makes millions of objects that stay in memory. Without this call, Python would scan all of them
+    # repeatedly.
     gc.freeze()
     gc.set_threshold(100_000, 20, 20)
 
 
 def pytest_unconfigure(config):
-    """Leave nothing behind."""
+    """Remove the temporary folder."""
     if hasattr(config, "compiled"):
         shutil.rmtree(config.compiled, ignore_errors=True)
 
 
-#: Programs compiled or found on disk since caches were last emptied. Tests that count programs read it: a listener of
-#: their own could not be removed without this one.
+#: One entry for each program that was compiled or found on disk since caches were last emptied. Tests that count
+#: programs read this list, because a separate listener could not be removed without this one.
 COMPILED: list[float] = []
 
 
@@ -151,7 +157,7 @@ def _compilation(request):
     quick = any(mark.name == "quick_to_compile" for mark in request.node.iter_markers())
     changed = quick != jax.config.values["jax_disable_most_optimizations"]
     jax.config.update("jax_disable_most_optimizations", quick)
-    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quick))  # of commands that tests start
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quick))  # for commands that tests start
     if changed or len(COMPILED) > MANY_PROGRAMS:
         jax.clear_caches()
         COMPILED.clear()
@@ -170,21 +176,21 @@ def _one_point(_figure: object, file: Path, **_: object) -> None:
 
 @pytest.fixture(autouse=True)
 def _pictures(request, monkeypatch):
-    """Drawing takes longer than most fits: one test of each kind of picture draws it."""
+    """Replace the drawing of figures, which takes longer than most fits. One test of each kind of picture draws it."""
     if request.node.get_closest_marker("draws") is None:
         monkeypatch.setattr(matplotlib.figure.Figure, "savefig", _one_point)
 
 
 @pytest.fixture
 def processor() -> None:
-    """For what only the processor does."""
+    """Run the test on the processor, for features that only the processor supports."""
     if jax.default_backend() != "cpu":
         pytest.skip("programs run on another device than the processor")
 
 
 @pytest.fixture
 def febio() -> Path:
-    """Folder of FEBio's results."""
+    """Return the folder of FEBio's results."""
     folder = SHARED / "reference" / "febio"
     if not folder.is_dir():
         pytest.skip("results of FEBio are not here")
@@ -203,23 +209,26 @@ def distorted_box():
 
 @pytest.fixture
 def table_2() -> lj.Prony:
-    """Viscosity of the chapter's Table 2."""
+    """The viscosity of the chapter's Table 2."""
     return lj.Prony(ratios=jax.numpy.array([0.235, 0.333]), relaxation_times=jax.numpy.array([0.27, 0.03]))
 
 
 def every_motion(scene):
-    """One mode (V, 3) for each free degree of freedom of a scene, orthonormal with the lumped volumes of the nodes."""
+    """Return one mode (V, 3) for each free degree of freedom of a scene.
+
+    The modes are orthonormal with respect to the lumped volumes of the nodes.
+    """
     free = np.asarray(free_directions(scene).mask)
     modes = np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape)
     return jax.numpy.asarray(modes / np.sqrt(np.asarray(nodal_volumes(scene.mesh)))[:, None])
 
 
 def moves_as_full(scene):
-    """Positions (T, V, 3) [m] of a run; the reduced model of all motions and points has the same ones."""
+    """Return the positions (T, V, 3) [m] of a run, after a comparison with a reduced model of all modes and points."""
     full, model = lj.simulate(scene).check(), with_all_points(scene, every_motion(scene))
     found = lj.simulate_reduced(model, scene)
     assert not np.any(found.status)
     moved = np.abs(full.positions - scene.mesh.points[None]).max()
-    # The solver's tolerance of 1e-8 of the forces, through a condition number of some thousands.
+    # The bound is the solver's tolerance of 1e-8 times a condition number of some thousands.
     assert np.abs(lj.reduced_positions(model, scene, found) - full.positions).max() < 1e-5 * moved
     return full.positions

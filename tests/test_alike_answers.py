@@ -1,4 +1,4 @@
-"""Noise that neighbouring answers of a test in time share: errors, models, posterior."""
+"""Correlated noise of neighbouring points in relaxation and creep tests: standard errors, models, posterior."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ G0, RATIOS, TIMES, STRAIN = 1000.0, np.array([0.3, 0.25]), np.array([2.0, 40.0])
 
 
 def _relaxation(time: np.ndarray, noise: np.ndarray) -> TimeTest:
-    """A step at 0 s of two exact modes; `noise` (n,) relative."""
+    """A relaxation test with a step at 0 s and two exact modes; `noise` (n,) is relative."""
     G = G0 * (1 - RATIOS.sum() + np.exp(-time[:, None] / TIMES) @ RATIOS)
     at = np.concatenate([[0.0, 1e-7], time])
     strain = np.concatenate([[0.0], np.full(len(time) + 1, STRAIN)])
@@ -32,8 +32,9 @@ def _autoregression(rng: np.random.Generator, n: int, part: float) -> np.ndarray
 
 
 def test_errors_of_shared_noise_are_those_of_many_draws():
-    """Drifting noise in equal steps of time: independent noise leaves errors of ratios and times 2 to 5 times too
-    small."""
+    """The errors under drifting noise are those of many draws. If the noise were taken as independent, the errors of
+    ratios and times would be 2 to 5 times too small.
+    """
     time, rng = np.arange(0.1, 300.0, 2.0), np.random.default_rng(0)
     values, before, after = [], [], []
     for _ in range(16):
@@ -45,12 +46,12 @@ def test_errors_of_shared_noise_are_those_of_many_draws():
         after.append(wide.uncertainty.standard_errors)
     scatter = np.std(values, axis=0)
     assert np.all((np.median(before, axis=0) < 0.7 * scatter)[1:])
-    # The scatter of 16 draws is known to 18 %, and the length of the noise to a factor.
+    # The scatter of 16 draws has an error of 18 %; the correlation length of the noise is known only roughly.
     assert np.all(np.median(after, axis=0) > 0.6 * scatter) and np.all(np.median(after, axis=0) < 2.5 * scatter)
 
 
 def test_white_noise_changes_nothing():
-    """The noise of the measured answers is in the scales of the residuals too, and is not taken for an order."""
+    """White noise is also in the scales of the residuals, and must not be taken for a correlation."""
     rng = np.random.default_rng(1)
     for time in (np.geomspace(0.1, 600, 120), np.arange(0.1, 300.0, 1.0)):
         fit = time_tests.fit(_relaxation(time, 0.01 * rng.normal(size=len(time))), modes=2)
@@ -60,7 +61,7 @@ def test_white_noise_changes_nothing():
 
 @pytest.mark.parametrize("model", ["prony", pytest.param("fractional", marks=pytest.mark.slow)])
 def test_the_posterior_counts_independent_answers(model, monkeypatch):
-    """The log likelihood is that of fewer answers, so that its intervals are as wide as the errors."""
+    """The log likelihood is that of fewer points, so the posterior intervals are as wide as the standard errors."""
     time, rng = np.geomspace(0.1, 600, 100), np.random.default_rng(2)
     test = _relaxation(time, 0.01 * _autoregression(rng, len(time), 0.9))
     fit = choose_in_time(test, model, 2 if model == "prony" else "auto")
@@ -84,7 +85,9 @@ def test_a_spectrum_keeps_its_own_errors():
 
 
 def test_noise_of_constant_size_is_neither_shared_nor_in_proportion():
-    """Small beside early answers, large beside late ones: it was taken for an order, with errors 25 times off."""
+    """Such noise is small relative to early values and large relative to late ones. It was once taken for a
+    correlation, and the errors were 25 times too large.
+    """
     time, values, errors = np.geomspace(0.1, 300, 100), [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -95,12 +98,14 @@ def test_noise_of_constant_size_is_neither_shared_nor_in_proportion():
         values.append(fit.uncertainty.values)
         errors.append(fit.uncertainty.standard_errors)
     ratio = np.median(errors, axis=0) / np.std(values, axis=0)
-    assert np.all((ratio > 0.6) & (ratio < 1.7)), ratio  # the scatter of 12 draws is known to 21 %
+    assert np.all((ratio > 0.6) & (ratio < 1.7)), ratio  # the scatter of 12 draws has an error of 21 %
 
 
 @pytest.mark.slow
 def test_noise_that_grows_with_time_is_in_the_errors():
-    """The interval of G_inf held the truth in 16 of 20 draws; its errors are at most 1.3 times too small now."""
+    """Without this noise in the errors, the interval of G_inf contained the truth in 16 of 20 draws. Now the errors are
+    at most 1.3 times too small.
+    """
     time = np.concatenate([[0.0], np.arange(0.5, 100.1, 0.5)])
     G = 400 + 300 * np.exp(-time) + 300 * np.exp(-time / 20)
     off = {with_own_noise: [], with_alike_noise: []}
@@ -117,22 +122,26 @@ def test_noise_that_grows_with_time_is_in_the_errors():
     assert new < 1.3 < old
 
 
-#: A creep of 30 s and a recovery of 60 s.
+#: Creep for 30 s and recovery for 60 s.
 _RECOVERY = np.concatenate(
     [np.linspace(0, 0.1, 3), 0.1 + np.geomspace(0.05, 29.9, 40), 30.1 + np.geomspace(0.05, 60, 40)]
 )
 
 
 def _recovery(noise: np.ndarray) -> TimeTest:
-    """Strain under 50 Pa that ends, of two exact modes; `noise` (n,) over the largest strain."""
+    """Strain of two exact modes under a stress of 50 Pa that ends after 30 s.
+
+    `noise` (n,) is relative to the largest strain.
+    """
     stress = np.interp(_RECOVERY, [0, 0.1, 30, 30.1, 1e3], [0, 50, 50, 0, 0])
     strain = np.asarray(time_response.strain_response(Maxwell(G0, RATIOS, TIMES / 4), _RECOVERY, stress))
     return TimeTest("creep", _RECOVERY, stress, strain + noise * strain.max(), _RECOVERY > 0)
 
 
 def test_noise_of_constant_size_sets_the_weights_of_fit_interval_and_posterior(monkeypatch):
-    """With weights in proportion to the answers the interval of G_inf was half as wide as its standard error says, and
-    held the truth in 72 of 100 draws; with a sweep beside it, the errors were 2.2 times too small."""
+    """With weights proportional to the values, the interval of G_inf was half as wide as its standard error requires,
+    and contained the truth in 72 of 100 draws. With a sweep fitted together, the errors were 2.2 times too small.
+    """
     test = _recovery(0.005 * np.random.default_rng(0).normal(size=len(_RECOVERY)))
     fit = choose_in_time(test, "prony", 2)
     assert fit.details[time_tests.CONSTANT_NOISE] and np.ptp(fit.scales) == 0
@@ -142,11 +151,11 @@ def test_noise_of_constant_size_sets_the_weights_of_fit_interval_and_posterior(m
     seen = []
     monkeypatch.setattr(posterior, "sample", lambda target, *rest: seen.append(target))
     posterior.of_time_test(fit, test, 10)
-    # The weights of the likelihood are those of the fit: its minimum is the fit's.
+    # The likelihood has the weights of the fit, so both have the same minimum.
     u = np.asarray(fit.solution.u)
     near = u + 0.003 * np.random.default_rng(1).normal(size=(20, len(u)))
     assert np.all(seen[0].log_likelihood(near) < seen[0].log_likelihood(u[None]))
-    # Noise in proportion to the answers, and exact answers, keep their weights.
+    # Noise proportional to the values, and exact values, keep their weights.
     clean = _recovery(np.zeros(len(_RECOVERY)))
     some = clean.answer * (1 + 0.01 * np.random.default_rng(2).normal(size=len(_RECOVERY)))
     for other in (clean, clean._replace(answer=some)):
@@ -154,9 +163,9 @@ def test_noise_of_constant_size_sets_the_weights_of_fit_interval_and_posterior(m
 
 
 def test_white_noise_of_constant_size_is_not_shared_noise():
-    """With equal weights the sizes of the noise contained the residuals, and 100 answers counted as one."""
+    """With equal weights the estimated noise contained the residuals, and 100 points counted as one."""
     test = _relaxation(np.geomspace(0.1, 600, 100), np.zeros(100))
-    for seed in (0, 1, 3):  # the residuals of seed 2 do not show the kind
+    for seed in (0, 1, 3):  # the residuals of seed 2 do not show this kind of noise
         noise = 0.005 * STRAIN * G0 * np.random.default_rng(seed).normal(size=102)
         fit = choose_in_time(test._replace(answer=test.answer + np.where(test.used, noise, 0.0)), "prony", 2)
         assert fit.details[time_tests.CONSTANT_NOISE] and INDEPENDENT not in fit.details

@@ -1,4 +1,4 @@
-"""Errors of parameters where neighbouring points share their noise."""
+"""Standard errors of parameters if the noise of neighbouring points is correlated."""
 
 import numpy as np
 import pytest
@@ -13,14 +13,16 @@ def points(n: int = 150, seed: int = 3) -> np.ndarray:
 
 
 def smoothed(X: np.ndarray, width: float) -> np.ndarray:
-    """Square root of the covariance of noise that a Gaussian filter smoothed: not the law that is fitted."""
+    """Return a square root of the covariance of noise smoothed by a Gaussian filter. The fit assumes another
+    covariance.
+    """
     d = np.linalg.norm(X[:, None] - X[None], axis=-1)
     C = np.exp(-(d**2) / (4 * width**2)) + 1e-9 * np.eye(len(X))
     return np.linalg.cholesky(C)
 
 
 def fields(X: np.ndarray) -> np.ndarray:
-    """Derivatives (3 n, 2) of displacements by two numbers: a stretch, and a shear that varies."""
+    """Return derivatives (3 n, 2) of displacements with respect to two parameters: a stretch and a variable shear."""
     one = np.stack([X[:, 0], -0.4 * X[:, 1], -0.4 * X[:, 2]], axis=1)
     two = np.stack([X[:, 1] * np.sin(60 * X[:, 0]), 0 * X[:, 0], X[:, 0] ** 2 / 0.06], axis=1)
     return np.stack([one.ravel(), two.ravel()], axis=1) / 1e-3
@@ -35,7 +37,9 @@ def fitted(noise: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     "width", [pytest.param(0.004, marks=pytest.mark.slow), 0.01, pytest.param(0.03, marks=pytest.mark.slow)]
 )
 def test_errors_of_smoothed_noise_are_right(width):
-    """Those of independent noise are several times too small. Of 120 numbers at four widths 95 to 99 % are covered."""
+    """Errors under the assumption of independent noise are several times too small. With these errors, the intervals
+    contained 95 to 99 % of 120 numbers at four widths.
+    """
     X = points()
     J, L = fields(X), smoothed(X, width)
     places, group = np.repeat(X, 3, axis=0), np.tile(np.arange(3), len(X))
@@ -49,9 +53,9 @@ def test_errors_of_smoothed_noise_are_right(width):
         z.append(u / np.linalg.norm(found.root, axis=1))
         z_plain.append(u / plain)
     rms, rms_plain = (float(np.sqrt(np.mean(np.square(v)))) for v in (z, z_plain))
-    # 48 numbers: their rms is known to a tenth. Matérn's function falls more slowly than the noise's own correlation,
-    # so that errors are up to a half too large.
-    # Noise that is smoother than this function by far has a small level, but it is no noise of synthetic data.
+    # The rms of 48 numbers has an error of a tenth. Matérn's function decays more slowly than the correlation of this
+    # noise, so the errors are up to 1.5 times too large. Much smoother noise than this function would be estimated too
+    # small, but synthetic data do not contain such noise.
     assert 0.5 < rms < 1.3 and rms_plain > 2, (rms, rms_plain)
 
 
@@ -66,7 +70,9 @@ def test_independent_noise_is_left_alone():
 
 
 def test_noise_alike_in_part_and_many_points():
-    """Half of the variance is shared; more points than are used for the length."""
+    """Half of the variance is correlated, and there are more points than are used to estimate the correlation
+    length.
+    """
     X = points(900)
     J, L = fields(X), smoothed(X, 0.006)
     rng = np.random.default_rng(0)
@@ -89,7 +95,9 @@ def test_too_little_to_tell(case):
 
 
 def test_unknowns_that_few_groups_show_and_points_of_two_rows():
-    """A number of one step only, which is not among the chosen groups; each point in two rows of a step."""
+    """One parameter acts in one step only, which is not among the chosen groups. Then each point has two rows in a
+    step.
+    """
     X = points(40)
     L, rng = smoothed(X, 0.01), np.random.default_rng(1)
     steps = 20
@@ -104,7 +112,7 @@ def test_unknowns_that_few_groups_show_and_points_of_two_rows():
 
 @pytest.mark.slow
 def test_one_wrong_point_is_no_shared_noise():
-    """One of 150 points with 30 times the noise: a fourth of such data counted as shared noise."""
+    """One of 150 points has 30 times the noise. Such data were taken for correlated noise in a quarter of the cases."""
     X, seen = points(), 0
     J, places, group = fields(X), np.repeat(X, 3, axis=0), np.tile(np.arange(3), len(X))
     for seed in range(30):
@@ -115,7 +123,9 @@ def test_one_wrong_point_is_no_shared_noise():
 
 
 def test_as_many_residuals_as_unknowns_that_they_show():
-    """Three points in thirty steps, and 36 unknowns, all of which the chosen groups show: nothing is left to see."""
+    """Three points in thirty steps, and 36 parameters that all act in the chosen groups: no residual is left to
+    test.
+    """
     rng = np.random.default_rng(0)
     places, group = np.tile(rng.normal(size=(3, 3)), (30, 1)), np.repeat(np.arange(30), 3)
     J = rng.normal(size=(90, 36))
@@ -123,7 +133,9 @@ def test_as_many_residuals_as_unknowns_that_they_show():
 
 
 def test_two_series_that_drift_are_seen_and_white_ones_are_not():
-    """Two curves of 30 points, by a modulus and an exponent; noise of the stretch is in the derivatives too."""
+    """Two curves of 30 points are fitted with a modulus and an exponent. Noise of the stretch is also in the
+    derivatives.
+    """
     x = np.linspace(0.02, 0.5, 30)
     seen = {"white": 0, "drift": 0, "stretch": 0}
     for seed in range(20):
@@ -135,7 +147,7 @@ def test_two_series_that_drift_are_seen_and_white_ones_are_not():
             if kind == "drift":
                 for k in range(1, 60):
                     noise[k] = noise[k] if k == 30 else 0.95 * noise[k - 1] + 0.3 * noise[k]
-            if kind == "stretch":  # the stress of the true stretch, at the stretch that was read
+            if kind == "stretch":  # the stress belongs to the true stretch, but is stored at the measured one
                 noise = (np.stack([np.tile(x, 2), np.tile(x, 2) ** 3 * np.repeat([1.0, 2.0], 30)], axis=1) - J) @ [
                     50,
                     200,

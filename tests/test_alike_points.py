@@ -1,4 +1,6 @@
-"""Noise that neighbouring frequencies of a sweep share: errors hold the truth; independent noise changes nothing."""
+"""Correlated noise of neighbouring frequencies in a sweep: intervals contain the truth; independent noise is
+unchanged.
+"""
 
 import json
 
@@ -24,7 +26,7 @@ NUMBERS = np.array([1500, 0.2, 0.45, 0.5, 0.03])
 
 
 def drifting(seed: int, length: float) -> Sweep:
-    """3 % of noise whose correlation falls as exp(-rows / length), other draws for G' and G''."""
+    """A sweep with 3 % of noise whose correlation falls as exp(-rows / length); G' and G'' have independent draws."""
     rows = np.arange(len(OMEGA))
     C = np.exp(-np.abs(rows[:, None] - rows) / length) if length else np.eye(len(OMEGA))
     noise = 0.03 * np.linalg.cholesky(C) @ np.random.default_rng(seed).standard_normal((len(OMEGA), 2))
@@ -34,7 +36,7 @@ def drifting(seed: int, length: float) -> Sweep:
 
 @pytest.mark.slow
 def test_errors_of_a_drift_hold_the_truth():
-    """Of 24 sweeps; errors of independent noise hold the numbers in half of them."""
+    """Test 24 sweeps. With errors of independent noise, only half of the intervals contained the parameters."""
     before, after = [], []
     for seed in range(24):
         s = drifting(seed, 5.0)
@@ -58,7 +60,9 @@ def test_independent_noise_and_exact_data_change_nothing():
 
 
 def test_healthy_fluids_share_no_noise():
-    """At an equilibrium modulus of 0 a direction of the derivatives is lost; 12 of 40 such sweeps were found alike."""
+    """At an equilibrium modulus of 0, the derivatives lose one direction. Without a treatment of this case, 12 of 40
+    such sweeps were classified as correlated.
+    """
     w = 2 * np.pi * np.geomspace(0.01, 10, 25)
     G = sum(g * 1j * w * tau / (1 + 1j * w * tau) for g, tau in ((600.0, 1.0), (400.0, 0.05)))
     for seed in range(10):
@@ -73,7 +77,9 @@ def test_healthy_fluids_share_no_noise():
 
 
 def test_what_is_written_agrees(tmp_path):
-    """The sentence on structured residuals, the interval, and the errors of the moduli are those of such noise."""
+    """The warning on structured residuals, the interval, and the errors of the moduli all include the
+    correlated noise.
+    """
     s = drifting(3, 5.0)
     fit = edges.honest(viscoelastic.closed_form(s, 2), s, generalised_maxwell.spectrum(s))
     plain = viscoelastic.closed_form(s, 2)

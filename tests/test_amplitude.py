@@ -1,4 +1,4 @@
-"""Strain sweeps: the cycle against closed forms and a run in time, recovery of laws, files, the command."""
+"""Strain sweeps: the cycle against closed forms and a transient run, recovery of laws, files, the command."""
 
 import json
 
@@ -23,7 +23,7 @@ ONE = jnp.ones(1)
 
 @pytest.mark.parametrize("plates, mean, mean_third", [("cone", 0.75, 0.25), ("parallel", 0.5, 1 / 6)])
 def test_a_cubic_stress_has_the_textbooks_harmonics(plates, mean, mean_third, verified):
-    """Yeoh's law to its second term: stress 2 c1 g + 4 c2 g^3, sin^3 = (3 sin - sin 3)/4, rings by r^5."""
+    """Check Yeoh's law with two terms: stress 2 c1 g + 4 c2 g^3, with sin^3 = (3 sin - sin 3)/4. Rings weigh as r^5."""
     law = lj.laws.Yeoh(c1=jnp.asarray(400.0), c2=jnp.asarray(150.0), c3=jnp.asarray(0.0), bulk=None)
     first, third = cycle.first_and_third(law, cycle.reading(STRAIN, ELASTIC, plates), ONE)
     exact = 800 + 600 * mean * STRAIN**2
@@ -34,7 +34,7 @@ def test_a_cubic_stress_has_the_textbooks_harmonics(plates, mean, mean_third, ve
 
 
 def test_a_neo_hookean_sample_shows_no_amplitude_and_its_own_moduli():
-    """Elastic stress linear in the shear. A memory of the second Piola-Kirchhoff stress adds terms of the square."""
+    """The elastic stress is linear in the shear. A memory of the second Piola-Kirchhoff stress adds quadratic terms."""
     prony = Maxwell(1000.0, np.array([0.4]), np.array([0.3]))
     memories = law_fit.Memory(prony).of(5.0)
     law = lj.laws.NeoHookean(mu=jnp.asarray(1000.0), bulk=None)
@@ -48,7 +48,9 @@ def test_a_neo_hookean_sample_shows_no_amplitude_and_its_own_moduli():
 
 @pytest.mark.slow
 def test_a_run_in_time_comes_to_it(verified):
-    """A block whose nodes all shear, with memory: the force of its upper face over the third cycle, order 2 in dt."""
+    """In a block with memory, all nodes are sheared. The force on its upper face over the third cycle has order 2 in
+    dt.
+    """
     omega, amplitude, tau = 2 * np.pi, 0.6, 0.05
     mesh = lj.shapes.box((0.01, 0.01, 0.01), (1, 1, 1))
     law = lj.laws.Yeoh(c1=400.0, c2=150.0, c3=0.0, bulk=5000.0)
@@ -86,7 +88,7 @@ def test_a_run_in_time_comes_to_it(verified):
 
 
 def written(path, law, memories, noise=0.0, shares=ONE, strain=STRAIN):
-    """A CSV of a sweep at 1 Hz whose strains are in per cent."""
+    """Write a CSV file of a sweep at 1 Hz with strains in per cent."""
     first, _ = cycle.first_and_third(law, cycle.reading(strain, memories), shares)
     G = np.asarray(first) * (1 + noise * np.random.default_rng(2).normal(size=(2, len(strain))))[0]
     rows = ["frequency_Hz,strain_%,storage_modulus_Pa,loss_modulus_Pa"]
@@ -97,7 +99,7 @@ def written(path, law, memories, noise=0.0, shares=ONE, strain=STRAIN):
 
 @pytest.fixture(scope="module")
 def tanned():
-    """A stiffening law and a loss tangent of 0.2."""
+    """A stiffening law, its memory, and a loss tangent of 0.2."""
     law = lj.laws.FungDemiray(c1=jnp.asarray(900.0), c2=jnp.asarray(1.5), bulk=None)
     return law, law_fit.Memory().of(2 * np.pi), jnp.array([1.0, 0.2])
 
@@ -114,7 +116,7 @@ def test_a_law_and_its_loss_come_back(tmp_path, tanned):
     found = law_fit.fit_law(candidate, noisy, law_fit.Memory(), "parallel").law
     assert np.all(np.abs(found.values - [900, 1.5, 0.2]) < 4 * found.standard_errors + 1e-12)
     assert found.mean_relative_error < 0.03
-    other = law_fit.fit_law(candidate, sweep, law_fit.Memory(), "cone").law  # with the wrong plates another law
+    other = law_fit.fit_law(candidate, sweep, law_fit.Memory(), "cone").law  # the wrong plates give another law
     assert abs(other.values[1] / 1.5 - 1) > 0.1
 
 
@@ -137,14 +139,14 @@ def test_the_command_fits_with_the_series_of_a_sweep(tmp_path, capsys):
 
 
 def test_what_no_law_follows_is_said(tmp_path, tanned):
-    """A sample that yields: the modulus falls and the loss tangent rises."""
+    """The sample yields: its modulus falls and its loss tangent rises."""
     law, memories, shares = tanned
     sweep = strain_sweep.read_strain_sweep(written(tmp_path / "a.csv", law, memories, 0.0, shares))
     falls = 1 / (1 + (STRAIN / 0.1) ** 2)
     sweep = sweep._replace(storage=1000 * falls, loss=np.full(len(STRAIN), 100.0))
     (candidate,) = stress_stretch.candidates("fung_demiray")
     told = " ".join(law_fit.said_of(sweep, [law_fit.fit_law(candidate, sweep, law_fit.Memory(), "parallel")]))
-    assert "c2 may be off by several per cent" in told  # the memory is not known
+    assert "c2 may be off by several per cent" in told  # the memory is unknown
     assert "the loss tangent changes" in told and "misses the moduli" in told and "slips, yields or tears" in told
 
 
@@ -161,7 +163,7 @@ def test_files_that_are_no_strain_sweep_get_a_sentence(tmp_path, tanned, change,
     law, memories, shares = tanned
     path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
     path.write_text(path.read_text().replace(*change))
-    if words is None:  # another frequency throughout is a sweep too
+    if words is None:  # another constant frequency is a valid sweep too
         assert strain_sweep.read_strain_sweep(path).angular_frequency == pytest.approx(4 * np.pi)
         return
     with pytest.raises(InputError, match=words) as told:
@@ -170,7 +172,9 @@ def test_files_that_are_no_strain_sweep_get_a_sentence(tmp_path, tanned, change,
 
 
 def test_tension_and_a_frequency_that_is_missing(tmp_path, tanned):
-    """Tension is not shear: with E = 3 G, c2 was 6.6 times too large. A point without its frequency is left out."""
+    """Tension is not shear. When E = 3 G was used, c2 was 6.6 times too large. A point without a frequency is
+    left out.
+    """
     law, memories, shares = tanned
     path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
     shear, text = strain_sweep.read_strain_sweep(path), path.read_text()
@@ -184,7 +188,7 @@ def test_tension_and_a_frequency_that_is_missing(tmp_path, tanned):
 
 
 def test_strains_below_one_percent_may_be_fractions(tmp_path, tanned):
-    """Fractions under strain_% gave c2 = 5e6 Pa beside c1 = 500 Pa, without a word."""
+    """Fractions in a column strain_% gave c2 = 5e6 Pa with c1 = 500 Pa, without a warning."""
     law, memories, shares = tanned
     for part, told in ((0.01, True), (1.0, False)):
         sweep = strain_sweep.read_strain_sweep(written(tmp_path / "s.csv", law, memories, 0.0, shares, part * STRAIN))
@@ -192,7 +196,7 @@ def test_strains_below_one_percent_may_be_fractions(tmp_path, tanned):
 
 
 def test_two_temperatures_and_deviations(tmp_path, tanned):
-    """Sweeps at 20 and 37 °C were read as one."""
+    """Sweeps at 20 and 37 °C were read as one sweep."""
     law, memories, shares = tanned
     path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
     head, *rows = path.read_text().splitlines()
@@ -208,7 +212,7 @@ def test_two_temperatures_and_deviations(tmp_path, tanned):
 
 
 def test_a_frequency_beyond_the_series_is_told():
-    """Without the fastest of three modes c1 was 25 % too small, and nothing named the series."""
+    """Without the fastest of three modes, c1 was 25 % too small, and no warning named the series."""
     memory = law_fit.Memory(Maxwell(2000.0, np.array([0.3, 0.2]), np.array([1.0, 0.05])))
     assert law_fit.outside_series(memory, 2 * np.pi * 3) is None
     told = law_fit.outside_series(memory, 2 * np.pi * 20)
@@ -237,7 +241,7 @@ def test_a_frequency_sweep_and_few_points_are_refused(tmp_path, tanned, capsys):
     lines = path.read_text().splitlines()
     lines[3] = lines[3].replace("1.0,", "3.0,", 1)
     (tmp_path / "two.csv").write_text("\n".join(lines))
-    with pytest.raises(InputError, match="a sweep of the strain alone"):
+    with pytest.raises(InputError, match="a strain sweep at one frequency"):
         strain_sweep.read_strain_sweep(tmp_path / "two.csv")
     with pytest.raises(InputError, match="points of strain are left"):
         strain_sweep.read_strain_sweep(path, max_strain=0.012)
@@ -246,7 +250,7 @@ def test_a_frequency_sweep_and_few_points_are_refused(tmp_path, tanned, capsys):
         strain_sweep.read_strain_sweep(tmp_path / "per_cent.csv")
     assert command.main(["amplitude", "fung_demiray", str(path), "--max-strain", "-1"]) == 2
     assert command.main(["amplitude", "fung_demiray", str(path), "--model", str(path), "--out", str(tmp_path)]) == 2
-    assert "is no fit.json" in capsys.readouterr().err
+    assert "is not the fit.json" in capsys.readouterr().err
 
 
 def test_a_strain_without_a_unit_several_tables_and_a_gap(tmp_path, tanned):
@@ -276,7 +280,9 @@ def test_a_strain_without_a_unit_several_tables_and_a_gap(tmp_path, tanned):
 
 @pytest.mark.parametrize("name", ["yeoh", "neo_hookean"])
 def test_standard_errors_are_those_of_the_scatter(name, tmp_path):
-    """G' and G'' are one test: as two with factors of their own the errors were 400 %. Exact moduli, 0.5 % of noise."""
+    """G' and G'' are one test. When they were treated as two tests with separate factors, the errors were 400 %. The
+    moduli are exact apart from 0.5 % of noise.
+    """
     rng, strain = np.random.default_rng(1), np.logspace(-2, 0, 15)
     G = 1000 + (600 * strain**2 if name == "yeoh" else 0.0)
     storage, loss = (part * G * (1 + 0.005 * rng.standard_normal(15)) for part in (1.0, 0.1))
@@ -289,11 +295,11 @@ def test_standard_errors_are_those_of_the_scatter(name, tmp_path):
     errors, values = found["standard_errors"], found["parameters"]
     first = next(iter(values))
     assert 2e-4 < errors[first] / values[first] < 0.01
-    assert not any("factor of its own" in sentence for sentence in found["warnings"])
+    assert not any("the stress of each test" in sentence for sentence in found["warnings"])
 
 
 def test_a_coefficient_that_is_large_at_small_strains_is_no_limit(tmp_path):
-    """c3 in Pa grows with 1 over the fourth power of the strain: at 3 % it was named as infinite, and held."""
+    """c3 in Pa grows with strain to the power -4. At a strain of 3 % it was reported as infinite, and fixed."""
     errors = []
     for most in (0.03, 0.3):
         strain, rng = np.geomspace(most / 50, most, 14), np.random.default_rng(0)
@@ -305,19 +311,22 @@ def test_a_coefficient_that_is_large_at_small_strains_is_no_limit(tmp_path):
         law = law_fit.fit_law(candidate, strain_sweep.read_strain_sweep(file), law_fit.Memory(), "cone").law
         assert not law.limits and not any("limit" in said for said in law.warnings)
         errors.append(law.standard_errors / law.values)
-        truth = np.array([500.0, 1000 / 3 / most**2, 237.0 / most**4])  # c1, c2; c3 from 0.8 by the cone's fifth power
+        # c1, c2 and c3; c3 follows from 0.8 by the fifth power of the cone
+        truth = np.array([500.0, 1000 / 3 / most**2, 237.0 / most**4])
         assert np.all(np.abs(law.values[:2] - truth[:2]) < 4 * law.standard_errors[:2])
-    assert np.allclose(*errors, rtol=0.3)  # the same curve: only the strain has another unit
+    assert np.allclose(*errors, rtol=0.3)  # the same curve with another unit of strain
 
 
 @pytest.mark.slow
 def test_noise_in_percent_does_not_make_the_moduli_too_small():
-    """Relative to each measured modulus, points that are low by chance weighed most: 2 % low of 10 % noise."""
+    """With weights relative to each measured modulus, points that were low by chance had too much weight. With 10 % of
+    noise, the moduli were 2 % too small.
+    """
     (candidate,), found = stress_stretch.candidates("neo_hookean"), []
     for seed in range(2):
         rng, strain = np.random.default_rng(seed), np.logspace(-2, 0, 200)
         storage, loss = (part * 1000 * (1 + 0.1 * rng.standard_normal(200)) for part in (1.0, 0.1))
         sweep = strain_sweep.StrainSweep(strain, storage, loss, 2 * np.pi)
         found.append(law_fit.fit_law(candidate, sweep, law_fit.Memory(), "parallel").storage.mean() / 1000 - 1)
-    # One fit is 0.7 % off: the mean of two has 0.5 %, and twice that is allowed.
+    # One fit has an error of 0.7 %, so the mean of two has 0.5 %. Twice this is allowed.
     assert abs(np.mean(found)) < 0.01

@@ -1,4 +1,4 @@
-"""Ligaments and vessels: against springs and bars by hand, and a vessel of elements."""
+"""Ligaments and vessels: compared with springs and bars by hand, and with a vessel made of elements."""
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ def test_a_line_is_cut_where_it_leaves_an_element():
         points = begin + (cut.begin + at * (cut.end - cut.begin))[:, None] * (end - begin)
         L = locate.barycentric(mesh, points)[:, np.arange(len(points)), cut.element]
         assert L.min() > -1e-9
-    # Along an edge and in a face every length counts once.
+    # Along an edge and in a face, every length counts only once.
     edge = locate.pieces(mesh, np.zeros((1, 3)), np.array([[SIDE, SIDE, SIDE]]))
     assert np.isclose(np.sum(edge.end - edge.begin), 1.0)
 
@@ -69,7 +69,7 @@ def content(**more) -> dict:
 
 @pytest.mark.parametrize("given", [{"pre_tension": 0.5}, {"rest_length": 0.05}])
 def test_fibres_pull_as_springs_of_their_stretch(given):
-    """Forces by hand: k/n (l - l0) along every fibre, none where it is slack."""
+    """Forces by hand: k/n (l - l0) along every fibre, and none in slack fibres."""
     table = {"where": {"z_min": SIDE}, "to": [0.03, 0.05, 0.16], "stiffness": 90.0, **given}
     scene = scene_from(content(ligament=[table]))
     mesh, own = scene.mesh, scene.physics[0].freeze(None, type("Step", (), {"mesh": scene.mesh}))
@@ -101,7 +101,9 @@ def test_fibres_pull_as_springs_of_their_stretch(given):
 
 @pytest.mark.parametrize("given", [{"pre_tension": 0.0}, {"rest_length": 0.06}])
 def test_a_straight_fibre_without_tension_has_its_whole_stiffness(given):
-    """Where it begins to pull it is a spring along its line; that of max(l - l0, 0)^2 / 2 is a quarter."""
+    """At the length at which it becomes taut, the fibre acts as a spring along its line. Differentiation of max(l - l0,
+    0)^2 / 2 at this point would give a quarter of the stiffness.
+    """
     corner = {"x_min": SIDE, "y_min": SIDE, "z_min": SIDE}
     table = {"where": corner, "to": [SIDE, SIDE, SIDE + 0.06], "stiffness": 90.0, **given}
     scene = scene_from(content(ligament=[table]))
@@ -116,7 +118,9 @@ def test_a_straight_fibre_without_tension_has_its_whole_stiffness(given):
 @pytest.mark.slow
 @ORDERS
 def test_a_stiff_cube_hangs_from_its_ligament(order):
-    """Weight W on sliding sides and one ligament with tension T0: it sinks by (W - T0)/k, and lifts by its energy."""
+    """A cube of weight W with sliding sides hangs from one ligament with tension T0. It sinks by (W - T0)/k, and the
+    derivative with respect to T0 is 1/k.
+    """
     table = content(
         law={"name": "neo_hookean", "mu": 1e7, "bulk": 4e7},
         ligament=[{"where": {"z_min": SIDE}, "to": [0.05, 0.05, 1000.0], "stiffness": 40.0, "pre_tension": 0.3}],
@@ -130,7 +134,7 @@ def test_a_stiff_cube_hangs_from_its_ligament(order):
         return jnp.mean((lj.simulate(changed).positions[-1] - scene.mesh.points)[:, 2])
 
     value, slope = jax.jvp(sinks, (0.3,), (1.0,))
-    # The cube's own strain adds 1e-6 of its side.
+    # The strain of the cube adds 1e-6 of its side.
     assert np.isclose(value, -(1.0 - 0.3) / 40.0, rtol=1e-4) and np.isclose(slope, 1 / 40.0, rtol=1e-4)
 
 
@@ -172,13 +176,15 @@ def test_bad_ligaments_are_refused(table, words):
         scene_from(content(ligament=[table]))
 
 
-#: One node of the top.
+#: One node of the top face.
 CORNER = {"x_max": 0.0, "y_max": 0.0, "z_min": SIDE}
 
 
 @pytest.mark.parametrize(("rest", "holds"), [(0.05, True), (0.1, True), (0.100001, False), (0.2, False)])
 def test_slack_fibres_hold_nothing(rest, holds):
-    """A body that slides along z hangs by fibres of 0.1 m: longer ones at rest are slack, and nothing holds it then."""
+    """A body that slides along z hangs from fibres of 0.1 m. If their rest length is larger, they are slack, and the
+    body is not supported.
+    """
     table = content(
         fixed=[{"where": {"x_max": 0.0}, "axes": "xy"}],
         ligament=[{"where": CORNER, "to": [0.0, 0.0, 0.2], "stiffness": 40.0, "rest_length": rest}],
@@ -186,7 +192,7 @@ def test_slack_fibres_hold_nothing(rest, holds):
     if holds:
         scene_from(table)
     else:
-        with pytest.raises(InputError, match="nothing holds the body"):
+        with pytest.raises(InputError, match="do not prevent every rigid motion of the body"):
             scene_from(table)
 
 
@@ -195,7 +201,7 @@ def test_slack_fibres_hold_nothing(rest, holds):
 
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_vessel_in_a_stretched_body_pulls_as_a_bar(order):
-    """In a uniform deformation every piece has the stretch |F t|: energy and force of one straight bar."""
+    """In a uniform deformation every piece has the stretch |F t|, so energy and force are those of one straight bar."""
     mesh, law = box(order), lj.laws.create("yeoh", c1=4e4, c2=1e4, c3=10.0, bulk=1e6)
     line = np.array([[0.01, 0.02, 0.03], [0.05, 0.04, 0.06], [0.09, 0.03, 0.08]])
     tube = vessel.along(mesh, line, 2e-3, law, wall=5e-4)
@@ -208,7 +214,7 @@ def test_a_vessel_in_a_stretched_body_pulls_as_a_bar(order):
         stretch = np.linalg.norm(F @ t) / np.linalg.norm(t)
         energy += area * np.linalg.norm(t) * float(law.energy(np.diag([stretch, stretch**-0.5, stretch**-0.5])))
     assert np.isclose(own.energy(mesh, x), energy, rtol=1e-12)
-    # Virtual work of a growth along the bars: nominal stress of a sample in tension.
+    # Virtual work of an extension along the bars, with the nominal stress of a sample in tension.
     along = sum(
         area
         * np.linalg.norm(t)
@@ -229,7 +235,9 @@ def test_a_vessel_in_a_stretched_body_pulls_as_a_bar(order):
 
 @pytest.mark.slow
 def test_a_vessel_stiffens_as_one_of_elements(verified):
-    """A block pulled along a stiff core of 1 % of its section: bars in a coarse mesh, elements in a fine one."""
+    """A block is stretched along a stiff core of 1 % of its section. Bars in a coarse mesh are compared with elements
+    in a fine one.
+    """
     stiff, cells = lj.laws.NeoHookean(mu=8e4, bulk=4e5), 10
     fine = lj.quadratic(lj.shapes.box((SIDE, SIDE, SIDE), (cells, cells, 4)))
     centre = np.asarray(fine.points)[np.asarray(fine.tetrahedra)].mean(axis=1)
@@ -246,7 +254,7 @@ def test_a_vessel_stiffens_as_one_of_elements(verified):
 
     coarse = lj.quadratic(lj.shapes.box((SIDE, SIDE, SIDE), (5, 5, 4)))
     line = np.array([[0.045, 0.045, 0.0], [0.045, 0.045, 0.075]])
-    # The tissue that the vessel displaces is not taken off: its modulus is that above the tissue's.
+    # The displaced tissue is not removed, so the modulus of the vessel is its excess over that of the tissue.
     tube = vessel.along(coarse, line, 0.01 / np.sqrt(np.pi), replace(stiff, mu=8e4 - 800.0))
     bare, bars, elements = pulled(coarse), pulled(coarse, physics=(tube,)), pulled(fine, region=region)
     effect = (bare - bars) / (bare - elements)
@@ -266,12 +274,12 @@ def test_a_vessel_stiffens_as_one_of_elements(verified):
         ({"line": [[0, 0, 0], [0, 0, 10**400]], "radius": 1, "law": {"name": "neo_hookean", "mu": 1e5}}, "needs line"),
         (
             {"line": [[0, 0, 0], [0, 0, np.nan]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}},
-            "one number or one each, all of them finite",
+            "one number or one per point: give finite numbers",
         ),
         ({"line": [[0, 0, 0]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}}, "two points or more"),
         (
             {"line": [[0, 0, 0]] * 2, "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}},
-            "a point twice in a row",
+            "the same point twice in succession",
         ),
         (
             {"line": [[0, 0, 1], [0, 0, 2]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}},

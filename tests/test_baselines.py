@@ -1,4 +1,4 @@
-"""The solvers that experiments compare with agree with ours where both must: rivals that are wrong prove nothing."""
+"""Agreement of the comparison solvers in experiments with the package: a wrong rival would prove nothing."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.quick_to_compile
 
 
 def _bar(gravity: float = 0.05, **solve) -> lj.Scene:
-    """A clamped bar of 72 tetrahedra that begins to hang, its weight small: displacements of 0.1 % of its length."""
+    """A clamped bar of 72 tetrahedra that starts to sag under a small weight, by 0.1 % of its length."""
     mesh = lj.shapes.box((0.03, 0.02, 0.02), (3, 2, 2))
     return lj.Scene(
         mesh=mesh,
@@ -33,7 +33,7 @@ def _moved(scene: lj.Scene, x: jax.Array) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("prony", [None, lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([0.01]))])
 def test_explicit_dynamics_agrees_with_newmark(prony):
-    """Both are of second order, so on half the step they come four times as near to each other."""
+    """Both are of second order, so their difference falls by a factor of four if the step is halved."""
     seconds, apart = 0.06, []
     for steps in (100, 200):
         dt = seconds / steps
@@ -47,7 +47,7 @@ def test_explicit_dynamics_agrees_with_newmark(prony):
 
 @pytest.mark.slow
 def test_explicit_dynamics_is_stable_just_below_its_critical_step():
-    """Ten per cent above it the displacement explodes."""
+    """With 1.1 times the critical step, the displacement grows without bound."""
     scene = _bar(dt=1.0)
     limit = float(critical_step(scene))
     below, above = (_moved(scene, explicit(scene, f * limit, 400, 400)[-1]) for f in (0.95, 1.1))
@@ -65,7 +65,7 @@ BODIES = {
 @pytest.mark.parametrize("integrator", ["euler", "newmark"])
 @pytest.mark.parametrize("body", BODIES)
 def test_linear_bodies_agree_with_ours_where_strains_are_small(body, integrator):
-    """All take the same steps; what differs is of second order in the strain."""
+    """All use the same steps. Their differences are of second order in the strain."""
     apart = []
     for gravity in (0.05, 0.1):
         scene = _bar(gravity, dt=0.02, steps=5, integrator=integrator)
@@ -80,7 +80,9 @@ def test_linear_bodies_agree_with_ours_where_strains_are_small(body, integrator)
     "way", [*(pytest.param(way, marks=pytest.mark.slow) for way in ("chapter", "standard")), "autodiff"]
 )
 def test_rivals_of_the_assembly_are_right_with_and_without_their_parts_written(way, name):
-    """Sums of some hundred products that cancel to a few digits: within 1e-12 of the largest entry of the Hessian."""
+    """The sums have some hundred products that cancel to a few digits. The bound is 1e-12 of the Hessian's largest
+    entry.
+    """
     mesh, law = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1)), lj.laws.typical(name)
     x = mesh.points + 0.05 * jnp.asarray(np.random.default_rng(0).standard_normal(mesh.points.shape))
     force, hessians = assembly_rivals.vmapped(mesh, law, x)
@@ -92,7 +94,7 @@ def test_rivals_of_the_assembly_are_right_with_and_without_their_parts_written(w
 
 
 def test_the_run_time_at_an_error_lies_between_two_runs():
-    """Order 2, a time that grows with the steps: exact between the runs, whatever their distance."""
+    """For order 2 and a run time proportional to the steps, the interpolation between two runs is exact."""
     runs = [{"dt": dt, "error": 4 * dt**2, "run_s": 0.3 / dt} for dt in (0.3, 0.1, 0.01)]
     dt, seconds = equal_error.at_error([{"dt": 0.6, "error": None, "run_s": 1.0}, *runs], 0.01)
     assert dt == pytest.approx(0.05) and seconds == pytest.approx(6.0)

@@ -1,7 +1,7 @@
-"""Every physics of a body in its place, by element order: in motion, viscous and porous; sweeps, gradients, robust.
+"""Every physics object in one body, by element order: motion, viscosity and porosity; sweeps, gradients, robust steps.
 
-One body has them all, so that a table of features takes few programs. In motion it is viscous and has a fluid; at rest
-it is elastic. The answers are witnessed where each physics has its own tests; here one body is run in different ways.
+One body contains all objects, so that few compiled programs test all combinations. In motion it is viscous and porous;
+at rest it is elastic. The results of each object are verified in its own tests. Here one body is run in different ways.
 """
 
 import jax
@@ -34,12 +34,12 @@ PRONY = lj.Prony(ratios=jnp.array([0.3]), relaxation_times=jnp.array([0.1]))
 #: Two points inside the body.
 LINE = np.array([[0.002, 0.004, 0.003], [0.017, 0.006, 0.007]])
 TIMES = jnp.array([0.0, 0.05, 0.1])
-#: Centre of a ball of 5 mm that touches the top.
+#: Centre of a ball of 5 mm that touches the top face.
 ABOVE = jnp.array([0.012, 0.005, SIZE[2] + 0.005])
 
 
 def everything(mesh: lj.TetMesh) -> tuple:
-    """Every physics that has a table of its own in scene files, once."""
+    """Return every physics object that has a table in scene files, once."""
 
     def side(name: str) -> jax.Array:
         return jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets[name]), jnp.int32)
@@ -58,7 +58,7 @@ def everything(mesh: lj.TetMesh) -> tuple:
     )
 
 
-#: Numbers that a sweep varies and a derivative is taken by.
+#: Parameters that a sweep varies and that derivatives refer to.
 NUMBERS = (
     "support.0.normal",
     "membrane.0.thickness",
@@ -71,11 +71,11 @@ NUMBERS = (
     "traction.0.history",
     "region.0.law.bulk",
 )
-#: The bulk modulus of a sponge takes the place of the law's, so a law's own moves nothing then.
+#: In a porous body its bulk modulus replaces that of the law, so a change of the law's own value has no effect.
 FLUID = ("porosity.inlet.0.flux", "porosity.inlet.1.pressure", "region.1.viscosity.ratios", "region.1.porosity.bulk")
 
 
-#: Elements: their order, and how they hold volumes.
+#: For each form: the order of the elements, and their volumetric option.
 FORMS = {
     "linear": (1, "element"),
     "linear nodal": (1, "nodal"),
@@ -105,7 +105,7 @@ def at_rest(form: str, **solve) -> lj.Scene:
 
 
 def in_motion(form: str) -> lj.Scene:
-    """Three steps of a viscous body that falls. If elements hold volumes one by one it is a sponge.
+    """Three steps of a viscous body that falls. With the volume of each element separate, the body is also porous.
 
     Fluid enters below and at the end.
     """
@@ -131,7 +131,9 @@ def in_motion(form: str) -> lj.Scene:
 
 
 def check_sweep_and_gradient(scene: lj.Scene, numbers: tuple[str, ...]) -> None:
-    """Lanes converge and are the runs by themselves; difference quotients come to the derivative, by every number."""
+    """Check that the runs of a batch converge and are equal to single runs, and that gradients agree with
+    differences.
+    """
     lj.check_scene(scene)
     first = {name: jnp.asarray(numbers_at(scene, name)) for name in numbers}
 
@@ -153,7 +155,7 @@ def check_sweep_and_gradient(scene: lj.Scene, numbers: tuple[str, ...]) -> None:
     plus, minus = np.asarray(lanes[1:]).reshape(2, len(h), len(numbers))
     for k, name in enumerate(numbers):
         errors = np.abs((plus[:, k] - minus[:, k]) / (2 * h) - slopes[k])
-        # A residual of 1e-11 moves the value by 1e-11 of itself and more: over h, 1e-7 of it.
+        # A residual of 1e-11 changes the value by at least 1e-11 of itself; divided by h, this is 1e-7.
         small = 1e-4 * abs(slopes[k]) + 1e-7 * value
         assert slopes[k] != 0 and errors[1:3].min() < small, (name, slopes[k], errors)
         assert errors[1:3].min() <= errors[0] + small and errors[1:3].min() <= errors[3] + small, (name, errors)
@@ -161,7 +163,7 @@ def check_sweep_and_gradient(scene: lj.Scene, numbers: tuple[str, ...]) -> None:
 
 @pytest.fixture(autouse=True)
 def without_programs():
-    """A program of all physics takes half a gigabyte, and no two tests share one."""
+    """Empty the caches. A program with all objects needs half a gigabyte, and no two tests share one."""
     yield
     jax.clear_caches()
 
@@ -183,7 +185,7 @@ def test_at_rest_it_sweeps_and_has_gradients(form):
 
 
 def inverted_start(mesh: lj.TetMesh) -> jax.Array:
-    """Positions (V, 3) some of whose elements are inside out."""
+    """Return positions (V, 3) in which some elements are inverted."""
     noise = {1: 0.6, 2: 0.3}[mesh.order] * SIZE[1] * np.random.default_rng(3).standard_normal(mesh.points.shape)
     start = mesh.points + jnp.asarray(noise).at[mesh.node_sets["x_min"]].set(0.0)
     assert volume_ratios(mesh, start).min() < 0
@@ -193,7 +195,7 @@ def inverted_start(mesh: lj.TetMesh) -> jax.Array:
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["linear", "quadratic", "quadratic mixed"])
 def test_robust_steps_find_the_same_from_an_inverted_start(form):
-    """Friction and a pressed obstacle among the rest; without a start and from one with inverted elements."""
+    """Friction and a pressed obstacle are among the objects. The runs begin at rest and from inverted elements."""
     plain, robust = at_rest(form), at_rest(form, robust="projected")
     lj.check_scene(robust)
     rest = lj.simulate(plain).check().positions
@@ -205,9 +207,9 @@ def test_robust_steps_find_the_same_from_an_inverted_start(form):
 @pytest.mark.slow
 @EVERY_FORM
 def test_a_robust_step_minimises_the_energy_of_all(form):
-    """In motion an inverted start cannot be left; in one very long step inertia does nothing.
+    """In motion, the solver must use an inverted starting point. In one very long step, inertia has no effect.
 
-    Friction remembers where the surface was at the beginning, so it is not there.
+    Friction depends on the positions at the beginning of the step, so it is left out.
     """
     long = at_rest(form, kind="dynamic", steps=1, dt=1e3, tolerance=1e-9)
     smooth = tuple(p for p in long.physics if not isinstance(p, RoughObstacle))
@@ -221,7 +223,7 @@ def test_a_robust_step_minimises_the_energy_of_all(form):
 @pytest.mark.slow
 @EVERY_FORM
 def test_a_factorisation_finds_the_same(form):
-    """Friction without symmetry, and the rank-one stiffness of a pressed obstacle."""
+    """The stiffness is non-symmetric because of friction, and has a rank-one part from the pressed obstacle."""
     rest = lj.simulate(at_rest(form)).check().positions
     direct = at_rest(form, linear_solver="direct")
     lj.check_scene(direct)
@@ -231,7 +233,7 @@ def test_a_factorisation_finds_the_same(form):
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["linear", "quadratic mixed"])
 def test_what_holds_the_body_carries_its_loads(form):
-    """At rest the forces of all parts in the table of reactions add up to weight and traction, and a weight's to it."""
+    """At rest, the forces of all supports in the table of reactions balance weight and traction."""
     scene = at_rest(form)
     result = lj.simulate(scene).check()
     names, rows = reaction_table(scene, result)
@@ -249,7 +251,7 @@ def test_what_holds_the_body_carries_its_loads(form):
 @pytest.mark.slow
 @EVERY_FORM
 def test_from_the_shape_before_the_load_it_comes_to_the_given_one(form):
-    """Loads without a history, and no obstacle: all parts that hold and cover the body."""
+    """The loads have no history and there is no obstacle. All other supports and covers are present."""
     scene = at_rest(form, dt=None)
     pull = replace(scene.traction[0], times=None, history=None)
     still = tuple(p for p in scene.physics if type(p) in (ElasticSupport, SlidingSupport, Membrane, Ligament, Vessel))

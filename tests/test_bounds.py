@@ -1,4 +1,4 @@
-"""Bounds of numbers: one place reads them, for scenes made in Python as for files, before anything is compiled."""
+"""Bounds of parameters: one function checks them, for scenes made in Python and from files, before compilation."""
 
 import cProfile
 import pstats
@@ -45,7 +45,7 @@ SOUND = lj.Scene(
     solve=lj.Solve(dt=0.05, steps=2, newton_iterations=3),
 )
 
-#: A dotted name, a value that its field does not allow, and the sentence.
+#: A dotted name, a value that its field does not allow, and the message.
 REFUSED = (
     ("law.0.mu", -1.0, "law.0.mu = -1.0 must be above 0 Pa: give e.g. 770"),
     ("law.0.bulk", float("nan"), "law.0.bulk = nan is not finite: give a number in Pa"),
@@ -73,7 +73,7 @@ COUNTS = (
 
 
 def spoiled() -> list:
-    """Every scene with one number out of bounds, and its sentence."""
+    """Return every scene with one number out of bounds, and its message."""
     cases = []
     for name, value, sentence in REFUSED:
         cases.append(pytest.param(lj.with_parameters(SOUND, {name: value}), sentence, id=f"{name}={value}"))
@@ -101,7 +101,7 @@ def test_a_sound_scene_passes_and_traced_numbers_are_left_alone(monkeypatch):
         return jnp.sum(lj.simulate(lj.with_parameters(SOUND, {"law.0.mu": mu, "body.density": mu})))
 
     assert np.isfinite(jax.jit(jax.grad(traced))(-1.0))
-    with pytest.raises(lj.InputError, match=r"law\.0\.bulk"):  # a number beside it is not traced
+    with pytest.raises(lj.InputError, match=r"law\.0\.bulk"):  # a second parameter with an ordinary value is not traced
         jax.jit(lambda mu: traced(mu) + jnp.sum(lj.simulate(lj.with_parameters(SOUND, {"law.0.bulk": -1.0}))))(1.0)
 
 
@@ -119,7 +119,7 @@ def test_one_of_many_numbers_is_named_by_its_place():
 
 @lj.struct
 class Mine:
-    """A struct of a user's own, with a field that states nothing."""
+    """A user-defined struct with a field without bounds."""
 
     count: int = lj.static(default=3, lower=2)
     share: Any = lj.param("1", lower=0.0, upper=1.0, default=0.5)
@@ -152,7 +152,7 @@ def test_parts_of_a_scene_checked_alone_use_the_same_place():
 
 
 def test_bounds_are_cheap():
-    """Asked at every call of `simulate`: so few calls of functions take less than a millisecond."""
+    """The check runs at every call of `simulate`. With this few function calls it takes less than a millisecond."""
     check_bounds(SOUND)
     counted = cProfile.Profile()
     counted.runcall(check_bounds, SOUND)
@@ -167,7 +167,8 @@ BAR = vessel.along(FINE, np.array([[0.05, 0.05, 0.01], [0.05, 0.06, 0.09]]), 1e-
 FIBRE = Ligament(
     nodes=jnp.array([[7]]), weights=jnp.ones((1, 1)), to=jnp.array([0.1, 0.1, 0.2]), stiffness=1.0, rest_length=0.1
 )
-#: A triangle of three vertices of the mesh that is no face of an element; on quadratic ones its middles are not there.
+#: A triangle of three vertices of the mesh that is not a face of an element. In a quadratic mesh, its edges have no
+#: middle nodes.
 LOST = jnp.array([[1, 2, 4]])
 
 
@@ -193,7 +194,7 @@ def _spring(**given) -> dict:
             {"displaced": (lj.Displaced(nodes=jnp.array([27]), by=jnp.zeros(3)),)},
             "displaced.0.nodes names node 27, but the nodes are",
         ),
-        ({"traction": (lj.Traction(triangles=LOST, pressure=1.0),)}, "traction.0.triangles has [1, 2, 4], not a"),
+        ({"traction": (lj.Traction(triangles=LOST, pressure=1.0),)}, "traction.0.triangles has [1, 2, 4], which is not a"),
         (
             {"traction": (lj.Traction(triangles=TOP.ravel(), pressure=1.0),)},
             "traction.0.triangles has shape (6,): give",
@@ -208,18 +209,21 @@ def _spring(**given) -> dict:
         ),
         (
             {"porosity": replace(SOUND.porosity, inlet=(Inlet(triangles=LOST, flux=1.0),))},
-            "porosity.inlet.0.triangles has [1, 2, 4], not a face of an element",
+            "porosity.inlet.0.triangles has [1, 2, 4], which is not a face of an element",
         ),
-        (_plate(triangles=LOST), "obstacle.0.triangles has [1, 2, 4], not a face"),
-        (_plate(triangles=jnp.zeros((0, 3), int)), "obstacle.0.triangles names no node: give node numbers from 0 to 7"),
+        (_plate(triangles=LOST), "obstacle.0.triangles has [1, 2, 4], which is not a face"),
+        (
+            _plate(triangles=jnp.zeros((0, 3), int)),
+            "obstacle.0.triangles contains no node: give node numbers from 0 to 7",
+        ),
         (_plate(position=jnp.zeros(2)), "obstacle.0.position has shape (2,): give shape (3,)"),
         (_plate(by=jnp.array(0.1)), "obstacle.0.by has shape (): give shape (3,)"),
         (_plate(stiffness=jnp.ones(3)), "obstacle.0.stiffness has shape (3,): give one number or shape (2,)"),
         (
             _plate(times=jnp.array([1.0, 0.0]), history=jnp.zeros((2, 3))),
-            "obstacle.0 history must have increasing times, it has 0 s after 1 s: sort them",
+            "obstacle.0 history must have increasing times, but has 0 s after 1 s: sort them",
         ),
-        (_spring(triangles=LOST, normal=1.0), "support.0.triangles has [1, 2, 4], not a face of an element"),
+        (_spring(triangles=LOST, normal=1.0), "support.0.triangles has [1, 2, 4], which is not a face of an element"),
         (_spring(triangles=TOP, normal=jnp.ones(5)), "support.0.normal has shape (5,): give one number or shape (2,)"),
         (
             _spring(nodes=jnp.array([99]), stiffness=1.0),
@@ -233,7 +237,7 @@ def _spring(**given) -> dict:
         ({"physics": (SlidingSupport(nodes=jnp.array([0]), normal=jnp.ones(2)),)}, "support.0.normal has shape (2,)"),
         (
             {"physics": (Membrane(triangles=LOST, thickness=1e-5, law=LAYER),)},
-            "membrane.0.triangles has [1, 2, 4], not",
+            "membrane.0.triangles has [1, 2, 4], which is not",
         ),
         ({"physics": (Membrane(triangles=TOP, thickness=jnp.ones(3), law=LAYER),)}, "membrane.0.thickness has shape"),
         (
@@ -253,7 +257,9 @@ def _spring(**given) -> dict:
     ],
 )
 def test_places_and_shapes_made_in_python_are_refused_in_one_sentence(change, sentence):
-    """On quadratic elements, where a triangle that is no face would take the middle of another edge, silently."""
+    """The elements are quadratic. There, a triangle that is not a face would silently use the middle node of another
+    edge.
+    """
     scene = lj.Scene(
         mesh=FINE, law=LAYER, fixed=(lj.Fixed(nodes=FINE.node_sets["z_min"]),), solve=lj.Solve(dt=0.1, steps=2)
     )
@@ -278,7 +284,7 @@ def _moved(**given) -> dict:
     return {"displaced": (replace(PULLED.displaced[0], **given),)}
 
 
-#: What a run cannot mean. Each of them ran to the end once, with another model, motion or number of nodes.
+#: Meaningless settings. Each of them once ran to the end, with another model, motion or number of nodes.
 MEANINGLESS = (
     (
         {"viscosity": replace(PULLED.viscosity, part="volumetric")},
@@ -309,7 +315,7 @@ MEANINGLESS = (
     ({"solve": lj.Solve(steps=2)}, "[solve] has no dt, which viscosity needs"),
     ({"solve": lj.Solve(steps=2, kind="dynamic", dt=0.05)}, "[solve] kind = 'dynamic' needs mass"),
     ({"solve": lj.Solve(steps=2, kind="dynamic"), "viscosity": None}, "[solve] kind = 'dynamic' needs dt"),
-    (_moved(by=jnp.array([0.01, 0.02])), "displaced.0 by has shape (2,): give three numbers in m, or three a node"),
+    (_moved(by=jnp.array([0.01, 0.02])), "displaced.0 by has shape (2,): give three numbers in m, or three per node"),
     (_moved(by=jnp.zeros(4)), "displaced.0 by has shape (4,)"),
     (_moved(by=[0.01, 0.02]), "displaced.0 by has shape (2,)"),
     (_moved(by=0.01), "displaced.0 by has shape ()"),
@@ -362,7 +368,9 @@ def test_numbers_to_differentiate_by_are_checked():
 
 
 def _turned(about_end: bool) -> np.ndarray:
-    """A turn of the nodes of x_max about their edge at z = 0, or about that at z = 0.1: along x (n, 3)."""
+    """Return displacements (n, 3) along x: a rotation of the nodes of x_max about their edge at z = 0, or at z
+    = 0.1.
+    """
     z = np.asarray(MESH.points)[np.asarray(MESH.node_sets["x_max"]), 2]
     return np.stack([0.1 * (z - (z.max() if about_end else 0.0)), 0 * z, 0 * z], axis=1)
 
@@ -372,7 +380,7 @@ def _turned(about_end: bool) -> np.ndarray:
     [((0.01, 0.0, 0.0), True), ((0.0, 0.0, 0.0), False), (_turned(False), False), (_turned(True), True)],
 )
 def test_nodes_that_are_fixed_are_not_moved_before_a_run(by, refused):
-    """A motion of 0 contradicts nothing; another one would win without a word."""
+    """A displacement of 0 contradicts nothing. Any other displacement would silently override the fixed nodes."""
     mesh = MESH
     moved = lj.Displaced(nodes=mesh.node_sets["x_max"], by=jnp.array(by))
     held = lj.Fixed(nodes=mesh.node_sets["z_min"])

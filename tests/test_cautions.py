@@ -1,4 +1,4 @@
-"""Cautions of a converged run: sizes, slivers and volumes that no tissue has, in the report and in result.h5."""
+"""Warnings after a converged run, in the report and in result.h5: unusual sizes, slivers and volume changes."""
 
 import json
 
@@ -26,7 +26,7 @@ def scene(mesh: lj.TetMesh, **solve) -> lj.Scene:
 
 
 def run(mesh: lj.TetMesh, gradients: list[np.ndarray], times: list[float]) -> Result:
-    """What a run that ends every step with one deformation gradient leaves."""
+    """Return the result of a run that ends every step with a given uniform deformation gradient."""
     positions = np.stack([np.asarray(mesh.points) @ F.T for F in gradients])
     return Result(times=np.array(times), positions=positions, reactions=None, status=None, statistics=None)
 
@@ -35,7 +35,7 @@ BOX = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
 
 
 def test_a_sound_run_has_none():
-    # Bounds themselves are allowed: J = 1/4 and 4, exact in binary, lie inside; a box 1 m long is no organ too long.
+    # Values at the bounds are allowed: J = 1/4 and 4 are exact in binary. A box of 1 m is not too long for an organ.
     gradients = [np.diag([0.25, 1.0, 1.0]), np.diag([1.0, 4.0, 1.0])]
     assert cautions_of_run(scene(BOX), run(BOX, gradients, [1.0, 2.0])) == []
     one = lj.shapes.box((1.0, 0.1, 0.1), (1, 1, 1))
@@ -47,17 +47,19 @@ def test_a_sound_run_has_none():
     [(0.01, True, False), pytest.param(0.01, True, True, marks=pytest.mark.slow), (0.002, False, False)],
 )
 def test_motion_that_grows_by_long_steps_of_newmark_is_told(dt, grows, plane):
-    """A block of period 12 ms under constant gravity: its energy is known, and a step of 10 ms multiplies it."""
+    """A block with a period of 12 ms is under constant gravity, so its energy is known. With steps of 10 ms it
+    grows.
+    """
     mesh = lj.shapes.box((0.002, 0.002, 0.006), (1, 1, 3))
     body = lj.Body(density=1060.0, gravity=np.array([0.0, 0.0, 40.0]))
     solve = lj.Solve(kind="dynamic", integrator="newmark", dt=dt, steps=85)
     own = replace(scene(mesh), body=body, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),), solve=solve)
-    if plane:  # far below
+    if plane:  # a plane far below
         below = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])
         own = replace(own, physics=(Obstacle(triangles=jnp.asarray(below), position=jnp.array([0.0, 0.0, -1.0])),))
     result = lj.simulate(own)
     assert not np.any(result.status)
-    said = [sentence for sentence in cautions_of_run(own, result) if "more energy than its loads" in sentence]
+    said = [sentence for sentence in cautions_of_run(own, result) if "exceeds the work of its loads" in sentence]
     assert bool(said) == grows
 
 
@@ -67,7 +69,7 @@ def test_volumes_name_how_many_which_and_when():
     small, large = cautions_of_run(scene(BOX, dt=0.1), result)
     assert small.startswith("6 of 6 elements shrank below J = 0.2 (worst: element ") and "J = 0.04 at 0.1 s)" in small
     assert large.startswith("6 of 6 elements grew above J = 5 (worst: element ") and "J = 24 at 0.2 s)" in large
-    # One node pushed through: only its elements are counted, the worst by an independent volume.
+    # One node is pushed through. Only its elements are counted, and the worst is found by a separate volume formula.
     moved = x.copy()
     moved[7] = x[0] + 0.05 * (x[7] - x[0])
     tets = np.asarray(BOX.tetrahedra)
@@ -84,10 +86,10 @@ def test_long_bodies_and_slivers():
     assert cautions_of_run(scene(long), run(long, [np.eye(3)], [1.0])) == [
         "the body is 6 m long: check the mesh's unit, e.g. write unit = 'mm'"
     ]
-    # Four points of a square, one lifted by h: volume a^2 h / 6, mean square edge (4 + 2 * 2)/6 a^2 without h.
+    # Four corners of a square, one lifted by h: volume a^2 h / 6, mean square edge (4 + 2 * 2)/6 a^2 apart from h.
     a, h = 0.1, 1e-4
     flat = lj.tet_mesh([[0, 0, 0], [a, 0, 0], [a, a, h], [0, a, 0]], [[0, 1, 3, 2]])
-    quality = 6 * np.sqrt(2) * a * a * h / 6 / ((4 / 3) ** 0.5 * a) ** 3  # to order (h/a)^2
+    quality = 6 * np.sqrt(2) * a * a * h / 6 / ((4 / 3) ** 0.5 * a) ** 3  # up to order (h/a)^2
     (found,) = cautions_of_run(scene(flat), run(flat, [np.eye(3)], [1.0]))
     assert found.startswith("1 of 1 elements are slivers, of quality below 0.01 (worst: element 0, ")
     assert f"{quality:.2g}; regular: 1)" in found
@@ -96,12 +98,12 @@ def test_long_bodies_and_slivers():
 def test_short_bodies_and_nodes_in_one_place():
     short = lj.shapes.box((2e-4, 1e-4, 1e-4), (1, 1, 1))
     assert cautions_of_run(scene(short), run(short, [np.eye(3)], [1.0])) == [
-        "the body is 0.0002 m long: check its size; if its numbers are metres, leave unit out"
+        "the body is 0.0002 m long: check its size; if its coordinates are in m, remove unit"
     ]
     x, tets = np.asarray(BOX.points), np.asarray(BOX.tetrahedra)
     two = lj.tet_mesh(np.concatenate([x, x + np.array([0.1, 0, 0])]), np.concatenate([tets, tets + len(x)]))
     (found,) = cautions_of_run(scene(two), run(two, [np.eye(3)], [1.0]))
-    assert found.startswith("4 nodes are at the place of another node: the body is not joined there")
+    assert found.startswith("4 nodes have the same coordinates as another node: the body is not connected there")
 
 
 def test_waves_without_a_mass_are_told():
@@ -153,14 +155,14 @@ def test_they_stand_in_the_report_and_in_the_results(tmp_path, capsys):
         (
             [0.0, 0.19, 0.191],
             [1.0, 1.0, 0.0],
-            "bends within steps, and the run, which sees it at their ends, is off by",
+            "bends within steps, but the run uses only its values at the ends of steps",
         ),
         ([0.0, 0.001], [0.0, 1.0], "bends within steps"),
         ([0.0, 0.1], [0.0, 1.0], None),
     ],
 )
 def test_a_history_that_changes_within_a_step_is_told(times, history, told):
-    """Steps end at 0.1, 0.2 and 0.3 s: they see a history there, and take it as linear in between."""
+    """Steps end at 0.1, 0.2 and 0.3 s. The run uses the history at these times and is linear in between."""
     top = lj.boundary.boundary_triangles(BOX)[:1]
     value = np.array([0.0, 0.0, 5.0])
     load = lj.Traction(triangles=top, value=value, times=np.array(times), history=np.array(history))
@@ -172,7 +174,7 @@ def test_a_history_that_changes_within_a_step_is_told(times, history, told):
 
 @pytest.mark.parametrize(("cells", "told"), [(1, True), (20, False)])
 def test_a_sphere_between_the_points_of_contact_is_told(cells, told):
-    """A sphere of 10 mm, 4 mm deep in a face whose triangles are 100 or 5 mm wide; the body does not move."""
+    """A sphere of 10 mm is 4 mm deep in a face with triangles of 100 or 5 mm width; the body does not move."""
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (cells, cells, 1))
     sphere = lj.Obstacle(
         triangles=lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_max"]),
@@ -204,7 +206,9 @@ def test_a_sphere_between_the_points_of_contact_is_told(cells, told):
     ],
 )
 def test_an_obstacle_that_passes_the_surface_within_a_step_is_told(shape, start, way, told):
-    """A sphere of 20 mm in a cube of 100 mm touches nothing: the force was 0 N, and nothing was said."""
+    """A sphere of 20 mm inside a cube of 100 mm touches nothing. Without this warning, the force was 0 N and nothing
+    was reported.
+    """
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (8, 8, 8))
     obstacle = lj.Obstacle(
         triangles=lj.boundary.boundary_triangles(mesh),
@@ -227,7 +231,7 @@ def sphere(mesh: lj.TetMesh, at: list[float], **more) -> lj.Obstacle:
 
 
 def passed(mesh: lj.TetMesh, *physics: lj.Obstacle, positions: np.ndarray | None = None, dt: float = 1.0) -> list[str]:
-    """What is said of obstacles that pass the surface of a mesh in one step."""
+    """Return the warnings on obstacles that pass the surface of a mesh in one step."""
     result = run(mesh, [np.eye(3)], [1.0])
     result = result if positions is None else replace(result, positions=positions[None])
     said = cautions_of_run(replace(scene(mesh, dt=dt, steps=1), physics=physics), result)
@@ -241,14 +245,16 @@ def test_a_thin_plate_that_a_sphere_goes_through_and_touches_from_below_is_told(
 
 
 def test_a_body_that_comes_into_the_way_afterwards_is_not_told():
-    """The sphere falls beside the body, which is beside its way at the beginning of the step and in it at the end."""
+    """The sphere falls beside the body. The body is outside its path at the beginning of the step, and inside at the
+    end.
+    """
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (4, 4, 4))
     ball = sphere(mesh, [0.15, 0.05, 0.2], by=np.array([0.0, 0.0, -0.3]))
     assert not passed(mesh, ball, positions=np.asarray(mesh.points) + np.array([0.1, 0.0, 0.0]))
 
 
 def test_an_obstacle_that_another_body_of_the_mesh_stands_in_the_way_of_is_not_told():
-    """Its triangles are those of the body that it may touch."""
+    """The triangles of the obstacle belong to the body that it may touch; only this body counts."""
     box = lj.shapes.box((0.1, 0.1, 0.1), (4, 4, 4))
     one, tets = np.asarray(box.points), np.asarray(box.tetrahedra)
     two = one + np.array([0.2, 0.0, 0.0])
@@ -271,7 +277,7 @@ def test_a_history_begins_where_it_begins_beside_a_pressed_obstacle():
 
 
 def test_a_dent_of_curved_elements_is_outside_of_the_body():
-    """A middle of an edge 12 mm below the straight edge, and a sphere of 10 mm in the dent, moved there sideways."""
+    """The middle node of an edge is 12 mm below the straight edge. A sphere of 10 mm moves into this dent."""
     mesh = lj.quadratic(lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2)))
     x = np.array(mesh.points)
     at = int(np.argmin(np.linalg.norm(x - [0.05, 0.025, 0.1], axis=1)))
@@ -289,7 +295,7 @@ def test_a_lagged_pressure_that_goes_up_and_down_is_told():
     falling = np.array([0.0, 0.95, 0.05, 0.9, 0.1, 0.8])[:, None] * np.ones(BOX.number_of_nodes)
     for pressure, told in ((rising, False), (falling, True)):
         result = replace(run(BOX, [np.eye(3)] * 6, times), pressure=pressure)
-        assert any("scheme = 'lagged' does if it is unstable" in s for s in cautions_of_run(still, result)) == told
+        assert any("scheme = 'lagged' is unstable here" in s for s in cautions_of_run(still, result)) == told
 
 
 def test_a_body_whose_estimate_is_not_found_is_not_said_to_be_at_rest():
@@ -299,4 +305,4 @@ def test_a_body_whose_estimate_is_not_found_is_not_said_to_be_at_rest():
     nothing = replace(error, positions=np.zeros((1, 8, 3)), found=np.array([True]))
     assert "the body does not move" in mesh_sentence(scene(BOX), replace(result, mesh_error=nothing))
     failed = replace(result, status=np.array([status.NOT_FINITE]))
-    assert mesh_sentence(scene(BOX), failed).startswith("mesh error: the last step failed")
+    assert mesh_sentence(scene(BOX), failed).startswith("mesh error: unknown, because the last step failed")

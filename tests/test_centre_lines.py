@@ -12,7 +12,7 @@ RADIUS, LENGTH = 3e-3, 0.1
 
 
 def tube(path, corners=16, closed=False, radius=RADIUS):
-    """Corners and triangles of a tube about a path (n, 3)."""
+    """Return points and triangles of a tube along a path (n, 3)."""
     t = np.gradient(path, axis=0)
     u = np.cross(t, [0.1, 0.2, 1.0])
     u /= np.linalg.norm(u, axis=1, keepdims=True)
@@ -52,7 +52,7 @@ def test_a_tube_has_its_length_and_radius(path, closed, corners):
     length = np.linalg.norm(found.end - found.begin, axis=1)
     assert length.sum() == pytest.approx(LENGTH, rel=0.015)
     assert np.sum(length * found.radius) / length.sum() == pytest.approx(RADIUS, rel=0.02)
-    # Pieces lie on the path.
+    # The pieces of the centre line are on the path.
     far = np.linalg.norm(found.begin[:, None] - np.array(path())[None], axis=2).min(axis=1)
     assert far.max() < 0.4 * RADIUS
 
@@ -90,12 +90,12 @@ def test_a_ring_closes():
 
 
 def _ring(x, corners):
-    """Corners about a point of a circle about the origin."""
+    """Return points around a cross-section; the centre line is a circle about the origin."""
     out, a = x / np.linalg.norm(x), np.linspace(0, 2 * np.pi, corners, endpoint=False)[:, None]
     return x + RADIUS * (np.cos(a) * out + np.sin(a) * np.array([0.0, 0.0, 1.0]))
 
 
-# scikit-image 0.26 sets shapes as NumPy 2.5 no longer likes.
+# scikit-image 0.26 sets shapes in a way that NumPy 2.5 deprecates.
 @pytest.mark.filterwarnings("ignore:Setting the shape:DeprecationWarning")
 def test_a_fork_has_three_branches():
     measure = pytest.importorskip("skimage.measure", reason="the surface of a fork needs scikit-image")
@@ -132,7 +132,7 @@ def content(**vessel):
 
 
 def written(folder, scale=1.0, closed=True):
-    """An STL file, as segmentation tools write it: no corner is shared."""
+    """Write an STL file as segmentation tools do: triangles do not share points."""
     points, triangles = tube(straight() + np.array([-0.02, 0.045, 0.055]), 16, closed)
     path = folder / "tube.stl"
     own = np.arange(3 * len(triangles)).reshape(-1, 3)
@@ -148,7 +148,7 @@ def test_a_vessel_from_a_file_is_the_one_along_its_line(tmp_path, unit, scale):
     hand = scene_from(content(line=line, radius=RADIUS, wall=5e-4, law=WALL)).physics[0]
 
     def steel(vessel, mesh):
-        """Length times section of what lies in the body."""
+        """Return the sum of length times section of the pieces in the body."""
         corners = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)[np.asarray(vessel.element)]]
         along = np.einsum("am,mai->mi", np.asarray(vessel.leaves - vessel.enters), corners)
         return np.sum(np.linalg.norm(along, axis=1) * np.asarray(vessel.area()))

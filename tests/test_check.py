@@ -1,4 +1,4 @@
-"""The gradient check: every shipped law passes, planted mistakes are caught in their row, files are read."""
+"""The gradient check: every shipped law passes, planted mistakes fail in the right row, files are read."""
 
 import textwrap
 from typing import ClassVar
@@ -24,7 +24,7 @@ class Law(NeoHookean):
     '''W = mu/2 (Ibar1 - 3) + U(J), with a mistake.'''
 """
 
-#: What is written into a neo-Hookean law -> a row that must fail.
+#: Text that is added to a neo-Hookean law -> the row that must fail.
 MISTAKES = {
     "wrong sign": (
         """
@@ -126,14 +126,14 @@ MISTAKES = {
 }
 
 
-#: One of a wrong derivative, of a wrong value, and of a state that no derivative has. The others run with -m slow.
+#: A wrong derivative, a wrong value, and a state without derivatives. The other mistakes run with -m slow.
 FIRST = ("wrong sign", "NaN at rest")
 
 
 @pytest.mark.parametrize("mistake", [m if m in FIRST else pytest.param(m, marks=pytest.mark.slow) for m in MISTAKES])
 def test_planted_mistakes_are_caught(mistake, tmp_path, capsys, monkeypatch):
     body, row = MISTAKES[mistake]
-    if mistake != "NaN at rest":  # one picture of a wrong law is enough, that with the fewest numbers
+    if mistake != "NaN at rest":  # one picture of a wrong law is enough; this one has the fewest numbers
         monkeypatch.setattr(figures, "gradient_check", lambda *_: None)
     file = tmp_path / "mine.py"
     file.write_text(HEAD + textwrap.indent(textwrap.dedent(body), "    "))
@@ -168,7 +168,9 @@ def test_a_steep_energy_is_no_jump(steep, tmp_path, monkeypatch, capsys):
 
 
 def test_a_law_of_the_volume_alone_does_not_jump():
-    """In tests that keep the volume its energy is 0, but for roundoff of 1e-28 Pa: that was called a jump."""
+    """In tests with constant volume the energy of this law is 0, up to rounding of 1e-28 Pa. This was reported as a
+    jump.
+    """
 
     @lj.struct
     class Volume(lj.Law):
@@ -190,7 +192,7 @@ def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):
     more: float = lj.param("Pa", typical=3.0)
 """
     )
-    assert main(["check", f"{file}:Law", "--out", str(tmp_path)]) == 1  # a misspelt energy showed in no code
+    assert main(["check", f"{file}:Law", "--out", str(tmp_path)]) == 1  # a misspelt energy did not change the exit code
     (row,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("parameters without effect")]
     assert row.split()[3:5] == ["FAILED", "more"]
 
@@ -204,7 +206,9 @@ def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):
     ],
 )
 def test_fibres_that_go_slack_have_a_stiffness_for_each_side(stated, agrees, tmp_path, monkeypatch):
-    """W = k/2 max(I4 - 1, 0)^2: stretched fibres add 4 k along themselves; at rest JAX takes a quarter of it."""
+    """For W = k/2 max(I4 - 1, 0)^2, stretched fibres add 4 k along their direction. At rest, JAX gives a
+    quarter of it.
+    """
     monkeypatch.setattr(figures, "gradient_check", lambda *_: None)
     file = tmp_path / "mine.py"
     file.write_text(
@@ -227,13 +231,13 @@ def test_fibres_that_go_slack_have_a_stiffness_for_each_side(stated, agrees, tmp
 
 
 _UNUSABLE = {
-    # Parts of a law are made without its bulk.
+    # The isochoric part of a law is made without its bulk modulus.
     "isochoric_part cannot be evaluated": """
     def strain_energy(self, I):
         return self.mu / 2 * (I.J ** (-2 / 3) * I.I1 - 3) + self.bulk / 2 * (I.J - 1) ** 2
 """,
-    # A run traces the numbers of a law.
-    "decide by its parameters with jnp.where": """
+    # In a run, the parameters of a law are traced.
+    "write conditions on parameters with jnp.where": """
     def isochoric_energy(self, I1, I2):
         return self.mu / 2 * (I1 - 3) if self.mu > 1 else 0 * I1
 """,
@@ -300,7 +304,7 @@ def test_users_laws_pass_or_are_refused_in_one_sentence(tmp_path, capsys):
     file.write_text(USERS_FILE)
     assert main(["check", f"{file}:Whole", "--out", str(tmp_path)]) == 0
     assert "not stated" in capsys.readouterr().out
-    for name, sentence in (("Forgets", "name every invariant"), ("Shapeless", "has shape")):
+    for name, sentence in (("Forgets", "list every invariant"), ("Shapeless", "has shape")):
         assert main(["check", f"{file}:{name}", "--out", str(tmp_path)]) == 2
         error = capsys.readouterr().err
         assert sentence in error and error.count("\n") == 1
@@ -310,19 +314,19 @@ def test_differences_have_the_v_shape():
     result = gradient_check.check(lj.laws.typical("yeoh"))
     for errors in result.difference_errors.values():
         k = int(np.argmin(errors))
-        assert 1.9 < np.log10(errors[1] / errors[3]) < 2.1  # second order while it falls
+        assert 1.9 < np.log10(errors[1] / errors[3]) < 2.1  # second order in the range where the error falls
         assert errors[0] > 1e3 * errors[k] < errors[-1]
 
 
 @pytest.mark.slow
 def test_stable_ranges_of_known_laws():
-    # Mooney-Rivlin with c01 < 0: P = 2 (l - l^-2)(c10 + c01/l) falls below the root of its derivative.
+    # Mooney-Rivlin with c01 < 0: P = 2 (l - l^-2)(c10 + c01/l) has a negative derivative below `root`.
     c10, c01 = 400.0, -100.0
     l = np.linspace(0.1, 1.0, 100_001)
     slope = 2 * ((1 + 2 * l**-3) * (c10 + c01 / l) - (l - l**-2) * c01 / l**2)
     root = l[slope < 0].max()
     low, _ = gradient_check.check(lj.laws.MooneyRivlin(c10=c10, c01=c01, bulk=7700.0)).stable["uniaxial"]
-    assert 0 <= low - root < 0.1  # the ellipticity may be lost a little before
+    assert 0 <= low - root < 0.1  # ellipticity may be lost slightly before
     assert gradient_check.check(lj.laws.typical("neo_hookean")).stable["uniaxial"] == (0.2, 4.0)
 
 
@@ -331,7 +335,7 @@ def test_stable_ranges_of_known_laws():
     [
         ("neo_hokean", "did you mean neo_hookean"),
         ("nothing.py:Law", "is not a file"),
-        ("mine.py", "mine.py names a file, and no law in it: use mine.py:Law"),
+        ("mine.py", "mine.py names a file, but no law in it: use mine.py:Law"),
         ("mine.py:Lew", "use mine.py:Law"),
         ("mine.py:number", "is not a law"),
         ("mine.py:Bare", "write @liverjax.struct"),
@@ -357,7 +361,7 @@ def test_plot_draws_laws(tmp_path, capsys):
     assert main(["plot", "neo_hookean", "yeoh", "--out", str(tmp_path)]) == 0
     assert (tmp_path / "laws.png").stat().st_size > 10_000
     assert main(["plot", "yeoh", "--stretch", "1.2", "1.6", "--out", str(tmp_path)]) == 2
-    assert "not a range about 1" in capsys.readouterr().err
+    assert "not a range that contains 1" in capsys.readouterr().err
     assert main(["plot", "yeoh", "--step", "2", "--out", str(tmp_path)]) == 2
     assert "--step is for results, not for yeoh" in capsys.readouterr().err
 
@@ -390,7 +394,7 @@ def test_homogeneous_stress_against_textbook_formulas():
 
 @lj.struct
 class Gent(lj.Law):
-    """A law that locks at an uniaxial stretch of 1.26."""
+    """A law with an infinite energy at a uniaxial stretch of 1.26."""
 
     mu: float = lj.param("Pa", typical=770.0)
     limit: float = lj.param("1", typical=0.2)
@@ -398,20 +402,20 @@ class Gent(lj.Law):
     volumetric: str = lj.static("quadratic")
 
     def isochoric_energy(self, I1, I2):
-        """-mu limit/2 ln(1 - (Ibar1 - 3)/limit)."""
+        """Return -mu limit/2 ln(1 - (Ibar1 - 3)/limit)."""
         return -self.mu * self.limit / 2 * jnp.log1p(-(I1 - 3) / self.limit)
 
 
 @lj.struct
 class Fibres(lj.Law):
-    """Slack fibres alone: no stiffness at rest, and none ever across them."""
+    """Slack fibres alone: no stiffness at rest, and never any stiffness perpendicular to the fibres."""
 
     k: float = lj.param("Pa", typical=100.0)
     fibre: tuple = lj.static((1.0, 0.0, 0.0))
     invariants: ClassVar = ("I4",)
 
     def strain_energy(self, I):
-        """k/4 (I4 - 1)^4."""
+        """Return k/4 (I4 - 1)^4."""
         return self.k / 4 * (I.I4 - 1) ** 4
 
 
@@ -419,7 +423,7 @@ class Fibres(lj.Law):
     "law, told",
     [
         (Gent(mu=770.0, limit=0.2, bulk=7700.0), ("only from 0.85 to 1.18", "stretch 0.78 to 1.26")),
-        (Fibres(k=100.0), ("no stiffness of its own", "0.0e+00 Pa")),
+        (Fibres(k=100.0), ("no stiffness at rest", "0.0e+00 Pa")),
         pytest.param(lj.laws.NeoHookean(mu=-770.0, bulk=7700.0), ("not even at rest",), marks=pytest.mark.slow),
     ],
 )

@@ -1,4 +1,4 @@
-"""The command lines: contract of files and exit codes, one sentence for unusable input."""
+"""The command lines: files, exit codes, and one-line messages for unusable input."""
 
 import importlib
 import json
@@ -40,10 +40,12 @@ def _contract(content: dict, modes: int) -> None:
 
 @pytest.mark.draws
 def test_main_job_as_a_new_user(tmp_path):
-    """The README's command on the model-implied sweep: through the simulation, closed form beside it."""
+    """Run the README's command on the model-implied sweep: through the simulation, with the closed form for
+    comparison.
+    """
     run = subprocess.run(
         [sys.executable, "-m", "fitting", str(PORCINE), "--out", str(tmp_path / "fit")],
-        env=os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"},  # a user's programs have them all
+        env=os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"},  # users run with all optimisations
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -55,7 +57,7 @@ def test_main_job_as_a_new_user(tmp_path):
     values = [content["shear_modulus"], *content["ratios"], *content["relaxation_times"]]
     assert np.allclose(values, [770, 0.235, 0.333, 0.27, 0.03], rtol=5e-3)
     assert "closed-form" in run.stdout and "torsion" in run.stdout and "Traceback" not in run.stderr
-    assert "%|" not in run.stderr  # no progress bar where there is no terminal
+    assert "%|" not in run.stderr  # no progress bar if the output is not a terminal
     assert (tmp_path / "fit" / "fit.png").stat().st_size > 10_000
     with h5py.File(tmp_path / "fit" / "fit.h5") as file:
         assert file["torsion/covariance"].shape == (5, 5)
@@ -138,7 +140,9 @@ BAD = {
 
 
 def test_the_closed_form_takes_the_inertia_of_the_sample_off(tmp_path, capsys):
-    """A mode of 100 Pa beside a spring of 900 Pa, 10 mm high: at 100 rad/s inertia takes a third of what is seen."""
+    """A mode of 100 Pa in parallel with a spring of 900 Pa, 10 mm high. At 100 rad/s the sample's inertia reduces the
+    measured modulus by more than a third.
+    """
     omega = np.geomspace(1.0, 100.0, 12)
     G = 900.0 + 100.0 * 1j * omega * 0.05 / (1 + 1j * omega * 0.05)
     seen = sample_inertia.shown(G, omega, 1060.0, 0.01)
@@ -147,7 +151,7 @@ def test_the_closed_form_takes_the_inertia_of_the_sample_off(tmp_path, capsys):
     np.savetxt(tmp_path / "s.csv", rows, "%.12g", ",", header=head, comments="")
     more = ["--density", "1060", "--height", "0.01", "--method", "closed-form", "--out", str(tmp_path)]
     assert main([str(tmp_path / "s.csv"), *more]) == 0
-    assert "the inertia of the sample, 10 mm high, is taken off" in capsys.readouterr().err
+    assert "the inertia of the sample, 10 mm high, is subtracted" in capsys.readouterr().err
     found = json.loads((tmp_path / "fit.json").read_text())
     assert seen.real[-1] < 0.8 * G.real[-1]
     assert np.isclose(found["equilibrium_modulus"], 900, rtol=1e-6) and np.isclose(
@@ -157,7 +161,7 @@ def test_the_closed_form_takes_the_inertia_of_the_sample_off(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_points_that_the_inertia_of_the_sample_bends_are_kept_if_it_is_known(tmp_path, capsys):
-    """They were left out as the mark of the instrument before the inertia of the sample was taken off."""
+    """Before the inertia of the sample was subtracted, these points were left out as affected by the instrument."""
     hertz = np.logspace(-1.7, 1.5, 33)
     tau, part, rng = np.array([0.02, 0.4, 8.0]), np.array([0.3, 0.25, 0.2]), np.random.default_rng(0)
     iwt = 2j * np.pi * hertz[:, None] * tau
@@ -196,7 +200,7 @@ def test_output_folder_that_is_a_file(tmp_path, capsys):
     assert "name a folder that can be written" in capsys.readouterr().err
     (tmp_path / "out" / "fit.h5").mkdir(parents=True)
     assert main([str(PORCINE), "--out", str(tmp_path / "out")]) == 2
-    assert "fit.h5 in it is a folder" in capsys.readouterr().err
+    assert "contains a folder fit.h5" in capsys.readouterr().err
 
 
 def test_what_an_earlier_run_left_is_told(tmp_path, capsys):
@@ -261,7 +265,9 @@ def test_laws_lists_every_parameter(capsys):
 
 
 def test_a_run_in_single_precision_writes_its_files(tmp_path):
-    """A scene in single precision keeps a mesh in double: what is made of both is in the mesh's digits."""
+    """A scene in single precision keeps its mesh in double precision. Combined values have the precision of the
+    mesh.
+    """
     scene = tmp_path / "scene.toml"
     scene.write_text(
         """
@@ -277,14 +283,14 @@ def test_a_run_in_single_precision_writes_its_files(tmp_path):
     assert liverjax_main(["simulate", str(scene), "--out", str(tmp_path), *options]) == 0
     with h5py.File(tmp_path / "result.h5") as file:
         assert file["positions"].dtype == np.float32
-    # The support carries the weight, to the tolerance of its run.
+    # The support carries the weight, up to the tolerance of the run.
     lines = (tmp_path / "reactions.csv").read_text().splitlines()
     last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
     assert np.isclose(float(last["support.0.z_N"]), 3.0, rtol=1e-3)
 
 
 def test_numbers_with_exponents_are_values_and_an_unknown_backend_is_no_matter(tmp_path):
-    """`--gap-error -1e-5` was an unknown option to argparse; a wrong MPLBACKEND ended in a traceback."""
+    """argparse took `--gap-error -1e-5` for an unknown option; a wrong MPLBACKEND ended in a traceback."""
     command = [sys.executable, "-m", "fitting", str(PORCINE), "--method", "closed-form", "--out", str(tmp_path)]
     env = os.environ | {"MPLBACKEND": "nonsense"}
     run = subprocess.run([*command, "--modes", "2"], env=env, cwd=ROOT, capture_output=True, text=True)
@@ -300,7 +306,7 @@ def test_numbers_with_exponents_are_values_and_an_unknown_backend_is_no_matter(t
 
 @pytest.mark.slow
 def test_a_terminal_without_the_letter_and_a_full_disk(tmp_path):
-    """Both ended in tracebacks after the fit, the first one before the files that --cards asks for."""
+    """Both cases ended in tracebacks after the fit. The first one failed before the files of --cards were written."""
     command = [sys.executable, "-m", "fitting", str(PORCINE), "--method", "closed-form", "--out", str(tmp_path)]
     env = os.environ | {"PYTHONIOENCODING": "ascii"}
     run = subprocess.run([*command, "--cards"], env=env, cwd=ROOT, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""Clusters of near nodes in thin cells: their blocks against autodiff, and what they save."""
+"""Clusters of near nodes in thin cells: their blocks against autodiff, and the iterations that they save."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ LAW = lj.laws.NeoHookean(mu=700.0, bulk=2200.0)
 
 
 def plate(aspect: float, cells: int = 4, order: int = 1, **solve) -> lj.Scene:
-    """A plate of cells so many times as wide as thick, glued below, its upper face moved aside and down."""
+    """A plate with cells `aspect` times as wide as thick, glued below; its upper face is moved sideways and down."""
     thick = 0.1 / aspect
     mesh = lj.shapes.box((0.1, 0.1, thick), (cells, cells, cells))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
@@ -69,7 +69,7 @@ def test_flat_cells_take_as_few_iterations_as_cubes():
         result = lj.simulate(replace(plate(aspect, volumetric="mixed"), law=law))
         assert (np.asarray(result.status) == status.CONVERGED).all()
         counts.append(int(result.statistics.linear_iterations.sum()))
-    # With blocks of single nodes it is three times as many.
+    # With blocks of single nodes, the number is three times as large.
     assert counts[1] < 1.3 * counts[0]
 
 

@@ -1,4 +1,6 @@
-"""Rigid obstacles: distances against difference quotients, Hertz, weights on planes, energy, gradients, refusals."""
+"""Rigid obstacles: distances against difference quotients, Hertz, weights on planes, energy, gradients, invalid
+input.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +21,13 @@ SIDE = 0.1
 
 
 def surface(mesh: lj.TetMesh, **where) -> jax.Array:
-    """Triangles of a place."""
+    """Return the triangles of a region of the surface."""
     return jnp.asarray(lj.boundary.boundary_triangles(mesh, lj.boundary.select(mesh, where)))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_distances_and_their_derivatives(shape):
-    """Normals of length 1 and second derivatives, against automatic differentiation of the distance."""
+    """Compare normals of length 1 and second derivatives with automatic differentiation of the distance."""
     axis = jnp.array([2.0, -1.0, 2.0]) / 3
     y = jnp.asarray(np.random.default_rng(0).normal(size=(40, 3)))
 
@@ -42,7 +44,9 @@ def test_distances_and_their_derivatives(shape):
 
 
 def test_a_cone_with_a_round_tip_begins_at_its_place():
-    """Along the axis the distance is that to the tip; far away beside it, that of the sharp cone moved by rho/sin."""
+    """On the axis, the distance is that to the tip. Far from the axis, it is that of the sharp cone moved by
+    rho/sin.
+    """
     up, angle, rho = jnp.array([0.0, 0.0, 1.0]), 0.7, 0.01
     below = distance("cone", list(jnp.array([0.0, 0.0, -0.2])), up, rho, angle)
     assert np.isclose(below.value, 0.2, atol=1e-12) and np.allclose(jnp.stack(below.normal), [0, 0, -1], atol=1e-12)
@@ -52,7 +56,7 @@ def test_a_cone_with_a_round_tip_begins_at_its_place():
 
 
 def lying(order: int = 1, **changes) -> lj.Scene:
-    """A cube that lies on a plane, pressed on it by a traction; its sides slide, so its stress is uniform."""
+    """A cube is pressed on a plane by a traction. Its sides slide, so its stress is uniform."""
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (2, 2, 2))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     sides = tuple(lj.Fixed(nodes=jnp.asarray(lj.boundary.select(mesh, {f"{a}_max": 0.0})), axes=a) for a in "xy")
@@ -72,7 +76,7 @@ def test_a_pressed_cube_sinks_by_pressure_over_stiffness(order):
         return found.positions[-1, sole, 2], found.status
 
     depth, slope, status = jax.jvp(sunk, (1e6,), (1.0,), has_aux=True)
-    # Residual 1e-8 of the forces at work.
+    # The residual is 1e-8 of the acting forces.
     assert status.max() == 0 and np.allclose(depth, -50.0 / 1e6, rtol=1e-6)
     assert np.allclose(slope, 50.0 / 1e12, rtol=1e-6)
 
@@ -80,10 +84,10 @@ def test_a_pressed_cube_sinks_by_pressure_over_stiffness(order):
 @pytest.mark.parametrize(("ratio", "volumetric", "depth"), [(3.0, "element", 5e-5), (1e3, "mixed", 2e-5)])
 @pytest.mark.slow
 def test_a_sphere_on_a_layer_takes_the_force_of_its_integral_equation(ratio, volumetric, depth, verified):
-    """Half a thousand quadratic elements, the contact as wide as 6 to 10 % of the sphere.
+    """The mesh has about 500 quadratic elements. The contact is 6 to 10 % as wide as the sphere.
 
-    At K/mu = 1000 and a depth of 5e-5 the force is 1.7 % below that of small strains on every mesh. That is finite
-    strain, which falls with the depth.
+    At K/mu = 1000 and a depth of 5e-5, the force is 1.7 % below that of small strains on every mesh. This is an effect
+    of finite strain, which falls with the depth.
     """
     from fitting.rigs.thin_layer import Indenter, Layer
     from liverjax.mesh import cylinders
@@ -121,7 +125,9 @@ def test_a_sphere_on_a_layer_takes_the_force_of_its_integral_equation(ratio, vol
 
 @pytest.mark.slow
 def test_a_falling_cube_bounces():
-    """Newmark's method, with the contact force at the end of the step, keeps the part exp(-pi w dt/2) of the energy."""
+    """With Newmark's method and the contact force at the end of the step, the fraction exp(-pi w dt/2) of the energy is
+    kept.
+    """
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (1, 1, 1))
     plane = Obstacle(triangles=surface(mesh, z_max=0.0), position=jnp.array([0.0, 0.0, -0.005]), stiffness=4e6)
     stiff = lj.laws.NeoHookean(mu=1e8, bulk=1e8)
@@ -136,7 +142,7 @@ def test_a_falling_cube_bounces():
     lj.check_scene(scene)
     result = lj.simulate(scene).check()
     z = np.asarray(result.positions)[:, :, 2].mean(axis=1) - SIDE / 2
-    # A stiff cube of 1 kg on a spring of stiffness times area, 40,000 N/m: it falls 5 mm and bounces.
+    # A stiff cube of 1 kg falls 5 mm and bounces on a spring of stiffness times area, 40,000 N/m.
     fall = np.sqrt(2 * 0.005 / 9.81)
     w = np.sqrt(40000.0 / 1.0)
     touching = np.asarray(lj.obstacle_forces(scene, result).force)[0, :, 2] < -1e-9
@@ -149,7 +155,9 @@ def test_a_falling_cube_bounces():
 
 @pytest.mark.slow
 def test_gradients_through_closing_contact():
-    """Force on a sphere by its depth and by the law's modulus: difference quotients fall, bottom out and rise."""
+    """The force on a sphere is differentiated with respect to its depth and to the law's modulus. The error of
+    difference quotients falls, reaches a minimum and rises.
+    """
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (2, 2, 2))
     sphere = Obstacle(
         triangles=surface(mesh, z_min=SIDE),
@@ -174,7 +182,7 @@ def test_gradients_through_closing_contact():
         return lj.obstacle_forces(changed, lj.simulate(changed)).force[0, -1, 2]
 
     p = jnp.array([800.0, -0.01])
-    assert force(p) > 0  # the body pushes the sphere up
+    assert force(p) > 0  # the body pushes the sphere upwards
     forward, backward = jax.jacfwd(force)(p), jax.grad(force)(p)
     assert np.allclose(forward, backward, rtol=1e-7)
     for k in range(2):
@@ -188,7 +196,7 @@ def test_gradients_through_closing_contact():
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_forces_on_obstacles_know_regions_and_precision(precision):
-    """The contact's own stiffness follows from the stiffest law of the body, as in the run: forces balance."""
+    """The default contact stiffness follows from the stiffest law of the body, as in the run, so the forces balance."""
     scene = lying(steps=1, precision=precision, tolerance=1e-8 if precision == "float64" else 1e-4)
     stiff = lj.Region(elements=jnp.arange(8), law={"mu": 8e4})
     plane = replace(scene.physics[0], stiffness=None)
@@ -200,12 +208,12 @@ def test_forces_on_obstacles_know_regions_and_precision(precision):
 
 
 def on_its_own() -> lj.Scene:
-    """A cube of which nothing comes near."""
+    """A cube without obstacles near it."""
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (1, 1, 1))
     return lj.Scene(mesh=mesh, law=LAW, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),))
 
 
-@pytest.mark.slow  # by default tests/test_pay_for_what_is_there.py looks for the equations themselves
+@pytest.mark.slow  # the default run of tests/test_pay_for_what_is_there.py compares the equations themselves
 def test_a_scene_without_obstacles_has_none_in_its_program():
     scene, place = on_its_own(), jnp.array([0.0, 0.0, -1.0])
     far = replace(scene, physics=(Obstacle(triangles=surface(scene.mesh), position=place),))
@@ -249,7 +257,10 @@ SCENE = {
         ({"shape": "sphere", "radius": [0.1, 0.2], "position": [0, 0, 1]}, "must be one number"),
         ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "friction": [0.1]}, "must be one number"),
         ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "radius": 0.1}, "which has no radius"),
-        ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "where": 3}, "is not a place: write where"),
+        (
+            {"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "where": 3},
+            "is not a table of bounds: write where",
+        ),
     ],
 )
 def test_bad_obstacles_are_one_sentence(table, words):

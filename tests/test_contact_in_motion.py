@@ -1,5 +1,6 @@
-"""Contact in motion by Newmark's method: the force of a given obstacle acts at the end of each step, and gives no
-energy."""
+"""Contact in motion by Newmark's method: the force of an obstacle with prescribed motion acts at the end of each step,
+and adds no energy.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -29,19 +30,20 @@ def block(cells: int, order: int = 1) -> lj.Scene:
 
 
 def plane(scene: lj.Scene, **given) -> Obstacle:
-    """Above the block."""
+    """A plane above the block."""
     kind = RoughObstacle if "friction" in given else Obstacle
     top = jnp.asarray(lj.boundary.boundary_triangles(scene.mesh, scene.mesh.node_sets["z_max"]))
     return kind(triangles=top, axis=jnp.array([0.0, 0.0, -1.0]), **given)
 
 
 def test_a_still_obstacle_gives_no_energy():
-    """A plane presses the block for 0.1 s and stops. The mean of the contact forces of both ends gave the block 600
-    times its energy, with every step converged."""
+    """A plane presses the block for 0.1 s and stops. When the mean of the contact forces at both ends of a step was
+    used, the block got 600 times its energy, although every step converged.
+    """
     scene = block(2)
     times, ways = jnp.array([0.0, 0.1]), jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.0015]])
     above = plane(scene, position=jnp.array([0.0, 0.0, SIDE + 1e-4]), times=times, history=ways)
-    # The nodes of one edge are held and touch the plane.
+    # The nodes of one edge are fixed and touch the plane.
     held = tuple(lj.Fixed(nodes=scene.mesh.node_sets[side]) for side in ("z_min", "x_min"))
     scene = replace(scene, fixed=held, physics=(above,), solve=replace(scene.solve, dt=0.002, steps=200))
     result = lj.simulate(scene).check()
@@ -49,7 +51,7 @@ def test_a_still_obstacle_gives_no_energy():
     mass = DENSITY * np.asarray(nodal_volumes(scene.mesh))[:, None]
     energy = 0.5 * np.sum(mass * (np.diff(x, axis=0) / 0.002) ** 2, axis=(1, 2))
     assert energy[150:].max() < 1.5 * energy[50:100].max()
-    # The held faces carry what the plane presses, but for the inertia of the motion that is left.
+    # The fixed faces carry the force of the plane, apart from the inertia of the remaining motion.
     force = np.asarray(lj.obstacle_forces(scene, result).force)[0, 100:, 2].mean()
     assert np.isclose(np.asarray(result.reactions)[100:, :, 2].sum(axis=1).mean(), force, rtol=0.02)
 
@@ -64,7 +66,8 @@ def test_a_still_obstacle_gives_no_energy():
 )
 def test_an_obstacle_gives_a_body_with_a_rigid_plate_no_energy(side, by, mass):
     """The body rises against a plane. Its rigid plate touches the plane (z_max) or not (z_min). At the end of each step
-    m (v1 - v0) = dt (weight + contact), along the axis of the plate."""
+    m (v1 - v0) = dt (weight + contact), along the axis of the plate.
+    """
     scene, dt, weight = block(1), 0.002, DENSITY * SIDE**3 * 9.81
     nodes = jnp.asarray(scene.mesh.node_sets[side])
     centre = jnp.array([SIDE / 2, SIDE / 2, 0.0])
@@ -91,7 +94,7 @@ def test_an_obstacle_gives_a_body_with_a_rigid_plate_no_energy(side, by, mass):
     assert contact.max() > weight and np.flatnonzero(contact)[0] > 3
     assert np.all(moving < given + 1e-9 * given.max()) and moving.max() > 0.1 * given.max()
     momentum = [0.0]
-    for way in np.diff(centre):  # v0 + v1 is twice the way over dt
+    for way in np.diff(centre):  # v0 + v1 is twice the displacement over dt
         momentum.append(2 * way / dt - momentum[-1])
     assert np.allclose(np.diff(momentum) / dt - weight, -contact, atol=1e-6 * contact.max())
 
@@ -105,7 +108,7 @@ def test_an_obstacle_gives_a_body_with_a_rigid_plate_no_energy(side, by, mass):
     ],
 )
 def test_the_change_of_momentum_is_the_force_at_the_end(order, mass):
-    """Of a block that flies against a plane that rubs: m (v1 - v0) = dt (weight + contact at the end), in each step."""
+    """A block flies against a plane with friction. In each step, m (v1 - v0) = dt (weight + contact at the end)."""
     scene, up = block(1, order), jnp.array([2.0, 0.0, 9.81])
     ceiling = plane(scene, friction=0.3, position=jnp.array([0.0, 0.0, SIDE + 1e-3]))
     scene = replace(
@@ -119,7 +122,7 @@ def test_the_change_of_momentum_is_the_force_at_the_end(order, mass):
     x = np.concatenate([np.asarray(scene.mesh.points)[None], np.asarray(result.positions)])
     centre = DENSITY * np.einsum("v,tvi->ti", weights, x)
     momentum = [np.zeros(3)]
-    for way in np.diff(centre, axis=0):  # v0 + v1 is twice the way over dt
+    for way in np.diff(centre, axis=0):  # v0 + v1 is twice the displacement over dt
         momentum.append(2 * way / 0.002 - momentum[-1])
     force = np.diff(momentum, axis=0) / 0.002 - DENSITY * SIDE**3 * np.asarray(up)
     contact = np.asarray(lj.obstacle_forces(scene, result).force)[0]
@@ -129,7 +132,9 @@ def test_the_change_of_momentum_is_the_force_at_the_end(order, mass):
 
 
 def test_gradients_of_reactions_with_consistent_mass():
-    """In reverse mode, a cotangent on held nodes met a matrix that is singular there: NaN."""
+    """In reverse mode, a cotangent on fixed nodes was multiplied by a matrix that is singular there. The result was
+    NaN.
+    """
     scene = block(1)
     above = plane(scene, position=jnp.array([0.0, 0.0, SIDE]), by=jnp.array([0.0, 0.0, -0.001]), stiffness=1e6)
     scene = replace(
@@ -148,7 +153,7 @@ def test_gradients_of_reactions_with_consistent_mass():
 
 
 def _consistent_weights(mesh: lj.TetMesh) -> np.ndarray:
-    """Integrals (V,) of the shape functions of quadratic elements: -1/20 and 1/5 of the volume."""
+    """Return the integrals (V,) of the shape functions of quadratic elements: -1/20 and 1/5 of the volume."""
     weights = np.zeros(mesh.number_of_nodes)
     for k, nodes in enumerate(mesh.element_nodes_on_host):
         np.add.at(weights, nodes, np.asarray(mesh.volumes) * (-0.05 if k < 4 else 0.2))

@@ -1,8 +1,9 @@
-"""Sphere, cone and smooth flat punch on a bonded layer by quadratic elements: the integral equation of the contact.
+"""Sphere, cone and smooth flat punch on a bonded layer with quadratic elements, against the contact's integral
+equation.
 
-Strains are of a thousandth, since the equation is of small strains. Near incompressibility the contact is four times as
-hard as by default, since what it leaves of the depth counts there; the linear systems are factorised, for run and
-estimate. Layers of nearly any thickness have as many elements: one program serves all of a shape.
+Strains are about a thousandth, because the equation assumes small strains. For nearly incompressible layers the contact
+is four times as stiff as by default, because its penetration matters there. The linear systems are factorised, for run
+and estimate. Layers of nearly any thickness have equally many elements, so one program serves all layers of a shape.
 """
 
 import time
@@ -22,18 +23,21 @@ from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.simulation.mesh_error import BAR
 
 A, MU, STRAIN = 0.01, 800.0, 2e-3
-#: Stiffness of the contact over that by default, by K/mu.
+#: Stiffness of the contact over its default value, for each K/mu.
 HARDER = {3.0: 1.0, 1e3: 4.0}
 FORMS = {
     3.0: {"volumetric": "element", "linear_solver": "cg"},
     1e3: {"volumetric": "mixed", "linear_solver": "direct"},
 }
-#: Rings within the contact and outside of it, layers; finer where a thick layer meets the sharp edge of a punch.
+#: Numbers of rings within the contact and outside, and of layers. FINER is for a thick layer under the sharp edge of a
+#: punch.
 CELLS, FINER = (6, 8, 8), (8, 12, 12)
 
 
 def growing(first: float, length: float, n: int) -> np.ndarray:
-    """Places from 0 to `length` in n parts, the first of them `first` long and each a factor longer than the last."""
+    """Return positions from 0 to `length` in n parts. The first part is about `first`; the lengths grow by a constant
+    factor.
+    """
     low, high = 1e-3, 1e3
     for _ in range(200):
         ratio = np.sqrt(low * high)
@@ -42,12 +46,15 @@ def growing(first: float, length: float, n: int) -> np.ndarray:
 
 
 def layer(shape: str, thickness: float) -> tuple[cylinders.Sector, int]:
-    """A sector of the layer, over the contact's radius, fine at its edge and on a cone's tip; rings that may touch."""
+    """Return a sector of the layer in units of the contact radius, and the number of rings that may touch.
+
+    The mesh is fine at the edge of the contact and at the tip of a cone.
+    """
     edge = {"sphere": 0.12, "cone": 0.12, "punch": 0.02}[shape] * A
     rings, around, layers = FINER if shape == "punch" and thickness > 3 else CELLS
     inside = np.append(0.0, A - growing(edge, A, rings)[-2::-1])
     if shape == "cone":
-        # As fine at the tip, where the pressure has no bound.
+        # The mesh is as fine at the tip, where the pressure is singular.
         half = growing(edge / 2, A / 2, rings // 2)
         inside = np.append(half, A - half[-2::-1])
     h = thickness * A
@@ -57,7 +64,9 @@ def layer(shape: str, thickness: float) -> tuple[cylinders.Sector, int]:
 
 
 def pressed(shape: str, ratio: float, thickness: float) -> tuple[lj.Scene, float, float, float]:
-    """The scene, how many such sectors are a layer, the depth [m] and the force [N] of the integral equation."""
+    """Return the scene, the number of such sectors in a layer, the depth [m] and the force [N] of the integral
+    equation.
+    """
     h, poisson = thickness * A, (3 * ratio - 2) / (2 * (3 * ratio + 1))
     deeper = _contact(1 / thickness, poisson, shape)[0]
     up, at = jnp.array([0.0, 0.0, 1.0]), jnp.array([0.0, 0.0, h])
@@ -70,7 +79,7 @@ def pressed(shape: str, ratio: float, thickness: float) -> tuple[lj.Scene, float
         depth, rig = deeper * np.pi / 2 * A * STRAIN, Indenter(shape, h, poisson, half_angle=angle)
         place = {"half_angle": angle, "axis": up, "position": at}
     else:
-        # Smooth: a plane under which only the surface within the punch's edge may touch.
+        # A smooth punch is a plane under which only the surface within the punch's edge may touch.
         depth, rig, place = STRAIN * A, Indenter(shape, h, poisson, radius=A), {"axis": -up, "position": at}
     (mesh, normal, parts, _), rings = layer(shape, thickness)
     radii = np.unique(np.round(np.hypot(*np.asarray(mesh.points)[np.asarray(mesh.node_sets["top"]), :2].T), 12))
@@ -103,19 +112,21 @@ def pressed(shape: str, ratio: float, thickness: float) -> tuple[lj.Scene, float
 
 
 def carried(scene: lj.Scene, x, reactions):
-    """What the base carries at the end of the run [N]."""
+    """Return the force of the base at the end of the run [N]."""
     return jnp.sum(reactions[-1, scene.mesh.node_sets["bottom"], 2])
 
 
 CASES = [(ratio, shape, t) for ratio in FORMS for shape in ("sphere", "cone", "punch") for t in (0.5, 1.0, 3.0, 10.0)]
-#: Its finer mesh has too many cubic functions for a factorisation: the estimate takes more than ten minutes.
+#: The finer mesh of this case has too many cubic functions for a factorisation. The estimate takes over ten minutes.
 WITHOUT_ESTIMATE = (1e3, "punch", 10.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "shape", "thickness"), CASES)
 def test_the_force_on_a_layer_is_that_of_its_integral_equation(shape, ratio, thickness, verified):
-    """Within 1 %, and the bar of the mesh's estimate covers the rest; K/mu = 1000 is a Poisson's ratio of 0.4995."""
+    """The force is exact within 1 %, and the estimated mesh error covers the rest. K/mu = 1000 is a Poisson's ratio of
+    0.4995.
+    """
     scene, parts, depth, exact = pressed(shape, ratio, thickness)
     lj.check_scene(scene)
     asked = (ratio, shape, thickness) != WITHOUT_ESTIMATE
@@ -130,7 +141,7 @@ def test_the_force_on_a_layer_is_that_of_its_integral_equation(shape, ratio, thi
     bar = BAR * parts * abs(float(change)) / exact
     left = float(lj.obstacle_forces(scene, result).depth[0, -1]) / depth
     print(f"{shape} {ratio:g} {thickness:g}: off {100 * off:.3f} %, bar {100 * bar:.3f} %, left {100 * left:.3f} %")
-    # Finite strain and what the contact leaves of the depth are a thousandth each.
+    # Finite strain and the penetration of the contact are a thousandth each.
     assert abs(off) < 0.01 and abs(off) < bar + 0.002
     assert bool(jnp.all(result.mesh_error.found))
     verified(name, "integral equation", abs(off), 0.01, bar=bar)
@@ -138,7 +149,9 @@ def test_the_force_on_a_layer_is_that_of_its_integral_equation(shape, ratio, thi
 
 @pytest.mark.slow
 def test_noisy_curves_of_finite_elements_give_the_modulus_back(verified):
-    """200 curves with 5 % of noise: median within 5 %, intervals cover 90 to 99 %, below 5 s a curve."""
+    """200 curves with 5 % of noise are fitted: the median is within 5 %, intervals cover 90 to 99 %, a curve takes
+    below 5 s.
+    """
     scene, parts, depth, _ = pressed("sphere", 3.0, 1.0)
     steps, start = 20, 0.3 * depth
     scene = replace(scene, solve=replace(scene.solve, steps=steps))

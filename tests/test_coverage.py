@@ -1,4 +1,4 @@
-"""The study of coverage fits thousands of sweeps side by side: its fits and intervals are those of the program."""
+"""The study of coverage fits thousands of sweeps at once. Its fits and intervals are those of the program."""
 
 import numpy as np
 import pytest
@@ -37,4 +37,4 @@ def test_its_springpot_is_that_of_the_program():
 def test_truths_without_disturbance_are_measured_as_they_are():
     G = TRUTH.moduli(coverage.OMEGA)
     apart = DATA / np.concatenate([G.real, G.imag], axis=1) - 1
-    assert apart.std() == pytest.approx(coverage.NOISE, rel=0.15)  # of 372 numbers: 4 %
+    assert apart.std() == pytest.approx(coverage.NOISE, rel=0.15)  # of 372 numbers: known to 4 %

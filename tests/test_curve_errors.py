@@ -1,4 +1,6 @@
-"""Errors of laws fitted to curves: uneven noise, factors of tests, what the data do not tell."""
+"""Errors of laws fitted to curves: uneven noise, individual factors of tests, and parameters that are not
+determined.
+"""
 
 import numpy as np
 import pytest
@@ -21,13 +23,15 @@ def test_standard_errors_are_the_scatter_of_repeated_fits():
     fits = [stress_stretch.fit(candidate, synthetic(law, 0.03, seed), starts=4) for seed in range(20)]
     values = np.stack([f.values for f in fits])
     stated = np.mean([f.standard_errors for f in fits], axis=0)
-    # A standard deviation from 20 draws is known to 1/sqrt(38) = 16 %: three of these.
+    # A standard deviation from 20 draws has an error of 1/sqrt(38) = 16 %. Three of these are allowed.
     assert np.allclose(values.std(axis=0, ddof=1), stated, rtol=0.49)
     assert np.all(np.abs(values.mean(axis=0) - [500.0, 2.0]) < 3.5 * stated / np.sqrt(20))
 
 
 def test_errors_hold_where_noise_grows_with_the_stress():
-    """Least squares with y = a x + b x^2 and noise in proportion to y: b has 1.2 times the error of equal noise."""
+    """In a least-squares fit of y = a x + b x^2 with noise proportional to y, the error of b is 1.2 times that of equal
+    noise.
+    """
     x, rng, true = np.linspace(0.05, 1.0, 25), np.random.default_rng(0), np.array([1.0, 20.0])
     J = np.stack([x, x**2], axis=1)
     sd = 0.05 * (J @ true)
@@ -38,16 +42,18 @@ def test_errors_hold_where_noise_grows_with_the_stress():
         p = np.linalg.pinv(J) @ y
         errors.append(np.linalg.norm(uneven_root(J, y - J @ p, np.eye(2)), axis=1))
         held.append(np.abs(p - true) < 2.07 * errors[-1])
-    # HC3 is larger than the exact error by the leverage of few points: here a tenth.
+    # HC3 exceeds the exact error because of the leverage of few points, here by a tenth.
     assert np.all(np.sqrt(np.mean(np.square(errors), axis=0)) / exact < 1.25)
     assert np.all(np.mean(held, axis=0) > 0.91)
     equal = np.sqrt(np.mean(sd**2) * np.diag(np.linalg.inv(J.T @ J)))
-    assert exact[1] > 1.2 * equal[1]  # what an equal noise would give
+    assert exact[1] > 1.2 * equal[1]  # this would be the error for equal noise
 
 
 @pytest.mark.slow
 def test_errors_of_a_law_contain_uneven_noise():
-    """Fung and Demiray's law with 5 % of each stress as noise: 36 and 32 % of the 95 % intervals held."""
+    """Fit the law of Fung and Demiray with noise of 5 % of each stress. With errors for equal noise, only 36 and 32 %
+    of the 95 % intervals contained the truth.
+    """
     stretch, rng = np.linspace(1.02, 1.5, 15), np.random.default_rng(1)
     law = lj.laws.FungDemiray(c1=500.0, c2=10.0, bulk=None)
     exact = np.asarray(homogeneous.response(law, "uniaxial", stretch))
@@ -63,8 +69,8 @@ def test_errors_of_a_law_contain_uneven_noise():
 
 @pytest.mark.slow
 def test_factors_of_two_tests_are_in_the_errors_or_told():
-    """Mooney's law in tension and equibiaxial tension, a factor of 10 % on each test, 2 % of noise: errors of the noise
-    alone held 45 % of the intervals, and nothing was said.
+    """Fit Mooney's law to uniaxial and equibiaxial tension, with a factor of 10 % on each test and 2 % of noise. With
+    errors of the noise alone, 45 % of the intervals contained the truth, and there was no warning.
     """
     stretch, rng, true = np.linspace(1.02, 1.4, 12), np.random.default_rng(3), np.array([300.0, 200.0])
     law = lj.laws.MooneyRivlin(c10=300.0, c01=200.0, bulk=None)
@@ -79,20 +85,22 @@ def test_factors_of_two_tests_are_in_the_errors_or_told():
             two.append(curves.Curve(test, test, F, (0, 0), noisy, 0))
         found = stress_stretch.fit(candidate, two)
         held = np.abs(found.values - true) < 2.07 * found.standard_errors
-        told = any("a factor of its own" in sentence for sentence in found.warnings)
+        told = any("the stress of each test" in sentence for sentence in found.warnings)
         missed.append((not held.all(), not held.all() and not told))
-        shown += any("each test seems to have a factor" in sentence for sentence in found.warnings)
+        shown += any("each test seems to have an individual factor" in sentence for sentence in found.warnings)
     assert np.sum(missed, axis=0)[0] <= 3 and np.sum(missed, axis=0)[1] == 0 and shown, missed
 
 
 @pytest.mark.slow
 def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
-    """Ogden's law with alpha = 6: in simple shear alpha = -6 is the same, in tension 0.3 times the stress."""
+    """For Ogden's law with alpha = 6, simple shear is the same with alpha = -6. In tension the stress is 0.3 times as
+    large.
+    """
     law = lj.laws.Ogden(mu=(333.3,), alpha=(6.0,), bulk=None)
     (shear,) = (c for c in synthetic(law, 0.02, 0) if c.label.startswith("simple"))
     (candidate,) = stress_stretch.candidates("ogden", terms=1)
     told = [s for s in stress_stretch.fit(candidate, [shear], 32).warnings if s.startswith("other parameters follow")]
-    assert len(told) == 1 and "add a test of tension or compression" in told[0]
+    assert len(told) == 1 and "add a test in tension or compression" in told[0]
     every = stress_stretch.fit(candidate, synthetic(law, 0.02, 0), 32).warnings
     assert not [s for s in every if s.startswith("other parameters follow")]
 
@@ -105,7 +113,7 @@ def test_a_parameter_without_data_is_told():
 
 
 def test_errors_hold_at_a_point_through_which_the_law_goes():
-    """A law that stiffens: the last point has a leverage near 1, so its residual does not show its noise."""
+    """The law stiffens, so the last point has a leverage near 1, and its residual does not show its noise."""
     x, rng, true = np.linspace(0.1, 1.0, 10), np.random.default_rng(0), np.array([1.0, 1.0])
     J = np.stack([x, x * np.exp(16 * (x - 0.5))], axis=1)
     size, held, alone = J @ true, [], []
@@ -116,13 +124,13 @@ def test_errors_hold_at_a_point_through_which_the_law_goes():
         errors = [np.linalg.norm(root, axis=1) for root in roots]
         held.append(np.abs(p - true) < 2.31 * np.maximum(*errors))
         alone.append(np.abs(p - true) < 2.31 * errors[0])
-    # 200 draws: the binomial spread is 0.016 at 95 %.
+    # 200 draws: the binomial standard deviation is 0.016 at 95 %.
     assert np.all(np.mean(held, axis=0) > 0.9) and np.mean(alone, axis=0)[1] < 0.8, (
         np.mean(held, 0),
         np.mean(alone, 0),
     )
     even = [growing_root(J, J @ (np.linalg.pinv(J) @ e) - e, size, np.eye(2)) for e in rng.standard_normal((100, 10))]
-    assert np.mean([np.any(root) for root in even]) < 0.3  # equal noise is seen as such
+    assert np.mean([np.any(root) for root in even]) < 0.3  # equal noise is recognised
 
 
 def test_as_many_parameters_as_points_is_told():
@@ -145,7 +153,7 @@ def test_laws_that_tie_are_named_with_their_moduli():
 
 
 def test_a_factor_of_a_test_is_no_misfit_of_the_law():
-    """A second sample 1.3 times as stiff: beside its factor, "the law misses something" was said too."""
+    """The second sample is 1.3 times as stiff. In addition to its factor, a misfit of the law was once reported."""
     rng, stretch = np.random.default_rng(5), np.linspace(1.02, 1.4, 25)
     law = lj.laws.NeoHookean(mu=1000.0, bulk=None)
     (candidate,) = stress_stretch.candidates("neo_hookean")

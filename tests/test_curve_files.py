@@ -1,4 +1,4 @@
-"""Files of stress and stretch: headings, components, several samples, columns that hold something else."""
+"""Files of stress and stretch: headings, components, several samples, columns with another quantity."""
 
 import json
 import re
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.quick_to_compile
 
 
 def test_a_measured_stretch_of_sheared_samples_is_one_curve(tmp_path):
-    """1, 1.0 and 1.0004 were three curves."""
+    """The stretches 1, 1.0 and 1.0004 were read as three curves."""
     shear = np.linspace(0, 0.5, 12)
     rows = [f"simple_shear,{('1', '1.0', '1.0004')[k % 3]},{x:.4f},{x:.5f}" for k, x in enumerate(shear)]
     rows += [f"simple_shear,0.9,{x:.4f},{x:.5f}" for x in shear]
@@ -32,7 +32,7 @@ def test_a_measured_stretch_of_sheared_samples_is_one_curve(tmp_path):
 
 @pytest.mark.parametrize("at", [0.995, 1.005, 0.9])
 def test_a_stretch_that_scatters_about_a_rounded_one_is_one_sample(tmp_path, at):
-    """0.995 +- 0.0005 was two curves of six rows each."""
+    """A stretch of 0.995 +- 0.0005 was read as two curves of six rows each."""
     shear = np.linspace(0, 0.5, 12)
     own = at + 5e-4 * np.random.default_rng(1).uniform(-1, 1, 12)
     rows = [f"simple_shear,{s:.5f},{x:.4f},{x:.5f}" for s, x in zip(own, shear, strict=True)]
@@ -42,7 +42,7 @@ def test_a_stretch_that_scatters_about_a_rounded_one_is_one_sample(tmp_path, at)
 
 
 def test_a_component_of_single_precision_roundoff_is_no_curve(tmp_path):
-    """P22 of 1e-7 of the stress was scaled by its own size and ruined the fit."""
+    """A component P22 of 1e-7 of the stress was scaled by its own size and spoiled the fit."""
     rows = ["F11,F12,F13,F21,F22,F23,F31,F32,F33,P11_Pa,P22_Pa,P33_Pa"]
     r = np.random.default_rng(0).normal(size=(12, 2))
     for k, a in enumerate(np.linspace(1.03, 1.4, 12)):
@@ -54,7 +54,7 @@ def test_a_component_of_single_precision_roundoff_is_no_curve(tmp_path):
 
 
 def test_one_wrong_stretch_is_not_taken_for_several_samples(tmp_path):
-    """A mistyped stretch in a rising curve counted as a return in a third of such files."""
+    """A mistyped stretch in a rising curve was taken for a reversal in a third of such files."""
     stretch = np.linspace(1.02, 1.5, 20)
     for k, wrong in ((6, 1.45), (12, 1.04), (10, 1.02)):
         moved = stretch.copy()
@@ -65,7 +65,7 @@ def test_one_wrong_stretch_is_not_taken_for_several_samples(tmp_path):
 
 
 def test_several_ratios_of_the_stretches_are_no_return(tmp_path):
-    """Biaxial tests with three ratios in one file were told to keep one of them."""
+    """For biaxial tests with three ratios in one file, the message advised keeping only one of them."""
 
     def notes_of(ratios) -> list[str]:
         lines = ["F11,F22,F33,P11_Pa,P22_Pa"]
@@ -121,7 +121,9 @@ MEANINGS = {
 
 @pytest.mark.parametrize("meaning", MEANINGS)
 def test_columns_that_hold_something_else_are_named(meaning, tmp_path, capsys):
-    """A neo-Hookean sample of 1 kPa with 1 % of noise: the law followed 40 % off, without a word."""
+    """The sample is neo-Hookean with 1 kPa and 1 % of noise. The law fitted wrong columns with 40 % misfit, without a
+    message.
+    """
     change, words = MEANINGS[meaning]
     stretch = np.linspace(1.0, 1.6, 25)
     noise = np.random.default_rng(7).standard_normal(25)
@@ -172,7 +174,7 @@ def test_remarks_after_the_numbers_and_a_second_heading_are_no_matter(tmp_path):
 
 
 def test_components_of_one_test_are_of_one_sample(tmp_path):
-    """They have no factors of their own."""
+    """Components of one test have no individual factors."""
     a, b = np.linspace(1.02, 1.4, 9), np.linspace(1.01, 1.2, 9)
     F = np.stack([np.diag(each) for each in np.stack([a, b, 1 / (a * b)], axis=1)])
     head = ",".join([*(f"F{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "P11_Pa", "P22_Pa"])
@@ -276,7 +278,9 @@ def test_components_without_a_column_of_shear(tmp_path):
     [("nominal_stress_sd_kPa", False), ("stress sd [kPa]", False), ("SD", False), ("sample", True), ("side_mm", True)],
 )
 def test_deviations_are_named_as_not_used(heading, used, tmp_path):
-    """The fit finds the noise from the residuals; a file with deviations gave the same numbers, without a word."""
+    """The fit estimates the noise from the residuals. A file with deviations gave the same results, without a
+    message.
+    """
     rows = "".join(f"uniaxial,{l:g},{l - l**-2:g},0.02\n" for l in np.linspace(1.05, 1.5, 10))
     (tmp_path / "c.csv").write_text(f"test,stretch,nominal_stress_kPa,{heading}\n{rows}")
     found, notes = curves.read_curves([tmp_path / "c.csv"])

@@ -1,4 +1,6 @@
-"""Laws from stress-stretch curves: known parameters come back, SciPy finds nothing better, bad files are refused."""
+"""Laws from stress-stretch curves: known parameters are recovered, SciPy finds no better fit, bad files give
+messages.
+"""
 
 import json
 import warnings
@@ -23,7 +25,7 @@ DATA = Path(__file__).parent.parent / "data"
 
 
 def synthetic(law: lj.Law, noise: float = 0.0, seed: int = 0) -> list[curves.Curve]:
-    """Curves of a known law in three tests, with Gaussian noise relative to the curve."""
+    """Return curves of a known law in three tests, with Gaussian noise relative to the curve."""
     rng, made = np.random.default_rng(seed), []
     for test, driven in (
         ("uniaxial", np.linspace(0.75, 1.4, 27)),
@@ -51,7 +53,7 @@ KNOWN = {
 }
 
 
-#: Laws of stretches compile for long, and differ in scalars only.
+#: Laws of stretches take long to compile, and differ only in scalars.
 LONG = ("logarithmic", "bogen", "veronda_westmann", "exponential")
 
 
@@ -97,7 +99,7 @@ def test_a_law_of_ones_own_is_fitted_from_its_file(tmp_path, capsys):
     found = stress_stretch.fit(candidate, synthetic(exact))
     assert (found.label, found.names, found.units) == ("Gent", ("mu", "limit"), ("Pa", "1"))
     assert np.allclose(found.values, [500.0, 3.0], rtol=1e-5)
-    assert np.isclose(found.shear_modulus, 500.0, rtol=1e-5)  # not stated: from the tangent at rest
+    assert np.isclose(found.shear_modulus, 500.0, rtol=1e-5)  # not stated by the law: computed from the tangent at rest
     assert main(["curves", f"{file}:Blatz", str(DATA / "rubber_curves.csv")]) == 2
     assert "is not an isochoric energy plus U(J)" in capsys.readouterr().err
     assert main(["curves", f"{file}:Gnt", str(DATA / "rubber_curves.csv")]) == 2
@@ -123,7 +125,7 @@ def test_laws_that_add_up_are_fitted_together(tmp_path, capsys):
     found = stress_stretch.fit(candidate, synthetic(truth))
     assert np.allclose(found.values, [400.0, 200.0, 3.0], rtol=1e-5)
     assert not found.limits and np.isclose(found.shear_modulus, 600.0, rtol=1e-5)
-    for name, sentence in (("nothing", "none of its parameters has a value"), ("continued", "law of Continued is not")):
+    for name, sentence in (("nothing", "has a value other than 0"), ("continued", "law of Continued is not")):
         assert main(["curves", f"{file}:{name}", str(DATA / "rubber_curves.csv")]) == 2
         error = capsys.readouterr().err
         assert sentence in error and error.count("\n") == 1
@@ -140,7 +142,7 @@ def test_coefficients_that_are_given_are_fitted_and_the_others_named(tmp_path):
     found = stress_stretch.fit(candidate, synthetic(truth))
     assert np.allclose(found.values, [250.0, 90.0, 30.0, 60.0], rtol=1e-4)
     (shipped,) = stress_stretch.candidates("mooney_rivlin")
-    assert "mooney_rivlin: fitted are c10, c01; c20" in shipped.notes[0]
+    assert "mooney_rivlin: the fitted parameters are c10, c01; c20" in shipped.notes[0]
     assert not stress_stretch.candidates("yeoh")[0].notes
 
 
@@ -154,7 +156,7 @@ def test_a_law_at_its_limit_says_so_without_warnings_of_numpy():
         found = stress_stretch.fit(candidate, [softening])
     assert found.limits == {"chain_length": "infinity"} and np.isfinite(found.standard_errors[0])
     told = " ".join(found.warnings)
-    assert "runs into its limit (chain_length to infinity): the limit fits best" in told
+    assert "runs into its limit (chain_length to infinity). The limit fits best" in told
     assert "leave chain_length free" not in told
     assert "chain_length → infinity" in curves_report.table([found])
 
@@ -165,7 +167,9 @@ def test_a_curve_that_no_law_follows_is_named():
     foreign = shear._replace(stress=3 * shear.stress, label="another unit")
     found = stress_stretch.fit(candidate, [tension, tension._replace(label="again"), foreign])
     (sentence,) = stress_stretch.unfollowed([tension, tension._replace(label="again"), foreign], [found])
-    assert sentence.startswith("another unit: no law follows this curve, the nearest (neo_hookean) misses it by")
+    assert sentence.startswith(
+        "another unit: no law follows this curve. The nearest law (neo_hookean) misses the curve by"
+    )
 
 
 def test_lines_of_the_picture_are_fine_and_compiled_once_a_law():
@@ -174,7 +178,7 @@ def test_lines_of_the_picture_are_fine_and_compiled_once_a_law():
         dense = curves_report.fine(curve)
         exact = homogeneous.deformation_gradient(curve.test, dense.driven)
         assert len(dense.driven) == 200 and np.ptp(dense.driven) == np.ptp(curve.driven)
-        # Roundoff of logarithm and exponential; a chord between two points would be off by 1e-4.
+        # The bound is rounding of logarithm and exponential. A chord between two points would have an error of 1e-4.
         assert np.allclose(dense.F, exact, atol=1e-14)
     fits = [stress_stretch.fit(stress_stretch.candidates(n)[0], curves_of, starts=2) for n in ("yeoh", "neo_hookean")]
     before = len(COMPILED)
@@ -185,7 +189,7 @@ def test_lines_of_the_picture_are_fine_and_compiled_once_a_law():
 
 
 def _stress_of_rubber(test: str, l: np.ndarray, mu: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Ogden's law in the three tests, from the textbook."""
+    """Return the stress of Ogden's law in the three tests, by the textbook formula."""
     l = l[:, None]
     free = {"uniaxial": -alpha / 2 - 1, "equibiaxial": -2 * alpha - 1, "pure_shear": -alpha - 1}[test]
     return (l ** (alpha - 1) - l**free) @ mu
@@ -209,7 +213,7 @@ def test_rubber_no_worse_than_scipy_from_100_starts():
     (candidate,) = stress_stretch.candidates("ogden", terms=3)
     ours = stress_stretch.fit(candidate, found)
     assert ours.cost <= best * (1 + 1e-6)
-    assert ours.mean_relative_error < 0.03  # Ogden 1972 with three terms follows these data
+    assert ours.mean_relative_error < 0.03  # Ogden's law of 1972 with three terms fits these data
 
 
 def test_eight_chains_no_worse_than_scipy_from_100_starts():
@@ -235,7 +239,7 @@ def test_eight_chains_no_worse_than_scipy_from_100_starts():
 
 
 def test_a_law_that_cannot_follow_is_held_stable():
-    # Softening data: free coefficients of Yeoh's law alone would let the stress fall.
+    # The data soften. If Yeoh's coefficients were fitted freely, the stress would decrease.
     l = np.linspace(1.0, 1.6, 13)
     P = 2000 * (l - 1) - 2400 * (l - 1) ** 2
     curve = curves.Curve("soft", "uniaxial", np.asarray(homogeneous.deformation_gradient("uniaxial", l)), (0, 0), P)
@@ -247,7 +251,9 @@ def test_a_law_that_cannot_follow_is_held_stable():
 
 
 def test_a_law_that_misses_the_curve_is_not_taken_for_wrong_columns(tmp_path, capsys):
-    """A stiffening sample by a law that does not stiffen: no meaning of the columns makes it follow."""
+    """A stiffening sample is fitted with a law that does not stiffen. No other meaning of the columns improves
+    the fit.
+    """
     stretch = np.linspace(1.0, 2.0, 40)
     law = lj.laws.Yeoh(c1=500.0, c2=-80.0, c3=60.0, bulk=1.0)
     P = np.asarray(homogeneous.response(law, "uniaxial", stretch))
@@ -256,7 +262,7 @@ def test_a_law_that_misses_the_curve_is_not_taken_for_wrong_columns(tmp_path, ca
     (tmp_path / "c.csv").write_text("test,stretch,nominal_stress_Pa\n" + rows)
     main(["curves", "neo_hookean", str(tmp_path / "c.csv"), "--out", str(tmp_path)])
     said = capsys.readouterr().err
-    assert "the law misses something: try other laws" in said and "would follow" not in said
+    assert "the law is inadequate: try other laws" in said and "would follow" not in said
 
 
 @pytest.mark.draws
@@ -288,7 +294,7 @@ def test_measured_data_of_other_folders(tmp_path):
     files = [folder / f"Budday_2017__{n}.csv" for n in ("UT_T_cortex", "CSS_corona_radiata_lambda_0d75")]
     found, notes = curves.read_curves([*files, folder / "Treloar_1944__ET.csv"], unit="kPa")
     assert [c.test for c in found] == ["uniaxial", "simple_shear", "equibiaxial"]
-    assert len(notes) == 3 and "names no unit, read as kPa" in notes[0]
+    assert len(notes) == 3 and "names no unit; kPa is assumed" in notes[0]
     assert np.isclose(found[1].F[0, 0, 0], 0.75)
 
 

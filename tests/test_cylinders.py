@@ -1,4 +1,4 @@
-"""Graded cylinders and their sectors: places of rings and layers, areas, conformity, quality."""
+"""Graded cylinders and their sectors: positions of rings and layers, areas, conformity, quality."""
 
 from collections import Counter
 
@@ -31,10 +31,10 @@ def test_graded_cylinders_conform_and_have_the_circles_area(aspect, ring, rim):
     mesh = _whole(aspect, ring, rim)
     lj.check_mesh(mesh)
     outer = np.array(_surface(mesh))
-    # Euler's formula of a ball's boundary: triangles = 2 * (boundary nodes) - 4.
+    # Euler's formula for the boundary of a ball: triangles = 2 * (boundary nodes) - 4.
     assert len(outer) == 2 * len(np.unique(outer)) - 4
     assert np.isclose(mesh.volumes.sum(), np.pi * aspect, rtol=1e-12)
-    # The ring's polygon has the area of the circle of that radius: its triangles on the top are as large.
+    # The polygon of the ring has the area of the circle of that radius, so its triangles on the top have this area too.
     points, top = np.asarray(mesh.points), mesh.node_sets["top"]
     assert np.allclose(points[top, 2], aspect) and np.allclose(points[mesh.node_sets["bottom"], 2], 0)
     distance = np.hypot(*points[top, :2].T)
@@ -48,11 +48,12 @@ def test_graded_cylinders_conform_and_have_the_circles_area(aspect, ring, rim):
 
 @pytest.mark.parametrize("aspect", [0.2, 1.0, 5.0])
 def test_elements_keep_their_shape(aspect):
-    """Quality of an edge of the widest ring across two thin ones falls with the square of their ratio."""
+    """Where the widest ring meets two thin ones, the quality falls with the square of their ratio."""
     for rim in (0.33, 0.05):
         mesh = _whole(aspect, 0.4, rim)
         quality = qualities(np.asarray(mesh.points), np.asarray(mesh.tetrahedra), np.asarray(mesh.volumes))
-        # Volume h h L / 6 and three edges of six of length L: 4 (h / L)^2; of regular prisms' thirds about 0.6.
+        # Volume h h L / 6, and three of six edges of length L give 4 (h / L)^2. A third of a regular prism has about
+        # 0.6.
         assert quality.min() > min(0.5, 4 * (rim / 0.33) ** 2) and np.median(quality) > 0.3
 
 
@@ -65,7 +66,7 @@ def test_places_are_where_they_were_asked_for():
             near = np.diff(x)[
                 [k for k in (np.argmin(abs(x - place)) - 1, np.argmin(abs(x - place))) if 0 <= k < len(x) - 1]
             ]
-            # A cell's size varies within it: by at most exp(GROWTH).
+            # Within a cell the wanted size varies by at most exp(GROWTH).
             assert np.all(near < size * np.exp(cylinders.GROWTH) * 1.01)
 
 
@@ -90,7 +91,9 @@ def test_a_sector_is_its_part_of_the_whole(corners, slices):
 
 
 def test_default_numbers_are_those_of_always():
-    """No option, no change: sums over positions and elements as they were before there were options."""
+    """Options do not change the default mesh. These sums over positions and elements are from before there were
+    options.
+    """
     mesh = cylinder(0.01, 0.004, 0.0025)
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     assert points.shape == (183, 3) and tets.shape == (576, 4)
@@ -132,7 +135,7 @@ def test_scene_files_make_the_same_cylinders(tmp_path):
         (lambda: cylinder(1.0, 1.0, 0.3, rings=(1.2,)), "rings"),
         (lambda: cylinder(1.0, 1.0, 0.3, rim_cell=-0.1), "rim_cell"),
         (lambda: cylinders.graded_cylinder([0.0, 0.5, 0.4], [0.0, 1.0]), "radii"),
-        (lambda: cylinders.graded_cylinder([0.1, 0.5], [0.0, 1.0]), "begin with the axis"),
+        (lambda: cylinders.graded_cylinder([0.1, 0.5], [0.0, 1.0]), "begin with 0, the axis"),
         (lambda: cylinders.graded_cylinder([0.0, 0.5], [1.0]), "heights"),
         (lambda: cylinders.sector([0.0, 1.0], [0.0, 1.0], 8, 4), "slices = 4"),
     ],

@@ -1,4 +1,4 @@
-"""Tests described by a TOML file: against simulated samples, other integrals, cycles; refusals; the commands."""
+"""Tests described by a TOML file: simulated samples, other integrals, cycles; invalid input; the commands."""
 
 import json
 
@@ -39,7 +39,7 @@ SLOW = pytest.mark.slow
 @SLOW
 @pytest.mark.parametrize("test", ["tension", "compression", "glued_punch"])
 def test_a_simulated_sample_gives_its_numbers_back(tmp_path, test, verified):
-    """The sample is simulated in time on another mesh; held after a ramp."""
+    """The sample is simulated over time on another mesh, with a ramp and a constant displacement."""
     r, h, punch, dt = 0.01, 0.008, 0.004, 0.25
     time = dt * np.arange(1, 81)
     d = 2e-5 * np.minimum(time / 1.0, 1.0)
@@ -62,7 +62,7 @@ def test_a_simulated_sample_gives_its_numbers_back(tmp_path, test, verified):
 
 @pytest.mark.parametrize("shape", ["sphere", "cone", "punch"])
 def test_an_indenter_pressed_at_constant_speed(tmp_path, shape):
-    """The force is the integral of G(t - s) df/ds, here by quadrature."""
+    """The force is the integral of G(t - s) df/ds, here computed by quadrature."""
     sizes = {"half_angle": 70.0} if shape == "cone" else {"radius": 2e-3}
     rig = thin_layer.Indenter(shape=shape, thickness=8e-3, poisson=0.5, **sizes)
     layer, speed = thin_layer.Layer(rig), 1e-5
@@ -88,7 +88,7 @@ def test_an_indenter_pressed_at_constant_speed(tmp_path, shape):
 
 
 def test_an_indenter_under_a_held_force_creeps(tmp_path):
-    """The strain f(d)/S of creep is the force over S times the compliance: here of one mode, in closed form."""
+    """In creep, the strain f(d)/S is the force over S times the compliance. Here it has one mode, in closed form."""
     layer = thin_layer.Layer(thin_layer.Indenter(shape="sphere", thickness=8e-3, poisson=0.5, radius=2e-3))
     depths = np.linspace(0, 1e-3, 4001)
     table, time, held = 3 * layer.force(depths), np.geomspace(0.1, 60, 40), 1e-3
@@ -104,7 +104,9 @@ def test_an_indenter_under_a_held_force_creeps(tmp_path):
 
 @pytest.mark.slow
 def test_a_glued_sample_s_stiffness_is_that_of_another_program(tmp_path):
-    """Tension of R = H = 10 mm, mu 800, K 16000, by 1 um: 1.07390e-4 N (axisymmetric, 64 x 64 graded, DOLFINx)."""
+    """Tension of a sample with R = H = 10 mm, mu 800, K 16000, by 1 um: 1.07390e-4 N (axisymmetric, 64 x 64 graded,
+    DOLFINx).
+    """
     time, poisson = np.arange(1.0, 7.0), (3 * 20 - 2) / (2 * (3 * 20 + 1))
     table = {"test": "tension", "radius": 0.01, "height": 0.01, "poisson": poisson}
     test = read_described(written(tmp_path, table, (time, 0 * time + 1e-6, 0 * time + 1.07390e-4)))
@@ -113,7 +115,7 @@ def test_a_glued_sample_s_stiffness_is_that_of_another_program(tmp_path):
 
 @pytest.mark.parametrize("drive", ["displacement", "force"])
 def test_a_load_that_was_there_at_once(tmp_path, drive):
-    """Without a row at 0 s a held load is taken as a ramp, with a note; ramp = 0 takes it as a step."""
+    """Without a row at 0 s, a constant load is read as a ramp, with a note. With ramp = 0 it is read as a step."""
     layer = thin_layer.Layer(thin_layer.Indenter(shape="sphere", thickness=8e-3, poisson=0.5, radius=2e-3))
     time, force = np.geomspace(0.1, 60, 40), 3 * 800 * float(layer.force(np.array([5e-4]))[0])
     held = (time, 0 * time + 5e-4, force * (0.4 + 0.6 * np.exp(-time / 2)))
@@ -133,11 +135,11 @@ def test_a_load_that_was_there_at_once(tmp_path, drive):
 
 @pytest.mark.parametrize(("shape", "back"), [("sphere", True), ("cone", True), ("punch", False)])
 def test_rows_of_a_contact_that_shrinks_are_left_out(tmp_path, shape, back):
-    """Fitted with the formula of a contact that grows, a sphere taken back made G0 350 times too large."""
+    """When the formula of a growing contact was used for a retracted sphere, G0 was 350 times too large."""
     sizes = {"thickness": 0.02} | ({"half_angle": 60.0} if shape == "cone" else {"radius": 0.005})
     time = np.arange(1, 61) / 10
     d = 1e-3 * np.minimum(time, 1.0) + 2e-6 * np.random.default_rng(0).normal(size=60)
-    d[30] += 5e-5  # one reading is no return
+    d[30] += 5e-5  # one reading is not a reversal
     d[45:] -= 1.5e-5 * np.arange(15)
     file = written(tmp_path, {"test": shape} | sizes, (time, d, np.maximum(d, 0) * 100 * (1 + np.exp(-time))))
     test = read_described(file)
@@ -147,14 +149,16 @@ def test_rows_of_a_contact_that_shrinks_are_left_out(tmp_path, shape, back):
         backwards = written(tmp_path, {"test": shape} | sizes, (time, np.r_[1e-3, 1e-3 - 1e-5 * np.arange(59)], d))
         with pytest.raises(lj.InputError, match="goes back from"):
             read_described(backwards)
-        # 2 % of the depth is not a return yet.
+        # 2 % of the depth is not yet a reversal.
         assert said[0].startswith("13 rows from 4.8 s on are left out")
         assert test.time[-1] == pytest.approx(4.7)
 
 
 @SLOW
 def test_a_compression_by_a_fifth_is_computed(tmp_path):
-    """The finest cells of the plates' rims turn inside out at 15 % of this disc: coarser ones go on."""
+    """At a compression of 15 %, the finest cells at the rims of this disc invert. The computation continues with
+    coarser ones.
+    """
     time = np.arange(1, 31) / 10
     d = 0.2 * 0.008 * np.minimum(time, 1.0)
     secants = []
@@ -173,7 +177,7 @@ def test_the_elastic_curve_before_contact_is_straight():
 
 
 def test_cycles_between_plates_give_the_numbers_back(tmp_path):
-    """Cyclic compression of a cylinder between slippery plates: G = E / 3, answers pass through 0."""
+    """A cylinder between slippery plates is compressed cyclically: G = E / 3, and the response passes through 0."""
     time = np.arange(0.05, 40, 0.05)
     r, h, fine = 0.01, 0.01, np.arange(0, 40.001, 0.005)
     d = 1e-4 * np.sin(np.pi * fine / 8) ** 2
@@ -186,7 +190,7 @@ def test_cycles_between_plates_give_the_numbers_back(tmp_path):
     assert test.cyclic
     found = fits.fit(test, 2)
     assert float(found.model.shear_modulus) == pytest.approx(800, rel=0.02)
-    # The longest time is told by what the cycles sink to: with its error.
+    # The slow decay of the cycles determines the longest time, with its error.
     errors = found.uncertainty.standard_errors
     exact = np.array([800, *TRUTH.ratios, *TRUTH.relaxation_times])
     assert np.all(np.abs(found.uncertainty.values - exact) < 4 * errors)
@@ -226,9 +230,12 @@ def test_the_commands_take_a_description(tmp_path):
         ({"test": "sphere"}, "sphere has no key 'height'"),
         ({"height": None}, "tension needs height: give it in metres"),
         ({"radius": "wide"}, "radius = 'wide' is not a number"),
-        ({"radius": 10.0}, "radius = 10 cannot be that of a sample"),
-        ({"radius": 0.001, "height": 0.02}, "height = 0.02 m is 20 radii, and glued samples are computed up to 10"),
-        ({"radius": 0.001, "height": 0.02, "poisson": 0.4}, r"the tensile stress over 2.8 \(2 times 1 \+ poisson\)"),
+        ({"radius": 10.0}, "radius = 10 cannot be the size of a sample"),
+        (
+            {"radius": 0.001, "height": 0.02},
+            "height = 0.02 m is 20 radii, but glued samples are computed only up to 10",
+        ),
+        ({"radius": 0.001, "height": 0.02, "poisson": 0.4}, r"tensile stress / 2.8, that is 2 times 1 \+ poisson"),
         ({"radus": 0.01}, "did you mean radius"),
         ({"poisson": 0.5}, "must be from 0 to 0.4995"),
         ({"drive": "torque"}, "use displacement or force"),
@@ -255,7 +262,7 @@ def test_descriptions_that_cannot_be_used_get_one_sentence(tmp_path, change, wor
 
 def test_a_file_that_is_no_toml_gets_one_sentence(tmp_path):
     (tmp_path / "bad.toml").write_text("test = tension\n")
-    with pytest.raises(lj.InputError, match="is no TOML"):
+    with pytest.raises(lj.InputError, match="is not valid TOML"):
         read_described(tmp_path / "bad.toml")
     with pytest.raises(lj.InputError, match="cannot be read"):
         read_described(tmp_path / "none.toml")

@@ -1,4 +1,4 @@
-"""Tables of parameters for sweeps: ranges, kinds, files that are not written over."""
+"""Tables of parameters for sweeps: ranges, kinds, and files that are not overwritten."""
 
 import numpy as np
 import pytest
@@ -37,8 +37,8 @@ def test_a_table_is_not_written_over_other_files(tmp_path, capsys):
     scene = '[mesh]\nshape = "box"\n'
     (tmp_path / "scene.toml").write_text(scene)
     assert main(["design", str(tmp_path / "scene.toml"), "law.mu=500:600"]) == 2
-    assert "is no table of design" in capsys.readouterr().err and (tmp_path / "scene.toml").read_text() == scene
-    (tmp_path / "d.csv").touch()  # an empty file is no other table
+    assert "is not a table of design" in capsys.readouterr().err and (tmp_path / "scene.toml").read_text() == scene
+    (tmp_path / "d.csv").touch()  # an empty file is not another table
     for rows in ("2", "4"):
         assert main(["design", str(tmp_path / "d.csv"), "law.mu=500:600", "--rows", rows]) == 0
         assert len(sweep.read_table(tmp_path / "d.csv")[1]) == int(rows)

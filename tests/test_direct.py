@@ -1,4 +1,6 @@
-"""Factorisation on the host, numbers that change without a new program, and tangents that go from step to step."""
+"""Factorisation on the host, parameters that change without compilation, and tangents that are reused in later
+steps.
+"""
 
 import h5py
 import jax
@@ -42,7 +44,7 @@ POROUS = lj.Scene(
 
 
 def directly(scene: lj.Scene) -> lj.Scene:
-    """The scene with a factorisation."""
+    """Return the scene with a factorisation as solver."""
     return replace(scene, solve=replace(scene.solve, linear_solver="direct"))
 
 
@@ -55,7 +57,7 @@ def test_a_factorisation_finds_the_same():
 
 @pytest.mark.slow
 def test_programs_of_several_runs_have_the_solver_that_one_of_them_needs():
-    """Inside a program numbers are not known: batches failed where a single run was solved."""
+    """Inside a compiled program the parameter values are unknown. Batches failed where a single run was solved."""
     pulled = replace(PULLED, law=replace(LAW, bulk=7.7e6), solve=lj.Solve())
     alone = lj.simulate(pulled).check()
     batch = lj.simulate_batch(pulled, {"law.bulk": [7.7e4, 7.7e6]}).result
@@ -107,7 +109,7 @@ def test_auto_decides_by_size_and_stiffness():
     assert abs(automatic.thinnest(np.eye(4)[:, 1:], np.array([[0, 1, 2, 3]]), np.array([1 / 6])) - 0.77) < 0.01
     seen = []
     jax.eval_shape(lambda s: seen.append(automatic.linear_solver(s)), stiff)
-    assert seen == ["cg"]  # traced numbers are not known
+    assert seen == ["cg"]  # values of traced parameters are unknown
 
     @lj.struct
     class Bare(lj.Law):
@@ -117,14 +119,14 @@ def test_auto_decides_by_size_and_stiffness():
         def strain_energy(self, I):
             return self.mu / 2 * (I.I1 - 3 - 2 * jnp.log(I.J)) + self.mu * (I.J - 1) ** 2
 
-    # A law need not state its moduli.
+    # A law may leave out its moduli.
     assert automatic.linear_solver(replace(static, law=Bare(mu=770.0))) == "cg"
     lj.simulate(replace(PULLED, law=Bare(mu=770.0))).check()
 
 
 @pytest.mark.slow
 def test_a_matrix_without_an_inverse_is_told():
-    loose = lj.Scene(mesh=MESH, law=LAW, body=BODY, solve=lj.Solve())  # nothing holds it
+    loose = lj.Scene(mesh=MESH, law=LAW, body=BODY, solve=lj.Solve())  # the body is not supported
     e = equations(loose, initial_state(loose), 1.0)
     A = jax.jit(lambda: tangent.stiffness(e, None, MESH.points))()
     A = A._replace(rows=jax.tree.map(jnp.zeros_like, A.rows), diagonal=jax.tree.map(jnp.zeros_like, A.diagonal))
@@ -136,7 +138,7 @@ def test_a_matrix_without_an_inverse_is_told():
 
 def test_loads_that_follow_are_refused():
     load = lj.Traction(triangles=jnp.asarray(boundary.boundary_triangles(MESH, MESH.node_sets["z_max"])), pressure=4.0)
-    with pytest.raises(lj.InputError, match=r"linear_solver = 'direct' is for symmetric forces: use cg"):
+    with pytest.raises(lj.InputError, match=r"'direct' cannot be used with a follower pressure: use cg"):
         lj.simulate(directly(lj.Scene(mesh=MESH, law=LAW, fixed=HELD, traction=(load,))))
 
 
@@ -158,7 +160,7 @@ def test_a_number_that_changes_costs_no_compilation():
 
 
 def test_a_tangent_goes_from_step_to_step():
-    """Later steps ask for no new tangent where the old one still converges fast."""
+    """Later steps use the old tangent as long as it converges fast."""
     made = []
     original = tangent.stiffness
 

@@ -1,4 +1,4 @@
-"""Where a mesh is parted: few nodes between the parts, as few as there can be."""
+"""Division of a mesh: the parts are separated by as few nodes as possible."""
 
 import itertools
 from pathlib import Path
@@ -24,14 +24,14 @@ def mesh(cells: tuple[int, int, int], shaken: float = 0.0) -> tuple[np.ndarray, 
 
 
 def test_layers_are_parted_between_them():
-    """Fifteen layers have a middle one: a cut through it has more nodes than the 36 beside it."""
+    """Fifteen layers have a middle layer. A cut through it has more nodes than the 36 of the plane beside it."""
     elements, points = mesh((5, 5, 15))
     assert len(dissection.dissected(elements, points)[-1][0]) == 36
 
 
 @pytest.mark.parametrize("shaken", [0.0, 0.3])
 def test_no_element_has_nodes_of_two_parts(shaken):
-    """Without the last group the body falls apart, and each node is in one group."""
+    """Without the last group of nodes the body is disconnected. Each node is in one group."""
     elements, points = mesh((5, 6, 9), shaken)
     groups = dissection.dissected(elements, points)
     assert sorted(np.concatenate([nodes for nodes, _ in groups])) == list(range(len(points)))
@@ -50,7 +50,7 @@ def test_no_element_has_nodes_of_two_parts(shaken):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_no_other_cut_has_fewer_nodes(seed):
-    """Against all ways of giving ten elements to two sides; some nodes are taken already."""
+    """Compare with all ways to divide ten elements between two sides, where some nodes are assigned already."""
     rng = np.random.default_rng(seed)
     elements, points = mesh((2, 2, 3), 0.2)
     elements = elements[:, np.argsort(points[elements].mean(axis=0)[:, 2])]
@@ -74,7 +74,7 @@ def test_no_other_cut_has_fewer_nodes(seed):
 
 
 def test_smallest_cuts_save_a_quarter_where_there_are_no_layers(monkeypatch):
-    """Of the work of eliminating the liver phantom."""
+    """The saving is a quarter of the work to eliminate the liver phantom."""
     body = lj.quadratic(read_mesh(DATA / "liver_phantom.vtu"))
     elements, points = np.stack(body.element_nodes), np.asarray(body.points)
     pairs = tuple(a.ravel() for a in np.broadcast_arrays(elements[:, None], elements[None]))

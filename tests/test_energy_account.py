@@ -1,6 +1,6 @@
 """A body that falls on a plane, step by step: kinetic, elastic and contact energy, height, and the scheme's loss.
 
-The account is made in NumPy from positions, masses and the law's energy: the run itself keeps none.
+The energies are computed in NumPy from positions, masses and the law's energy, independently of the run.
 """
 
 import itertools
@@ -16,14 +16,16 @@ pytestmark = pytest.mark.quick_to_compile
 
 SIDE, DENSITY, GRAVITY, SOFT, FALL = 0.1, 1000.0, 9.81, 1e6, 5e-3
 LAW = lj.laws.NeoHookean(mu=1e5, bulk=3e5)
-#: Seconds of a run: it falls, is pressed together, and leaves the plane.
+#: Duration of a run [s]: the cube falls, is compressed, and leaves the plane.
 SECONDS = 0.09
-#: Time steps [s] that the order is seen at: a step in which an edge touches or leaves is off by more than others.
+#: Time steps [s] from which the order is computed. A step in which an edge touches or leaves has a larger error.
 STEPS = (1e-3, 2.5e-4)
 
 
 def falling(integrator: str, dt: float) -> lj.Scene:
-    """A cube as stiff as what it falls on, 5 mm above a plane that is inclined a little: edges touch one by one."""
+    """A cube as stiff as the contact, 5 mm above a slightly inclined plane, so that its edges touch one after the
+    other.
+    """
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (1, 1, 1))
     normal = np.array([0.05, 0.02, 1.0])
     normal = normal / np.linalg.norm(normal)
@@ -40,7 +42,7 @@ def falling(integrator: str, dt: float) -> lj.Scene:
 
 
 def velocities(x: np.ndarray, dt: float, integrator: str, weight: np.ndarray) -> np.ndarray:
-    """(T + 1, V, 3) from positions (T + 1, V, 3) of a body that begins at rest, falling freely."""
+    """Return velocities (T + 1, V, 3) from positions (T + 1, V, 3) of a body that begins at rest in free fall."""
     v, a = [np.zeros_like(x[0])], weight
     for before, after in itertools.pairwise(x):
         if integrator == "euler":
@@ -53,7 +55,10 @@ def velocities(x: np.ndarray, dt: float, integrator: str, weight: np.ndarray) ->
 
 
 def account(scene: lj.Scene, stiffer: float = 1.0) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """What each step leaves unbalanced [J], and the energies (T + 1,) [J]; `stiffer` is the mistake to plant."""
+    """Return the energy imbalance of each step [J], and the energies (T + 1,) [J].
+
+    `stiffer` above 1 adds a mistake to the contact energy.
+    """
     result, plane = lj.simulate(scene).check(), scene.physics[0]
     rest, mass = np.asarray(scene.mesh.points), DENSITY * np.asarray(nodal_volumes(scene.mesh))
     x = np.concatenate([rest[None], np.asarray(result.positions)])
@@ -84,22 +89,22 @@ def account(scene: lj.Scene, stiffer: float = 1.0) -> tuple[np.ndarray, dict[str
 @pytest.mark.slow
 @pytest.mark.parametrize(("integrator", "order"), [("newmark", 2), ("euler", 1)])
 def test_every_step_of_a_fall_balances(integrator, order, verified):
-    """The sum of what the steps leave falls with the scheme's order, and is small beside the energy of the fall.
+    """The sum of the imbalances falls with the scheme's order, and is small relative to the energy of the fall.
 
-    Implicit Euler loses half of m |dv|^2 in a step, Newmark's average acceleration nothing. What is left comes from the
-    curvature of the potentials: a step takes their slope at its end, or the mean of both.
+    Implicit Euler loses half of m |dv|^2 in a step, Newmark's average acceleration nothing. The remaining imbalance
+    comes from the curvature of the potentials: a step uses their derivative at its end, or the mean of both ends.
     """
     fallen = DENSITY * SIDE**3 * GRAVITY * FALL
     sums = []
     for dt in STEPS:
         left, energies = account(falling(integrator, dt))
         sums.append(float(np.abs(left).sum()) / fallen)
-        # All of it takes part: the cube is pressed, and the plane holds its share.
+        # All parts matter: the cube is compressed, and the plane stores its share.
         assert energies["elastic"].max() > 0.02 * fallen and energies["contact"].max() > 0.2 * fallen
     observed = np.log(sums[0] / sums[1]) / np.log(STEPS[0] / STEPS[1])
     assert observed > order - 0.3
     assert sums[1] < {1: 0.1, 2: 1e-3}[order]
     verified(f"fall on a plane, energy of every step, {integrator}", "balance", sums[1], 1.0, observed)
-    # A contact a tenth too hard in the books does not balance at any step length.
+    # With a contact energy that is a tenth too large, no step length balances.
     wrong = [float(np.abs(account(falling(integrator, dt), 1.1)[0]).sum()) / fallen for dt in STEPS]
     assert wrong[1] > 3 * sums[1] if integrator == "newmark" else wrong[1] > sums[1]

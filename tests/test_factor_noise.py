@@ -1,4 +1,4 @@
-"""Factors that series have of their own: errors of linear fits that hold, and no alarm without factors."""
+"""Individual factors of series in linear fits: correct errors with factors, and no alarm without factors."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ COUNTS, TRUE = [20, 15, 17], np.array([3.0, 2.0, -1.0])
 
 
 def fitted_once(factor: float, noise: float, seed: int):
-    """Residuals, derivatives and found numbers of a parabola, by least squares."""
+    """Return derivatives, residuals and fitted coefficients of a parabola, by least squares."""
     rng = np.random.default_rng(seed)
     J = np.vander(X, 3, increasing=True)
     y = (J @ TRUE) * np.repeat(1 + factor * rng.standard_normal(3), COUNTS) + noise * rng.standard_normal(len(X))
@@ -21,7 +21,7 @@ def fitted_once(factor: float, noise: float, seed: int):
 
 @pytest.mark.parametrize("noise", [0.01, 0.03])
 def test_errors_contain_factors(noise):
-    """Errors of independent noise held 30 to 60 % of the 95 % intervals."""
+    """With errors of independent noise, only 30 to 60 % of the 95 % intervals contained the truth."""
     held, plain = [], []
     for seed in range(200):
         J, r, found = fitted_once(0.03, noise, seed)
@@ -31,13 +31,13 @@ def test_errors_contain_factors(noise):
         t = scipy.stats.t.ppf(0.975, len(r) - 3)
         held.append(np.abs(found - TRUE) < t * errors)
         plain.append(np.abs(found - TRUE) < t * alone)
-    # 200 draws: the binomial spread is 0.015 at 95 %.
+    # 200 draws: the binomial standard deviation is 0.015 at 95 %.
     assert np.all(np.mean(held, axis=0) > 0.91), np.mean(held, axis=0)
     assert np.mean(plain, axis=0).min() < 0.75
 
 
 def test_independent_noise_has_no_factors():
-    """A gain of 3 is reached by chance in 1 of 140 fits."""
+    """By chance, 1 of 140 fits gains a factor of 3."""
     seen = [
         factors_of_series(COUNTS, J, r, J @ f, np.eye(3)) for J, r, f in (fitted_once(0, 0.02, k) for k in range(200))
     ]
@@ -47,7 +47,9 @@ def test_independent_noise_has_no_factors():
 
 
 def of_two_tests(factor: float, noise: float, seed: int):
-    """A law with two numbers, measured by two different tests: the numbers can take up the tests' factors."""
+    """A law with two parameters, measured by two different tests. The parameters can absorb the factors of the
+    tests.
+    """
     rng = np.random.default_rng(seed)
     x = np.linspace(0.05, 0.5, 12)
     J = np.concatenate([np.stack([x, x - 0.5 * x**2], 1), np.stack([2 * x, x + 3 * x**2], 1)])
@@ -60,8 +62,9 @@ def of_two_tests(factor: float, noise: float, seed: int):
 
 @pytest.mark.parametrize("noise", [0.01, 0.03])
 def test_factors_that_the_numbers_take_up_are_in_the_errors_or_told(noise):
-    """Factors of 10 %: errors of independent noise hold 4 to 17 % of the 95 % intervals. Above 3 % of noise the
-    residuals show too little, and those fits that miss say so."""
+    """For factors of 10 %, errors of independent noise cover 4 to 17 % of the 95 % intervals. With noise above 3 % the
+    residuals show too little, and the fits that miss the truth give a warning.
+    """
     held, told = [], []
     for seed in range(200):
         J, r, found, off = of_two_tests(0.1, noise, seed)
@@ -77,7 +80,7 @@ def test_factors_that_the_numbers_take_up_are_in_the_errors_or_told(noise):
 
 
 def test_two_tests_without_factors_keep_their_errors_and_no_factor_is_claimed():
-    """Student's t of one degree of freedom is 12.7: with it, errors were 3 times too large in the mean."""
+    """Student's t for one degree of freedom is 12.7. When it was used, errors were 3 times too large on average."""
     growth, claimed = [], 0
     for seed in range(200):
         J, r, found, _ = of_two_tests(0.0, 0.02, seed)
@@ -89,7 +92,7 @@ def test_two_tests_without_factors_keep_their_errors_and_no_factor_is_claimed():
 
 
 def test_factors_that_never_show():
-    """Each test has a number of its own: its factor changes that number and no residual."""
+    """Each test has a separate parameter. The factor of the test changes this parameter and no residual."""
     x, none = np.linspace(0.1, 1.0, 10)[:, None], np.zeros((10, 1))
     J = np.block([[x, none], [none, x]])
     y = J @ np.array([2.0, 5.0]) + 0.01 * np.random.default_rng(0).standard_normal(20)
@@ -109,7 +112,9 @@ def test_too_few_series_or_points_say_nothing():
 
 @pytest.mark.parametrize("repeats", [2, 3])
 def test_exact_repeats_add_nothing(repeats):
-    """A line that stands twice in a file measures once: in half of the files, errors were 0.7 of that, by roundoff."""
+    """A line that appears twice in a file counts as one measurement. In half of the files, rounding reduced the errors
+    to 0.7 of this.
+    """
     for seed in range(6):
         rng = np.random.default_rng(seed)
         J = np.vander(np.linspace(0.0, 1.0, 20), 3, increasing=True)
@@ -118,6 +123,7 @@ def test_exact_repeats_add_nothing(repeats):
         errors = np.sqrt(r @ r / 17) * np.linalg.norm(once, axis=1)
         many, of_many = np.repeat(J, repeats, axis=0), np.repeat(r, repeats)
         found = factors_of_series([repeats] * 20, many, of_many, np.ones(20 * repeats), np.eye(3))
-        # Deviations are looked for at every fifth of their size; t of 19 degrees of freedom enlarges them by 7 %.
+        # Deviations are tested on a grid of a fifth of their size. Student's t of 19 degrees of freedom increases them
+        # by 7 %.
         assert found.shown
         assert np.all(np.abs(np.linalg.norm(found.root, axis=1) / errors - 1.07) < 0.1)

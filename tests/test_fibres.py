@@ -1,4 +1,4 @@
-"""Fibre laws: Costa, Guccione, directions of each element, and I4 of users' own laws."""
+"""Fibre laws: Costa, Guccione, one direction per element, and I4 in user-defined laws."""
 
 from typing import Any, ClassVar
 
@@ -17,7 +17,7 @@ COSTA = dict(c=200.0, b_ff=8.0, b_ss=4.0, b_nn=3.0, b_fs=5.0, b_fn=4.0, b_sn=2.0
 
 @lj.struct
 class Holzapfel(lj.Law):
-    """Neo-Hookean matrix and one family of fibres (Holzapfel, Gasser and Ogden 2000): only its energy is written."""
+    """Neo-Hookean matrix and one family of fibres (Holzapfel, Gasser and Ogden 2000), defined by its energy only."""
 
     mu: Any = lj.param("Pa", typical=500.0)
     k1: Any = lj.param("Pa", typical=100.0)
@@ -28,30 +28,30 @@ class Holzapfel(lj.Law):
     invariants: ClassVar = ("I1", "I4", "J")
 
     def strain_energy(self, I):
-        """mu/2 (Ibar1 - 3) + k1/(2 k2) (exp(k2 (I4 - 1)^2) - 1) + K/2 (J - 1)^2."""
+        """Return mu/2 (Ibar1 - 3) + k1/(2 k2) (exp(k2 (I4 - 1)^2) - 1) + K/2 (J - 1)^2."""
         fibres = self.k1 / (2 * self.k2) * jnp.expm1(self.k2 * (I.I4 - 1) ** 2)
         return self.mu / 2 * (I.J ** (-2 / 3) * I.I1 - 3) + fibres + self.bulk / 2 * (I.J - 1) ** 2
 
 
 @lj.struct
 class FungOfGreen(lj.Law):
-    """A user's exponential of Green's strain: no derivative by hand, no fibre, no bulk."""
+    """A user-defined exponential of Green's strain, without derivatives by hand, fibres or a bulk modulus."""
 
     c: Any = lj.param("Pa", typical=500.0)
 
     def green_energy(self, E):
-        """c (exp(2 E_xx^2 + E_yy^2 + E_xy E_xy + E_yz^2 + E_xx E_zz) - 1)."""
+        """Return c (exp(2 E_xx^2 + E_yy^2 + E_xy E_xy + E_yz^2 + E_xx E_zz) - 1)."""
         Q = 2 * E[0][0] ** 2 + E[1][1] ** 2 + E[0][1] ** 2 + E[1][2] ** 2 + E[0][0] * E[2][2]
         return self.c * jnp.expm1(Q)
 
 
 def directions(n: int) -> np.ndarray:
-    """One direction an element, not of unit length."""
+    """Return one direction per element; their lengths are not 1."""
     return np.random.default_rng(7).standard_normal((n, 3))
 
 
 def laws(n: int) -> dict:
-    """Laws with one direction, with one an element, and sums of them."""
+    """Return laws with one direction, laws with one direction per element, and sums of them."""
     a, b = directions(n), directions(n)[::-1].copy()
     return {
         "costa, one direction": lj.laws.create("costa", **COSTA, fibre=[1.0, 0.2, 0.0], sheet=[0.0, 1.0, 0.3]),
@@ -69,7 +69,7 @@ def laws(n: int) -> dict:
 )
 def test_force_and_stiffness_against_both_references(name, distorted_box):
     mesh, x = distorted_box
-    x = 0.5 * (x + mesh.points)  # exponentials of Green's strain
+    x = 0.5 * (x + mesh.points)  # a smaller deformation for exponentials of Green's strain
     law = laws(mesh.number_of_elements)[name]
     f, K = np.asarray(mjed.internal_force(mesh, law, x)), mjed.stiffness_matrix(mesh, law, x)
     assert np.isclose(mjed.energy(mesh, law, x), reference.energy(mesh, law, x), rtol=1e-13)
@@ -117,7 +117,7 @@ def test_derivative_by_the_fibre_angle():
 @pytest.mark.parametrize(
     ("directions", "sentence"),
     [
-        ({"sheet": [2.0, 0.0, 0.0]}, "sheet lies along fibre"),
+        ({"sheet": [2.0, 0.0, 0.0]}, "sheet is parallel to fibre"),
         ({"fibre": [0.0, 0.0, 0.0]}, "one of them is zero"),
         ({"fibre": [1.0, 0.0]}, r"give \(3,\)"),
         ({"fibre": 1.0}, "a list of numbers"),
@@ -136,12 +136,12 @@ def test_directions_of_another_shape_are_refused(fibre, distorted_box):
 
 
 def test_a_fibre_without_length_is_refused():
-    """The run ended with the sentence on inverted elements."""
+    """Without this check, the run ended with the message on inverted elements."""
     mesh = lj.shapes.box((0.01, 0.01, 0.01), (1, 1, 1))
     directions = np.tile([1.0, 0.0, 0.0], (mesh.number_of_elements, 1))
     directions[2] = 0.0
     for fibre in ((0.0, 0.0, 0.0), directions):
         law = Holzapfel(mu=500.0, k1=100.0, k2=2.0, bulk=5000.0, fibre=fibre)
         for own in (law, law + lj.laws.NeoHookean(mu=100.0, bulk=None)):
-            with pytest.raises(lj.InputError, match="law Holzapfel: a fibre has no length"):
+            with pytest.raises(lj.InputError, match="law Holzapfel: a fibre has length 0"):
                 lj.simulate(lj.Scene(mesh=mesh, law=own, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),)))

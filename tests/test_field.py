@@ -1,4 +1,4 @@
-"""From displacements to stiffness: reading, places, the prior, maps with uncertainty, few numbers, the command."""
+"""From displacements to stiffness: files, positions, the prior, maps with uncertainty, few parameters, the command."""
 
 import json
 from functools import partial
@@ -43,13 +43,13 @@ def _scene(folder, mu=800.0, gravity="4, 0, -3", name="scene.toml"):
 
 
 def _truth(mesh):
-    """Twice as stiff at one end, smoothly."""
+    """Return a shear modulus that doubles smoothly towards one end."""
     middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
     return 800.0 * np.exp(0.7 / (1 + np.exp((0.03 - middle[:, 0]) / 0.006)))
 
 
 def _write(file, scene, noise, mu=None, seed=0):
-    """Synthetic displacements of the upper nodes, by place, with noise [m]."""
+    """Write synthetic displacements of the upper nodes, by position, with noise [m]."""
     X = np.asarray(scene.mesh.points)
     true = lj.with_parameters(scene, {"law.mu": jnp.asarray(_truth(scene.mesh) if mu is None else mu)})
     u = np.asarray(lj.simulate(true).check().positions[-1]) - X
@@ -61,7 +61,7 @@ def _write(file, scene, noise, mu=None, seed=0):
 
 @pytest.fixture(scope="module")
 def problem(tmp_path_factory):
-    """Two loads on one block, noise of a hundredth of the largest displacement."""
+    """Two loads on one block, with noise of a hundredth of the largest displacement."""
     folder = tmp_path_factory.mktemp("field")
     made, data = [], []
     for k, gravity in enumerate(("4, 0, -3", "0, 4, -3")):
@@ -72,7 +72,7 @@ def problem(tmp_path_factory):
 
 
 def test_places_in_a_mesh():
-    """A linear field is met exactly, inside and a little outside."""
+    """A linear field is interpolated exactly, inside and slightly outside of the mesh."""
     mesh = lj.shapes.box((0.06, 0.04, 0.04), (4, 3, 3))
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.002, 1.05, (50, 3)) * [0.06, 0.04, 0.04]
@@ -86,7 +86,7 @@ def test_places_in_a_mesh():
 
 
 def test_the_prior_has_the_covariance_it_states():
-    """sd^2 exp(-r / length) in the middle of a body that is large beside the length, and a true transpose."""
+    """The covariance is sd^2 exp(-r / length) in the middle of a large body. The transpose is exact."""
     mesh = lj.shapes.box((0.2, 0.2, 0.2), (10, 10, 10))
     p = prior.prior(mesh, 0.04)
     n, rng = mesh.number_of_nodes, np.random.default_rng(0)
@@ -99,7 +99,7 @@ def test_the_prior_has_the_covariance_it_states():
     covariance = prior.field_at_nodes(p, prior.to_whitened(p, unit))
     near = np.flatnonzero(np.linalg.norm(X - 0.1, axis=1) < 0.05)
     distance = np.linalg.norm(X[near] - X[centre], axis=1)
-    # Cells of half a length: the kink at distance 0 is cut off by the mesh.
+    # The cells are half a length wide, so the mesh cuts off the kink at distance 0.
     np.testing.assert_allclose(covariance[near], np.exp(-distance / 0.04), atol=0.2)
     V = np.linalg.qr(rng.normal(size=(n, 3)))[0]
     before, after = prior.variances(p, V, np.array([0.1, 0.5, 0.9]))
@@ -111,8 +111,9 @@ def test_the_prior_has_the_covariance_it_states():
 
 @pytest.mark.slow
 def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
-    """The map explains the data to their noise and is nearer the truth than any uniform body; its standard deviation
-    is that of the dense Hessian; a fit that was killed goes on where it was."""
+    """The map fits the data to their noise and is closer to the truth than any uniform body. Its standard deviation is
+    that of the dense Hessian. An interrupted fit continues.
+    """
     rows = []
     file = tmp_path / "progress.h5"
     found = field.estimate(
@@ -124,7 +125,7 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
     best = np.log(_truth(mesh)) - np.average(np.log(_truth(mesh)), weights=volumes)
     assert np.sqrt(np.average(off**2, weights=volumes)) < 0.5 * np.sqrt(np.average(best**2, weights=volumes))
 
-    # Standard deviations against the dense Hessian of all directions.
+    # Compare standard deviations with the dense Hessian of all directions.
     p, base = prior.prior(mesh, 0.02), field.start_of(problem, "law.mu")
     T = found.deviation * prior.field_at_nodes(p, np.eye(mesh.number_of_nodes))
     J = np.asarray(
@@ -133,15 +134,15 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
         )
     )
     covariance = T @ np.linalg.inv(np.eye(len(T)) + (J @ T).T @ (J @ T)) @ T.T
-    # Lanczos leaves out directions of which the data tell least; with 70 of 80 that is nearly nothing.
+    # Lanczos leaves out the directions that the data determine least. With 70 of 80, this is a very small part.
     np.testing.assert_allclose(found.sd, np.sqrt(np.diag(covariance)), rtol=0.02)
     assert np.all(found.sd < found.prior_sd)
     values = field.values_at(problem, "law.mu", base, jnp.asarray(found.log_factor))
     bias = covariance @ J.T @ scene_numbers.missing(problem, values)
-    # Conjugate gradients stop at a hundredth.
+    # Conjugate gradients stop at a relative residual of 0.01.
     assert np.linalg.norm(found.mesh_bias - bias) < 0.02 * np.linalg.norm(bias)
 
-    # What was written is the point reached: going on from it takes no iteration to speak of.
+    # The file contains the last point, so a fit that continues from it needs almost no iteration.
     with h5py.File(file) as f:
         np.testing.assert_allclose(found.deviation * prior.field_at_nodes(p, f["z"][:]), found.log_factor, rtol=1e-12)
     again = field.estimate(problem, length=0.02, max_iterations=40, modes=5, file=file, resume=True)
@@ -179,7 +180,7 @@ def test_a_map_goes_on_from_its_own_problem_alone(problem, tmp_path):
 
 
 def _of_a_formula(monkeypatch, problem, bend=0.0):
-    """Runs whose residuals are known: A m + bend (A m)^2 - b, with singular values over three decades."""
+    """Replace the runs by residuals A m + bend (A m)^2 - b, with singular values over three decades."""
     rng = np.random.default_rng(1)
     n = problem.scenes[0].mesh.number_of_nodes
     left, right = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
@@ -198,7 +199,7 @@ def _of_a_formula(monkeypatch, problem, bend=0.0):
 
 
 def test_a_map_is_at_its_minimum(problem, monkeypatch):
-    """Against the normal equations; L-BFGS stopped at 1 % of the cost above it."""
+    """The map solves the normal equations. L-BFGS stopped with a cost 1 % above the minimum."""
     A, b = _of_a_formula(monkeypatch, problem)
     found = field.estimate(problem, length=0.02, modes=30, mesh_error=False)
     p = prior.prior(problem.scenes[0].mesh, 0.02)
@@ -206,7 +207,7 @@ def test_a_map_is_at_its_minimum(problem, monkeypatch):
     H = np.eye(len(b)) + (A @ T).T @ (A @ T)
     off = np.linalg.solve(T, found.log_factor) - np.linalg.solve(H, (A @ T).T @ b)
     assert np.sqrt(off @ H @ off) < 0.05 and found.distance < 0.05 and field.distance_sentence(found) is None
-    # The distance is told as it is, where the search may not go on.
+    # The reported distance from the minimum is correct if the search may not continue.
     few = field.estimate(problem, length=0.02, modes=30, mesh_error=False, max_iterations=2)
     T = few.deviation * prior.field_at_nodes(p, np.eye(len(b)))
     H = np.eye(len(b)) + (A @ T).T @ (A @ T)
@@ -233,14 +234,14 @@ def test_a_map_that_was_killed_ends_where_an_unbroken_one_ends(problem, monkeypa
     again = field.estimate(problem, file=file, resume=True, **how)
     assert again.deviation == whole.deviation and len(again.history) == len(whole.history)
     assert np.abs((again.log_factor - whole.log_factor) / whole.sd).max() < 0.1
-    # A finished search is not begun again.
+    # A finished search is not started again.
     finished = field.estimate(problem, file=file, resume=True, **how)
     np.testing.assert_array_equal(finished.log_factor, again.log_factor)
     assert finished.history == again.history
 
 
 def test_a_search_goes_back_from_where_there_is_no_answer(problem, monkeypatch):
-    """However large chi^2 is: a fixed cost of failed runs was below it, and a failed run was the end."""
+    """Failed runs once had a fixed cost. If it was below chi^2, the search ended at a failed run."""
     _of_a_formula(monkeypatch, problem)
     inner = field._linearised
 
@@ -258,12 +259,12 @@ def test_a_scene_without_an_answer_is_no_map(problem, monkeypatch):
         return jax.linearize(lambda m: (jnp.nan * m, (jnp.zeros((), jnp.int32),)), m, has_aux=True)
 
     monkeypatch.setattr(field, "_linearised", nothing)
-    with pytest.raises(lj.InputError, match="no answer at the parameters where the map begins"):
+    with pytest.raises(lj.InputError, match="fails at the parameters from which the map begins"):
         field.estimate(problem, length=0.02, mesh_error=False)
 
 
 def test_the_error_of_the_mesh_counts_as_noise(problem, monkeypatch):
-    """Per scene, over the components that were measured; without an estimate nothing changes."""
+    """The mesh error is one value per scene, over the measured components. Without an estimate nothing changes."""
     first, second = problem.data
     sd = first.sd.copy()
     sd[0] = np.inf  # not measured
@@ -284,7 +285,7 @@ def test_the_error_of_the_mesh_counts_as_noise(problem, monkeypatch):
 @pytest.mark.draws
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_map_is_written_at_the_nodes_of_its_mesh(tmp_path, order):
-    """The map is a field of the vertices; the nodes between them have the mean of the logarithms."""
+    """The map is defined at the vertices. Nodes between them have the mean of the logarithms."""
     mesh = lj.shapes.box((0.06, 0.04, 0.04), (3, 2, 2))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     p, rng = prior.prior(mesh, 0.02), np.random.default_rng(0)
@@ -300,7 +301,7 @@ def test_a_map_is_written_at_the_nodes_of_its_mesh(tmp_path, order):
     if order == 2:
         low, high = mesh.pattern.edges
         np.testing.assert_allclose(factor[len(m) :], np.sqrt(factor[low] * factor[high]), rtol=1e-12)
-    # Where a region of the scene sets the value, the map says nothing.
+    # Where a region of the scene sets the value, the map has no values.
     given = np.zeros(E, bool)
     given[: E // 2] = True
     field_report.write(tmp_path, mesh, {}, found._replace(given=given))
@@ -312,7 +313,7 @@ def test_a_map_is_written_at_the_nodes_of_its_mesh(tmp_path, order):
 
 
 def test_a_sphere_starts_where_the_map_is_known(problem):
-    """A weak prior leaves the largest values where the data tell little."""
+    """With a weak prior, the largest values are where the data determine little."""
     mesh = problem.scenes[0].mesh
     X = np.asarray(mesh.points)
     near = np.linalg.norm(X - [0.03, 0.02, 0.02], axis=1) < 0.015
@@ -340,8 +341,9 @@ def test_the_command_maps_quadratic_elements(tmp_path):
 
 @pytest.mark.slow
 def test_the_mesh_bias_of_a_map_corrects_it(tmp_path):
-    """Data of quadratic elements on a mesh refined twice, mapped with linear ones on a mesh refined once: the map
-    without its bias is nearer the truth, which is uniform."""
+    """The data are from quadratic elements on a mesh refined twice, the map from linear ones on a mesh refined once.
+    With its bias subtracted, the map is closer to the uniform truth.
+    """
     scene = _scene(tmp_path, gravity="1, 0, -1")
 
     def on(mesh: lj.TetMesh) -> lj.Scene:
@@ -355,14 +357,15 @@ def test_the_mesh_bias_of_a_map_corrects_it(tmp_path):
     data = displacements.read_displacements(tmp_path / "u.csv", coarse, 0.1 * np.linalg.norm(u, axis=1).max())
     problem = scene_numbers.Problem((coarse,), (data,))
     found = field.estimate(problem, length=0.05, max_iterations=20, modes=20)
-    # In directions that the data do not know the prior holds the map where it began: at the truth, here.
+    # In directions that the data do not determine, the prior keeps the starting point of the map; here this is the
+    # truth.
     off, left = (np.sqrt(np.mean(m**2)) for m in (found.log_factor, found.log_factor - found.mesh_bias))
     assert off > 0.01 and left < 0.5 * off
 
 
 @pytest.mark.slow
 def test_the_gradient_of_the_map(problem):
-    """By the whitened field, against central differences."""
+    """Compare the gradient with respect to the whitened field with central differences."""
     base = field.start_of(problem, "law.mu")
     p = prior.prior(problem.scenes[0].mesh, 0.02)
     sharp = problem._replace(scenes=tuple(replace(s, solve=replace(s.solve, tolerance=1e-12)) for s in problem.scenes))
@@ -377,7 +380,7 @@ def test_the_gradient_of_the_map(problem):
 
 @pytest.mark.slow
 def test_few_numbers_of_several_scenes(problem):
-    """Shear and bulk modulus of a uniform block: within four standard errors, which shrink with the noise."""
+    """Shear and bulk modulus of a uniform block are within four standard errors, which decrease with the noise."""
     scene = problem.scenes[0]
     X = np.asarray(scene.mesh.points)
     data = []
@@ -400,7 +403,7 @@ def test_few_numbers_of_several_scenes(problem):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the mesh moves")
 def test_viscosity_from_a_time_series(tmp_path):
-    """A block that creeps under its weight: ratio and relaxation time from a few nodes over time."""
+    """A block creeps under its weight. Ratio and relaxation time are estimated from a few nodes over time."""
     text = _SCENE.format(mu=800.0, gravity="4, 0, -3")
     text += "[viscosity]\nratios = [0.4]\nrelaxation_times = [0.3]\n[solve]\ndt = 0.1\nsteps = 10\n"
     (tmp_path / "creep.toml").write_text(text)
@@ -426,7 +429,7 @@ def test_viscosity_from_a_time_series(tmp_path):
 @pytest.mark.draws
 @pytest.mark.slow
 def test_the_command_maps(tmp_path, capsys):
-    """A map from files; everything written. That it goes on from what is written, the next test sees."""
+    """Estimate a map from files and check all written files. The next test checks that a fit continues from them."""
     scene = _scene(tmp_path, mu=1000.0)
     _write(tmp_path / "u.csv", scene, 5e-5)
     out = tmp_path / "out"
@@ -456,7 +459,7 @@ def test_the_command_goes_on(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_sphere_is_found_where_it_is():
-    """Same mesh for data and fit: the estimator itself, from a start that is off."""
+    """Data and fit use the same mesh, so the estimator itself is tested, from a wrong starting point."""
     mesh = lj.shapes.box((0.06, 0.06, 0.05), (6, 6, 5))
     below = mesh.node_sets["z_min"]
 

@@ -1,4 +1,4 @@
-"""Tables of displacements: units, other programs, refusals in one sentence."""
+"""Tables of displacements: units, other programs, one-line messages for invalid input."""
 
 import json
 
@@ -21,7 +21,7 @@ _BAD = {
     "node,ux,uy,uz\n900,0,0,0": "node 900 is not in the mesh",
     "node,ux,uy,uz\n1.5,0,0,0": "node 1.5 is not in the mesh",
     "x,y,z,ux,uy,uz\n60,40,40,0,0,0": "is --unit right",
-    "x,y,z,ux,uy,uz\n,0,0,0,0,0": "place x,y,z is not finite",
+    "x,y,z,ux,uy,uz\n,0,0,0,0,0": "position x,y,z is not finite",
     "node,ux,uy,uz\n1,,,": "no displacement is measured",
     "node,ux,uy,uz\n1,inf,0,0": "row 1 is infinite",
     "\ufeffnode,ux,uy,uz\n2,-inf,0,0": "row 1 is infinite",
@@ -89,7 +89,7 @@ def test_tables_of_displacements_of_other_programs(tmp_path, written):
 def test_places_in_another_unit_than_the_displacements_are_refused(tmp_path):
     scene = _scene(tmp_path, mu=1000.0)
     points = np.asarray(scene.mesh.points)
-    rows = np.column_stack([points, 1e3 * 1e-3 * points])  # the displacements alone in mm
+    rows = np.column_stack([points, 1e3 * 1e-3 * points])  # only the displacements in mm
     np.savetxt(tmp_path / "u.csv", rows, delimiter=",", header="x,y,z,ux,uy,uz", comments="")
     with pytest.raises(lj.InputError, match=r"all points lie within .* --unit mm is for x, y, z and ux"):
         displacements.read_displacements(tmp_path / "u.csv", scene, 1e-5, "mm")
@@ -99,7 +99,9 @@ def test_places_in_another_unit_than_the_displacements_are_refused(tmp_path):
 @pytest.mark.filterwarnings("ignore:the mesh moves")
 @pytest.mark.filterwarnings("ignore:residuals of points")
 def test_displacements_in_another_unit_are_told(tmp_path, capsys):
-    """Ten times too large: a modulus of a tenth, with a small error. The misfit tells."""
+    """Displacements that are ten times too large give a tenth of the modulus, with a small error. Only the misfit shows
+    it.
+    """
     scene = _scene(tmp_path, mu=1000.0)
     _write(tmp_path / "u.csv", scene, 5e-5)
     rows = np.loadtxt(tmp_path / "u.csv", delimiter=",", skiprows=1)
@@ -110,11 +112,11 @@ def test_displacements_in_another_unit_are_told(tmp_path, capsys):
     main([*command, "--parameters", "law.mu", "--out", str(tmp_path / "out")])
     assert "per component, so the fit misses the displacements" in capsys.readouterr().err
     found = json.loads((tmp_path / "out" / "field.json").read_text())
-    assert found["chi2_per_component"] > 1.5 and "look at the unit" in found["warnings"][0]
+    assert found["chi2_per_component"] > 1.5 and "check the unit (--unit)" in found["warnings"][0]
 
 
 def test_scenes_of_two_orders_have_different_meshes(tmp_path):
-    """Their elements are as many, but not their nodes: this ended with a traceback of NumPy."""
+    """The scenes have as many elements, but not as many nodes. NumPy ended with a traceback."""
     scenes = [_scene(tmp_path)]
     scenes.append(replace(scenes[0], mesh=lj.quadratic(scenes[0].mesh)))
     with pytest.raises(lj.InputError, match="a field needs one mesh in all scenes"):

@@ -1,4 +1,4 @@
-"""Maps of scenes whose regions set the mapped parameter: the map says nothing there."""
+"""Maps of scenes whose regions set the mapped parameter: there the map has no values."""
 
 import json
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.quick_to_compile
 
 
 def test_elements_keep_the_numbers_of_their_regions():
-    """A map of mu showed its own values where a region of the scene sets mu, and the runs did not use them."""
+    """Where a region of the scene sets mu, a map of mu showed its own values, which the runs did not use."""
     box = lj.shapes.box((2.0, 1.0, 1.0), (2, 1, 1))  # 12 elements
     soft = lj.laws.NeoHookean(mu=500.0, bulk=2000.0)
     regions = (
@@ -33,24 +33,24 @@ def test_elements_keep_the_numbers_of_their_regions():
     assert np.all(values[:3] == 3000) and np.all(np.isnan(values[3:]))
     given, values = field.given_by_regions(problem, "viscosity.ratios.1")
     assert np.array_equal(given, np.arange(12) < 4) and np.all(values[:4] == 0.2)
-    # A parameter that another scene may change there is mapped.
+    # A parameter that another scene leaves free in this region is mapped.
     both = SimpleNamespace(scenes=(scene, replace(scene, region=())))
     assert not np.any(field.given_by_regions(both, "law.mu")[0])
     every = replace(scene, region=(lj.Region(elements=jnp.arange(12), law={"mu": 1.0}),))
-    with pytest.raises(InputError, match="so there is nothing to map"):
+    with pytest.raises(InputError, match="so nothing is left to map"):
         field.start_of(SimpleNamespace(scenes=(every,)), "law.mu")
 
 
 @pytest.mark.slow
 def test_a_map_shows_the_numbers_that_the_runs_use(tmp_path, capsys):
-    """A region of the scene sets mu in its upper half, as in the truth: the map showed 900 to 1,100 there."""
+    """A region of the scene sets mu in the upper half, as in the truth. The map showed 900 to 1,100 Pa there."""
     (tmp_path / "s.toml").write_text(
         _SCENE.format(mu=800.0, gravity="4, 0, -3") + "[[region]]\nwhere = {x_min = 0.03}\nlaw = {mu = 3000.0}\n"
     )
     scene = lj.load_scene(tmp_path / "s.toml")
     data = _write(tmp_path / "d.csv", scene, 2e-5, mu=1000.0)
     assert main(["field", str(tmp_path / "s.toml"), str(data), "--noise", "2e-5", "--out", str(tmp_path / "o")]) == 0
-    assert "keep the law.mu of their [[region]]: the map says nothing there" in capsys.readouterr().err
+    assert "keep the law.mu of their [[region]]: the map has no value there" in capsys.readouterr().err
     with h5py.File(tmp_path / "o" / "field.h5") as f:
         modulus, given, sd = f["modulus"][:], f["given"][:], f["sd_of_ln"][:]
     assert given.sum() == len(given) // 2 and np.all(modulus[given] == 3000)

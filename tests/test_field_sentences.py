@@ -1,4 +1,4 @@
-"""What is said of a map and of numbers found from displacements: misfit, open level, undetermined numbers."""
+"""Messages on a map and on parameters estimated from displacements: misfit, undetermined level and parameters."""
 
 from types import SimpleNamespace
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.quick_to_compile
 
 
 def test_chance_in_the_residuals_of_a_map_is_no_warning():
-    """Of 240 components chi2 is 1 +- 0.09 each."""
+    """For 240 components, chi2 per component is 1 +- 0.09."""
     for chi2, told in ((1.01, False), (1.25, False), (1.3, True)):
         found = SimpleNamespace(reached=False, chi2=240 * chi2, components=240)
         assert (field_report.noise_sentence(found) is not None) == told
@@ -25,7 +25,7 @@ def test_a_fit_that_misses_the_data_says_so():
         ("law.mu",), np.ones(1), np.ones((1, 1)), np.ones(1), np.ones((1, 1)), 90.0, 60, 1.0, 59.0, 3, True
     )
     assert field_report.misfit_sentence(found._replace(chi2=89.0)) is None
-    said = field_report.misfit_sentence(found._replace(chi2=0.6))  # a noise in millimetres
+    said = field_report.misfit_sentence(found._replace(chi2=0.6))  # a noise that was given in millimetres
     assert said is not None and "scatter 0.1 times as much as the stated noise" in said
     assert field_report.misfit_sentence(found._replace(chi2=0.6), with_mesh=True) is None
     said = field_report.misfit_sentence(found._replace(chi2=240.0))
@@ -40,7 +40,8 @@ def test_a_fit_that_misses_the_data_says_so():
 @pytest.mark.parametrize(
     ("sd", "bias", "level", "mesh"),
     [
-        ([3.0, 3.4], [0.46, 0.1], True, None),  # a bar that is only moved: the mesh was blamed, and nothing else said
+        # a bar under prescribed displacements only: the message named the mesh, and no other cause
+        ([3.0, 3.4], [0.46, 0.1], True, None),
         ([0.05, 3.0], [0.04, 0.46], False, None),
         ([0.05, 0.6], [0.5, 0.1], False, "by a third or more"),
         ([0.05, 0.6], [0.1, 0.5], False, "by up to 10%"),
@@ -55,7 +56,7 @@ def test_a_map_whose_level_is_open_says_so_and_the_mesh_is_blamed_for_its_own_sh
 
 
 def test_a_number_is_named_once(tmp_path, capsys):
-    """The second fit got a start value as result, with an infinite error."""
+    """The second fit returned its starting value as the result, with an infinite error."""
     (tmp_path / "scene.toml").write_text(
         '[mesh]\nshape = "box"\nsize = [1, 1, 1]\ncells = [1, 1, 1]\n[law]\nname = "neo_hookean"\nmu = 1\nbulk = 9\n'
         '[[fixed]]\nset = "z_min"\n[[traction]]\nset = "z_max"\nvalue = [0, 0, 0.1]\n'
@@ -67,7 +68,9 @@ def test_a_number_is_named_once(tmp_path, capsys):
 
 
 def test_numbers_that_no_mesh_determines_are_not_blamed_on_the_mesh():
-    """Two moduli in series, only moved: 938 ± 7e9, and the sentence was to refine the mesh."""
+    """Two moduli are in series under prescribed displacements only. The result was 938 ± 7e9, and the message advised a
+    finer mesh.
+    """
     found = {"names": ("mu", "law.mu"), "values": np.array([938.0, 2900.0]), "mesh_bias": np.array([2e3, 3e3])}
     (said,) = bias_sentences(SimpleNamespace(**found, standard_errors=np.array([7e9, 1e10])))
     assert said.startswith("the data do not determine mu, law.mu") and "refine" not in said

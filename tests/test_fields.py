@@ -1,4 +1,4 @@
-"""Fields of a run against a body in uniform strain, and forces over time as a table."""
+"""Fields of a run compared with a body in uniform strain, and a table of forces over time."""
 
 import h5py
 import meshio
@@ -47,7 +47,7 @@ def content(**more) -> dict:
 
 
 def shown(scene: lj.Scene, positions, names, pressure=None) -> dict:
-    """Fields at given positions (T, V, 3), as of a run."""
+    """Return fields at given positions (T, V, 3), as if they were the result of a run."""
     T = len(positions)
     zero = np.zeros(np.shape(positions))
     result = Result(
@@ -59,7 +59,7 @@ def shown(scene: lj.Scene, positions, names, pressure=None) -> dict:
 @pytest.mark.parametrize("volumetric", ["element", "mixed"])
 @pytest.mark.parametrize("order", [1, 2])
 def test_uniform_strain_has_the_fields_of_one_point(order, volumetric):
-    """The pressures of mixed bodies are in no result: at a solution they follow from the volumes."""
+    """The results do not contain the pressures of mixed bodies. In equilibrium they follow from the volumes."""
     solve = {"steps": 1, "volumetric": volumetric}
     scene = scene_from(content(mesh=content()["mesh"] | {"order": order}, solve=solve))
     F = np.array([[1.2, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, 0.0, 1.1]])
@@ -87,14 +87,16 @@ def test_a_field_named_twice_is_there_once():
 
 
 def test_a_held_viscous_body_relaxes():
-    """Strained at once and held: the stress of the second step is that of the first, relaxed by the series."""
+    """The body is strained in the first step and then constant. The stress of the second step is relaxed by the
+    series.
+    """
     prony = {"ratios": [0.5], "relaxation_times": [0.1]}
     viscous, plain = scene_from(content(viscosity=prony)), scene_from(content())
     F = np.diag([1.3, 0.9, 0.95])
     x = np.asarray(viscous.mesh.points) @ F.T
     stress, elastic = (shown(s, np.stack([x, x]), ["cauchy_stress"])["cauchy_stress"] for s in (viscous, plain))
     h = 0.1 / 0.1
-    # A ramp over the first step, then rest (exponential recursion).
+    # A ramp over the first step, then constant strain (exponential recursion).
     first = 0.5 + 0.5 * (1 - np.exp(-h)) / h
     second = 0.5 + 0.5 * (1 - np.exp(-h)) / h * np.exp(-h)
     assert np.allclose(stress[0], first * elastic[0], rtol=1e-9, atol=1e-9)
@@ -147,7 +149,7 @@ def test_bad_fields_are_refused():
 
 @pytest.mark.draws
 def test_a_field_of_a_result_is_drawn(tmp_path, capsys):
-    """Uniaxial tension has its stress for von Mises stress; what is not there is one sentence."""
+    """In uniaxial tension, the von Mises stress is the tensile stress. A missing field gives a one-line message."""
     from liverjax.__main__ import main
     from liverjax.jobs import pictures
 
@@ -170,7 +172,7 @@ def test_a_field_of_a_result_is_drawn(tmp_path, capsys):
     for more, words in (
         (["--field", "energy"], "has no field 'energy'"),
         (["--step", "3"], "--step 3 is not in"),
-        (["yeoh"], "draw it alone"),
+        (["yeoh"], "give only this file"),
         (["--stretch", "0.9", "1.1"], "--stretch is for laws, not for"),
     ):
         assert main(["plot", str(file), *more, "--out", str(tmp_path)]) == 2
@@ -182,5 +184,5 @@ def test_a_field_of_a_result_is_drawn(tmp_path, capsys):
     (tmp_path / "other.h5").write_text("no")
     assert main(["plot", str(tmp_path / "other.h5")]) == 2
     assert "is not a result of liverjax simulate" in capsys.readouterr().err
-    assert main(["plot", str(tmp_path)]) == 2  # it counted as the name of a law
+    assert main(["plot", str(tmp_path)]) == 2  # the folder was taken for the name of a law
     assert "is a file or a folder, and not a law: give the result.h5" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Identification: recovery, statistics, other optimisers, choice of modes, what the user is told."""
+"""Identification: recovery, statistics, other optimisers, choice of modes, messages to the user."""
 
 from types import SimpleNamespace
 
@@ -65,14 +65,16 @@ def test_given_deviations_change_the_weights_not_the_answer():
 @pytest.mark.parametrize("draws", [12, pytest.param(24, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_noise_in_percent_does_not_make_moduli_too_small(given, draws):
-    """Weighed by the measured moduli, points that are low by chance count most: G0 came out 2 % low of 10 % noise."""
+    """With weights from the measured moduli, points that are low by chance count most. With 10 % of noise, G0 was 2 %
+    too small.
+    """
     omega, found = np.geomspace(0.1, 100, 100), []
     truth = np.array([2500.0, 0.3, 0.4, 0.05, 1.2])
     for seed in range(draws):
         s = sweep(0.1, seed, truth, omega)
         s = s._replace(storage_sd=0.1 * s.storage, loss_sd=0.1 * s.loss) if given else s
         found.append(viscoelastic.closed_form(s, 2).uncertainty.values[0] / 2500 - 1)
-    # One fit is 0.85 % off: three times the deviation of the mean is allowed.
+    # One fit has an error of 0.85 %. Three standard deviations of the mean are allowed.
     assert abs(np.mean(found)) < 3 * 0.0085 / np.sqrt(draws)
 
 
@@ -80,16 +82,17 @@ def test_scales_follow_the_curve_and_not_the_noise():
     s = sweep(0.1, 3, omega=np.geomspace(0.02, 20, 60))
     exact = sweep(omega=s.angular_frequency)
     off = [np.std(np.log(a / b)) for a, b in zip(s.deviations, (exact.storage, exact.loss), strict=True)]
-    assert max(off) < 0.05  # the points: 0.1
-    # Without noise the curve goes through the points; below five places, the points themselves.
+    assert max(off) < 0.05  # the scatter of the points is 0.1
+    # Without noise the curve passes through the points. For fewer than five frequencies, the points are used
+    # themselves.
     assert all(np.allclose(a, b, rtol=1e-4) for a, b in zip(exact.deviations, (exact.storage, exact.loss), strict=True))
     few = s._replace(**{k: getattr(s, k)[:4] for k in ("angular_frequency", "storage", "loss")})
     assert np.array_equal(few.deviations[0], few.storage)
-    # A reading that is wrong by a factor is no better than none: it has its own size.
+    # A reading that is wrong by a large factor must not count more. Its scale is its own size.
     wrong = exact._replace(storage=exact.storage * np.where(np.arange(60) == 20, 30.0, 1.0))
     assert wrong.deviations[0][20] == wrong.storage[20]
     assert np.allclose(np.delete(wrong.deviations[0] / exact.storage, 20), 1, rtol=1e-3)
-    # Points at one place, as of repeated sweeps, are one.
+    # Points at the same frequency, for example from repeated sweeps, count as one.
     again = s._replace(angular_frequency=np.repeat(s.angular_frequency[::3], 3) * np.tile([1, 1 + 1e-9, 1 + 1e-7], 20))
     assert np.all(np.isfinite(again.deviations))
 
@@ -122,10 +125,10 @@ def draws():
 @pytest.mark.slow
 def test_spreads_are_the_best_possible(draws):
     values, errors, _ = draws
-    # mathematics: G0 1.5 %, g1 1.8 %, g2 2.1 %, tau1 2.3 %, tau2 7.4 % (relative standard deviations)
+    # Standard deviations from `mathematics.md`: G0 1.5 %, g1 1.8 %, g2 2.1 %, tau1 2.3 %, tau2 7.4 % (relative).
     stated = np.array([1.5, 1.8, 2.1, 2.3, 7.4]) / 100
     assert np.all(np.abs(values.std(axis=0) / TRUTH / stated - 1) < 0.2)
-    # and the standard errors know it, draw by draw
+    # The standard errors of each draw agree with them.
     assert np.all(np.abs(np.median(errors, axis=0) / TRUTH / stated - 1) < 0.2)
 
 
@@ -143,7 +146,7 @@ def test_profile_likelihood():
         low, high = intervals[name]
         half = f.uncertainty.quantile * f.uncertainty.standard_errors[j]
         value = f.uncertainty.values[j]
-        # Nearly quadratic here: the profile differs from the linearised interval by its skewness only.
+        # The problem is nearly quadratic: the profile differs from the linearised interval only by its skewness.
         assert np.isclose(value - low, half, rtol=0.35) and np.isclose(high - value, half, rtol=0.35), (name, low, high)
         assert low < TRUTH[j] < high
 
@@ -196,7 +199,9 @@ def test_modes_limited_by_points():
 
 
 def melt() -> Sweep:
-    """A fractional Maxwell liquid: a broad spectrum that ends in flow, as of a polymer melt or a dynamic gel."""
+    """A fractional Maxwell liquid has a broad spectrum that ends in flow, for example a polymer melt or a
+    dynamic gel.
+    """
     omega = np.geomspace(0.1, 100, 31)
     z = 0.1j * omega
     G = 1000 / (1 / z + z**-0.5)
@@ -219,7 +224,8 @@ def test_where_the_active_set_cycles_the_bounded_solver_finds_the_same(monkeypat
 
     monkeypatch.setattr(scipy.optimize, "nnls", cycles)
     y, other = generalised_maxwell.non_negative(A, b)
-    # lsq_linear ends where the cost gains less than 1e-10 of itself: its root, the distance, is half as far off.
+    # lsq_linear stops when the cost changes by less than a fraction of 1e-10. The relative error of x is the root of
+    # this, 1e-5.
     assert np.all(y >= 0) and np.isclose(other, rest, rtol=1e-10) and np.allclose(x, y, atol=1e-5)
 
 
@@ -259,7 +265,7 @@ def test_the_picture_holds_its_table_and_its_legends_cover_nothing(modes):
     (text,) = table.texts
     assert text.get_text().count("\n") == modes + 3
     assert text.get_window_extent().y0 >= picture.bbox.y0 and text.get_window_extent().x1 <= picture.bbox.x1
-    assert text.get_window_extent().y1 <= times.get_tightbbox().y0 + 1  # a pixel of rounding
+    assert text.get_window_extent().y1 <= times.get_tightbbox().y0 + 1  # a pixel for rounding
     sizes = [a.get_window_extent().height / picture.dpi for a in (top, rest, times)]
     assert sizes[0] > 2 and sizes[1] > 0.9 and sizes[2] > 1.5
     for a in (top, times):
@@ -289,7 +295,7 @@ def test_the_larger_of_mesh_and_time_steps_is_named_for_each_parameter():
 
 
 def test_what_auto_chooses_is_not_advised_against():
-    # Three modes within 1.6 decades, without noise: the criterion would take all three.
+    # Three modes within 1.6 decades, without noise: the criterion alone would choose all three.
     model = np.array([770.0, 0.2, 0.25, 0.3, 1.0, 0.2, 0.05])
     s = sweep(0.0, model=model)
     chosen, _ = viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
@@ -329,12 +335,12 @@ def test_merged_modes_are_named():
 
 
 def test_better_than_pyvisco_on_the_noise_free_table_2_sweep():
-    # PyVisco 2.1.3 answers G0 603 Pa and tau 0.108 and 0.450 s here: 22 %, 260 % and 67 % off.
+    # PyVisco 2.1.3 finds G0 603 Pa and tau 0.108 and 0.450 s here. The errors are 22 %, 260 % and 67 %.
     f = viscoelastic.closed_form(sweep(), 2)
     theirs = np.array([603.0, 0.450, 0.108]) / TRUTH[[0, 3, 4]] - 1
     ours = parameters(f)[[0, 3, 4]] / TRUTH[[0, 3, 4]] - 1
     assert np.all(np.abs(ours) < 1e-6 * np.abs(theirs))
-    # It also says 'converged' to exchanged columns; to a NaN and a negative modulus, see test_rheometer.
+    # It also reports 'converged' for exchanged columns. For a NaN and a negative modulus, see test_rheometer.
     s = sweep()
     with pytest.raises(InputError, match="are the two columns exchanged"):
         viscoelastic.closed_form(s._replace(storage=s.loss, loss=s.storage), 2)
@@ -351,7 +357,7 @@ def coarse_torsion():
 def test_torsion_fit_recovers_table_2(coarse_torsion):
     _, _, f = coarse_torsion
     assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() < 5e-3
-    assert f.details["geometry_factor"] > 1.3  # a mesh this coarse is far too stiff, and corrected
+    assert f.details["geometry_factor"] > 1.3  # such a coarse mesh is far too stiff, which is corrected
 
 
 def test_the_table_says_what_the_simulation_adds(coarse_torsion):
@@ -365,7 +371,7 @@ def test_the_table_says_what_the_simulation_adds(coarse_torsion):
     assert "agree within 3 % of the standard errors" in sweep_report._agreement([closed, near])[0]
     moved = closed.uncertainty.values + 2 * errors * last
     far = simulated._replace(uncertainty=simulated.uncertainty._replace(values=moved))
-    assert "moves a number by 2 standard errors" in sweep_report._agreement([closed, far])[0]
+    assert "changes a parameter by 2 standard errors" in sweep_report._agreement([closed, far])[0]
     # The equilibrium modulus is in the table, so its change counts too.
     u = simulated.uncertainty._replace(values=closed.uncertainty.values)
     both = np.isin(np.arange(len(errors)), (1, 2))  # the ratios
@@ -382,12 +388,15 @@ def test_torsion_fit_says_when_discretisation_exceeds_the_error(coarse_torsion):
 
 
 def test_the_biases_are_what_simulated_and_closed_form_differ_by(coarse_torsion):
-    """Same data, same model: only mesh, time steps and finite strain differ, and the last is below 1e-5 here."""
+    """Data and model are equal. The fits differ only by mesh, time steps and finite strain, which is below 1e-5
+    here.
+    """
     _, closed, f = coarse_torsion
     u = f.uncertainty
     moved = u.values - closed.uncertainty.values
     assert np.abs(u.time_step_bias / u.values).max() > 1e-4
-    # First order in moves of a thousandth; finite strain moves a parameter by up to 1e-4 of its error.
+    # The biases are of first order in relative changes of a thousandth. Finite strain changes a parameter by up to 1e-4
+    # of its error.
     left = np.abs(moved - u.mesh_bias - u.time_step_bias)
     assert np.all(left < 0.05 * np.abs(u.time_step_bias) + 1e-3 * u.standard_errors)
 
@@ -398,7 +407,8 @@ def test_chapter_recursion_biases_the_fit():
     closed = viscoelastic.closed_form(s, 2)
     simulation = simulated_rheometer.Simulation(cell_size=0.004, scheme="chapter")
     f = simulated_rheometer.through_torsion(s, closed, simulation)
-    # First order: at 50 steps a cycle its G'' is 5 % off at 4 Hz, which the parameters have to absorb.
+    # The scheme is of first order. With 50 steps per cycle, G'' has an error of 5 % at 4 Hz, which biases the
+    # parameters.
     assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() > 0.02
 
 
@@ -431,7 +441,7 @@ def test_parameters_at_a_bound_claim_no_certainty():
 
 
 def test_a_point_without_derivatives_is_not_gone_to():
-    """Cost falls towards u = 2, but beyond u = 1 the derivative is not a number: the fit stays before and finite."""
+    """The cost falls towards u = 2, but beyond u = 1 the derivative is NaN. The fit stays below u = 1 and finite."""
 
     @jax.custom_jvp
     def residuals(u):

@@ -1,4 +1,4 @@
-"""Files of other laboratories as they are: each is read without an edit, and spoiled ones get one sentence."""
+"""Files of other laboratories: each is read without changes, and spoiled ones give a one-line message."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def test_it_is_read_without_an_edit(file, kind):
 
 
 def spoiled(data: bytes, rng: np.random.Generator) -> bytes:
-    """Cut, overwritten, without some of its lines, or with a word in place of a number."""
+    """Return the data cut, overwritten, without some lines, or with a word instead of a number."""
     out, way = bytearray(data), rng.integers(4)
     if way == 0:
         del out[rng.integers(1, len(out)) :]

@@ -1,4 +1,4 @@
-"""Sweeps as instruments of eight makers write them: each is read without an edit; spoiled ones get one sentence."""
+"""Sweeps in the formats of eight manufacturers: each is read without changes; spoiled ones give a one-line message."""
 
 import json
 import re
@@ -150,7 +150,7 @@ def written(tmp_path, name: str):
 @pytest.mark.parametrize("name", FILES)
 def test_it_is_read_as_it_is(name, tmp_path):
     found = read_sweep(written(tmp_path, name))
-    # Numbers were written with seven digits behind the point: the smallest, 0.016 Hz, to 3e-6.
+    # The numbers have seven digits after the point, so the smallest one, 0.016 Hz, is exact to 3e-6.
     assert np.allclose(found.angular_frequency, OMEGA, rtol=1e-5)
     assert np.allclose(found.storage, G.real, rtol=1e-5) and np.allclose(found.loss, G.imag, rtol=1e-5)
 
@@ -174,7 +174,7 @@ def test_deviations_without_a_name_and_doubtful_thousands_are_told(tmp_path):
 
 
 def test_all_columns_have_the_table_s_decimal_sign():
-    """A strain of 1,100 % beside moduli of 1,234.5 is 11; beside 1.234,5 it is 0.011."""
+    """A strain of 1,100 % in a table with moduli of 1,234.5 is 11. In a table with 1.234,5 it is 0.011."""
     head = "strain_%,frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C"
     for modulus, strain in (("1,234.5", 11.0), ("1.234,5", 0.011)):
         lines = [f'"1,100","{k}","{modulus}","{modulus}","25"' for k in range(1, 5)]
@@ -191,7 +191,7 @@ def test_a_workbook_with_texts_for_numbers(tmp_path):
 
 
 def test_deviations_of_modulus_and_phase_are_carried_over(tmp_path):
-    """Against draws: the spread of G' and G'' where |G*| and the phase scatter as the file says."""
+    """Compare with random draws: the spread of G' and G'' if |G*| and the phase scatter as stated in the file."""
     head = "frequency_Hz,complex_modulus_Pa,complex_modulus_sd_Pa,phase_deg,phase_sd_deg\n"
     lines = [f"{f:.12g},{c:.12g},{0.02 * c:.12g},{p:.12g},0.3\n" for f, c, p in zip(HERTZ, SIZE, DEGREES, strict=True)]
     (tmp_path / "a.csv").write_text(head + "".join(lines))
@@ -199,7 +199,7 @@ def test_deviations_of_modulus_and_phase_are_carried_over(tmp_path):
     rng = np.random.default_rng(0)
     drawn = SIZE * (1 + 0.02 * rng.standard_normal((100_000, 6)))
     drawn = drawn * np.exp(1j * np.radians(DEGREES + 0.3 * rng.standard_normal((100_000, 6))))
-    assert np.allclose(found.storage_sd, drawn.real.std(axis=0), rtol=0.01)  # of 100,000 draws: 0.2 %
+    assert np.allclose(found.storage_sd, drawn.real.std(axis=0), rtol=0.01)  # 100,000 draws: known to 0.2 %
     assert np.allclose(found.loss_sd, drawn.imag.std(axis=0), rtol=0.01)
 
 
@@ -212,7 +212,7 @@ def changed(name: str, *pairs: tuple[str, str]) -> str:
 
 
 def column(name: str, place: int, value: str, head: int = 1, delimiter: str = ",") -> str:
-    """All numbers of a column replaced."""
+    """Replace all numbers of a column."""
     lines = [line.split(delimiter) for line in changed(name).splitlines()]
     for row in lines[head:]:
         row[place] = value
@@ -220,7 +220,7 @@ def column(name: str, place: int, value: str, head: int = 1, delimiter: str = ",
 
 
 HEAD = "frequency_Hz,complex_modulus_Pa,phase_deg\n"
-#: What was done to a file, and a part of the sentence.
+#: The change of a file, and a part of the message.
 SPOILED = {
     "bar": (changed("bohlin, phase", (r"\[Pa\]", "[bar]")), r"unit 'bar' of column Complex Modulus \[bar\].*use Pa"),
     "milli": (changed("rheowin, complex", ("in Pa", "in mPa")), "unit 'mPa'.*use Pa"),

@@ -1,4 +1,4 @@
-"""Coulomb friction at rigid obstacles: a block on an incline, its tangent, derivatives, refusals."""
+"""Coulomb friction at rigid obstacles: a block on an incline, its tangent, derivatives, invalid input."""
 
 from types import SimpleNamespace
 
@@ -26,7 +26,7 @@ DT, STEPS = 2e-3, 50
 
 
 def block(mu: float, order: int = 1, **solve) -> lj.Scene:
-    """A stiff cube of 1 kg that lies on a plane; gravity leans from the normal by the angle of an incline."""
+    """A stiff cube of 1 kg on a plane. Gravity is tilted from the normal by the angle of the incline."""
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (1, 1, 1))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     sole = lj.boundary.boundary_triangles(mesh, lj.boundary.select(mesh, {"z_max": 0.0}))
@@ -41,14 +41,14 @@ def block(mu: float, order: int = 1, **solve) -> lj.Scene:
 
 
 def velocity(scene: lj.Scene, result) -> float:
-    """Of the centre of mass along the incline, in the last step [m/s]."""
+    """Return the velocity of the centre of mass along the incline in the last step [m/s]."""
     m = np.asarray(nodal_volumes(scene.mesh))
     last = np.asarray(result.positions[-1] - result.positions[-2])[:, 0]
     return float(m @ last / m.sum() / DT)
 
 
 def test_a_block_sticks_below_the_angle_of_friction_and_slides_above():
-    """Speed g (sin - mu cos) t; the shear is mu times the force of the plane."""
+    """The speed is g (sin - mu cos) t, and the shear force is mu times the normal force of the plane."""
     seen = {}
     for mu in (0.5, 0.3):
         scene = block(mu, kind="dynamic", dt=DT, steps=STEPS)
@@ -57,11 +57,12 @@ def test_a_block_sticks_below_the_angle_of_friction_and_slides_above():
         force = np.asarray(lj.obstacle_forces(scene, result).force)[0]
         seen[mu] = velocity(scene, result), np.linalg.norm(force[:, :2], axis=1) / -force[:, 2]
     speed = G * (TAN - 0.3) / np.hypot(TAN, 1) * DT * STEPS
-    # The block rocks on its contact by some of the slip that sticking takes, mu F/(k A) = 10 um, at about 60 Hz.
+    # The block oscillates on its contact at about 60 Hz. The amplitude is part of the slip before sliding, mu F/(k A) =
+    # 10 um.
     rocks = 2 * np.pi * 60 * 1e-5
     assert rocks < 0.05 * speed
     assert abs(seen[0.3][0] - speed) < rocks and abs(seen[0.5][0]) < rocks
-    # The points slide in nearly one direction, more so as the rocking fades.
+    # The points slide in nearly one direction, which becomes more exact as the oscillation decays.
     assert np.all(seen[0.3][1] <= 0.3 * (1 + 1e-9))
     assert np.allclose(seen[0.3][1][5:], 0.3, rtol=1e-3) and np.allclose(seen[0.3][1][-20:], 0.3, rtol=1e-5)
     assert np.all(seen[0.5][1][5:] < 0.5)
@@ -70,7 +71,9 @@ def test_a_block_sticks_below_the_angle_of_friction_and_slides_above():
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_at_rest_the_plane_carries_the_weight(order):
-    """Sticking, its force is the weight along both directions; beyond the angle of friction no rest is found."""
+    """If the block sticks, the force of the plane is the weight. Beyond the angle of friction there is no
+    equilibrium.
+    """
     scene = block(0.5, order, steps=2, tolerance=1e-10)
     lj.check_scene(scene)
     result = lj.simulate(scene).check()
@@ -78,7 +81,7 @@ def test_at_rest_the_plane_carries_the_weight(order):
     assert np.allclose(lj.obstacle_forces(scene, result).force[0, -1], weight, atol=1e-8 * G)
     slides = lj.simulate(lj.with_parameters(scene, {"obstacle.0.friction": 0.3}))
     assert slides.status[-1] != status.CONVERGED
-    assert any("only friction holds the body" in said for said in cautions.cautions_of_run(scene, slides))
+    assert any("only friction prevents sliding of the body" in said for said in cautions.cautions_of_run(scene, slides))
     assert not any("only friction" in said for said in cautions.cautions_of_run(scene, result))
 
 
@@ -93,7 +96,7 @@ def test_a_failed_run_of_a_body_that_only_friction_holds_says_so():
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_the_tangent_is_the_derivative_of_the_force(order):
-    """Some points stick, some slide, some are in the air."""
+    """Some points stick, some slide, and some do not touch."""
     scene = block(0.3, order)
     mesh = scene.mesh
     at_random = np.random.default_rng(14).normal(size=(2, *mesh.points.shape))
@@ -113,7 +116,9 @@ def test_the_tangent_is_the_derivative_of_the_force(order):
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_search_sees_an_energy_whose_gradient_is_the_force(order):
-    """And whose second derivative has no negative eigenvalue; where no point slides, it is the tangent itself."""
+    """The second derivative of this energy has no negative eigenvalue. Where no point slides, it is the tangent
+    itself.
+    """
     scene = block(0.3, order)
     mesh = scene.mesh
     step = Step(mesh, mesh.points - jnp.array([[0.0, 0.0, 2e-5]]), 1.0, 1, None, False, None, Free(jnp.ones(())))
@@ -136,7 +141,9 @@ def test_a_search_sees_an_energy_whose_gradient_is_the_force(order):
 
 @pytest.mark.slow
 def test_derivative_of_the_way_by_the_coefficient():
-    """Of implicit Euler, -g cos n(n+1)/2 dt^2; difference quotients fall, bottom out and rise; 0 mu is no friction."""
+    """For implicit Euler the derivative is -g cos n(n+1)/2 dt^2. The error of difference quotients falls, reaches a
+    minimum and rises. With mu = 0 there is no friction.
+    """
     scene = block(0.3, kind="dynamic", dt=DT, steps=STEPS, tolerance=1e-11)
     m = nodal_volumes(scene.mesh) / SIDE**3
 
@@ -147,7 +154,7 @@ def test_derivative_of_the_way_by_the_coefficient():
 
     by, reverse = jax.jit(jax.jacfwd(way))(0.3), jax.grad(way)(0.3)
     expected = -G / np.hypot(TAN, 1) * STEPS * (STEPS + 1) / 2 * DT**2
-    # In the first step, of which the way has 50 parts in 1275, the deepest points still stick.
+    # In the first step the deepest points still stick. This step contributes 50 of 1275 parts to the displacement.
     assert np.isclose(by, expected, rtol=STEPS / (STEPS * (STEPS + 1) / 2)) and np.isclose(by, reverse, rtol=1e-7)
     errors = [abs((way(0.3 + h) - way(0.3 - h)) / (2 * h) / by - 1) for h in (3e-2, 1e-4, 1e-9)]
     assert errors[1] < 1e-5 and errors[1] < errors[0] and errors[1] < errors[2]
@@ -163,10 +170,10 @@ def test_bad_friction_is_one_sentence():
         "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
         "obstacle": [table],
     }
-    # Friction holds a body along the plane, so that nothing else has to.
+    # Friction supports a body along the plane, so no other support is needed.
     found = scene_from(scene)
     assert isinstance(found.physics[0], RoughObstacle)
-    with pytest.raises(InputError, match="nothing holds the body against every rigid motion"):
+    with pytest.raises(InputError, match="do not prevent every rigid motion of the body"):
         scene_from(scene | {"obstacle": [table | {"friction": 0.0}]})
     with pytest.raises(InputError, match=r"obstacle\.0\.friction = -0\.1"):
         scene_from(scene | {"obstacle": [table | {"friction": -0.1}]})

@@ -1,4 +1,4 @@
-"""Derivatives through runs: against central differences, forward against reverse, what is kept, and the codes."""
+"""Derivatives of runs: central differences, forward and reverse mode, stored states, and status codes."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,9 @@ RNG = np.random.default_rng(5)
 
 
 def _scene(kind: str, cells: tuple[int, int, int] = (3, 3, 2), steps: int = 3) -> lj.Scene:
-    """A block of 108 tetrahedra that hangs, is pulled, pushed and moved, with the physics that `kind` names."""
+    """A block of 108 tetrahedra that hangs and is stretched, pushed and moved, with the physics objects that `kind`
+    names.
+    """
     names = set(kind.split())
     mesh = lj.shapes.box((0.05, 0.04, 0.03), cells)
     top = mesh.node_sets["x_max"]
@@ -59,7 +61,7 @@ def _scene(kind: str, cells: tuple[int, int, int] = (3, 3, 2), steps: int = 3) -
 
 
 def _leaves(scene: lj.Scene) -> dict:
-    """Every number the scene has, by its name."""
+    """Return every parameter of the scene by its name."""
     names = ["law.mu", "law.bulk", "body.density", "body.gravity", "displaced.0.by", "mesh.points", "start"]
     names += ["viscosity.ratios", "viscosity.relaxation_times"] if scene.viscosity is not None else []
     if scene.porosity is not None:
@@ -68,7 +70,7 @@ def _leaves(scene: lj.Scene) -> dict:
     names += ["solve.dt"] if scene.solve.dt is not None else []
     names += ["traction.0.pressure" if lj.boundary.follows(scene.traction) else "traction.0.value"]
     if scene.solve.kind == "static" and (scene.porosity is None or scene.porosity.scheme == "lagged"):
-        names.remove("start")  # the equilibrium does not know where it was sought from
+        names.remove("start")  # the equilibrium does not depend on its starting point
     return {name: _value(scene, name) for name in names} | {"law.mu": jnp.full(scene.mesh.number_of_elements, 770.0)}
 
 
@@ -87,7 +89,7 @@ KINDS = ("static", "follower", "dynamic", "newmark", "viscous", "isochoric", "po
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_leaf_of_a_scene(kind):
-    """Reverse mode against central differences (best of several steps) and against forward mode."""
+    """Compare reverse mode with central differences (best of several steps) and with forward mode."""
     scene, rng = _scene(kind), np.random.default_rng(5)
     at = _leaves(scene)
     names = list(at)
@@ -117,10 +119,11 @@ def test_every_leaf_of_a_scene(kind):
     zero = jnp.zeros(len(names))
     direction = jnp.asarray(rng.normal(size=len(names)))
     forward = jax.jit(lambda eps: jax.jvp(lambda eps: moved(eps)[0], (eps,), (direction,))[1])(zero)
-    # The same products in another order; the adjoint solves end at 1e-13 of their loads.
+    # Both modes have the same products in another order. The adjoint solves have a relative residual of 1e-13.
     assert abs(forward - slopes @ direction) < 1e-10 * (abs(slopes) @ abs(direction))
 
-    # Against the sum of what its entries contribute: a slope whose entries cancel is no measure.
+    # Errors are relative to the sum of the sizes of all contributions, because the contributions of a derivative may
+    # cancel.
     sizes = [float(jnp.vdot(abs(found.gradient[name]), abs(along[name]))) for name in names]
     steps = (4e-4, 1e-4)
     errors = np.full((len(steps), len(names)), np.inf)
@@ -137,7 +140,7 @@ def _sum(result):
     return jnp.sum(result.positions[-1] ** 2)
 
 
-#: Several kinds in one program, and some numbers of each; the slow test takes all of them.
+#: Several physics objects in one program, and some parameters of each. The slow test uses all of them.
 TOGETHER = {
     "static": ("law.mu", "displaced.0.by", "traction.0.value"),
     "follower": ("law.mu", "displaced.0.by", "traction.0.pressure", "mesh.points"),
@@ -146,7 +149,7 @@ TOGETHER = {
 }
 
 
-#: The one with the fewest equations runs with the core, for other versions of jax.
+#: The case with the fewest equations is in the core tests, which run with other versions of jax.
 MARKS = {
     "static": (pytest.mark.core, pytest.mark.slow),
     "newmark isochoric porous": pytest.mark.slow,
@@ -157,7 +160,7 @@ MARKS = {
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=MARKS[k]) if k in MARKS else k for k in TOGETHER])
 def test_some_leaves_of_a_scene(kind):
-    """Six tetrahedra, two steps: central differences of the value, from the program of the gradient itself."""
+    """Six tetrahedra and two steps. Central differences use the value from the program of the gradient itself."""
     scene = _scene(kind, cells=(1, 1, 1), steps=2)
     at = {name: value for name, value in _leaves(scene).items() if name in TOGETHER[kind]}
     assert len(at) == len(TOGETHER[kind])
@@ -173,12 +176,12 @@ def test_some_leaves_of_a_scene(kind):
         for h in (1e-2, 1e-3, 1e-4):
             ends = [lj.value_and_gradient(_weighted, scene, at | {name: at[name] + s * along[name]}) for s in (h, -h)]
             errors.append(abs(float(ends[0].value - ends[1].value) / (2 * h) - slope) / entries)
-        # Truncation is h^2, 1e-8 at the last; roundoff of a value at a tolerance of 1e-12 is that over h.
+        # The truncation error is h^2, at last 1e-8. Rounding is the tolerance of the value, 1e-12, divided by h.
         assert min(errors) < 1e-7, (name, errors)
 
 
 def _weighted(result):
-    """Positions and reactions, every entry with a weight of its own."""
+    """Return the sum of positions and reactions, every entry with a separate weight."""
     n = result.positions.size
     weight = jnp.cos(jnp.arange(n, dtype=float)).reshape(result.positions.shape)
     return jnp.sum(weight * result.positions) + 1e-3 * jnp.sum(weight[::-1] * result.reactions)
@@ -187,7 +190,7 @@ def _weighted(result):
 @pytest.mark.slow
 @pytest.mark.parametrize("store", ["sqrt", 1, 3])
 def test_what_is_kept_changes_no_derivative(store):
-    """Five steps: segments of three and two; one of all; of two, two and one."""
+    """Five steps in segments of three and two, in one segment, and in segments of two, two and one."""
     scene = _scene("viscous")
     scene = replace(scene, solve=replace(scene.solve, steps=5, tolerance=1e-8))
     at = {"law.mu": 770.0, "viscosity.ratios": scene.viscosity.ratios}
@@ -202,7 +205,9 @@ def test_what_is_kept_changes_no_derivative(store):
 
 @pytest.mark.slow
 def test_a_step_keeps_no_more_than_its_state_and_root():
-    """The derivative's program holds no array of all steps that is larger than the state: XLA's own account."""
+    """The program of the derivative stores no array over all steps that is larger than the state, by XLA's memory
+    analysis.
+    """
     scene = _scene("complete")
     sizes = []
     for steps in (20, 120):
@@ -223,7 +228,9 @@ def test_a_step_keeps_no_more_than_its_state_and_root():
 
 @pytest.mark.slow
 def test_codes_of_derivatives():
-    """Through a step that did not converge, and where the adjoint solve gives nothing: one program, two tolerances."""
+    """The derivative is computed through a step that did not converge, and where the adjoint solve fails. Both use one
+    program with two tolerances.
+    """
     scene = _scene("static", cells=(1, 1, 1), steps=1)
 
     def spoiled(result):
@@ -267,14 +274,16 @@ def test_segments_cover_all_steps():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["static", "dynamic viscous", "complete"])
 def test_a_second_derivative_of_a_run(kind):
-    """Forward mode first, against central differences of the gradient; the other order is right, or NaN."""
+    """Forward over reverse mode is compared with central differences of the gradient. The other order is right,
+    or NaN.
+    """
     scene = _scene(kind, (1, 1, 1), 2)
 
     def size(mu):
         return jnp.sum(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})).positions[-1] ** 2) * 1e4
 
     slope, h = jax.jit(jax.grad(size)), 0.8
-    # Second order: halving the width leaves a quarter of the error.
+    # Second order: half the step leaves a quarter of the error.
     wide, narrow = (float(slope(770.0 + d) - slope(770.0 - d)) / (2 * d) for d in (2 * h, h))
     expected = narrow + (narrow - wide) / 3
     found = float(jax.grad(jax.jacfwd(size))(770.0))

@@ -1,4 +1,4 @@
-"""Harmonic motion: against waves in closed form, against runs in time, and its derivatives."""
+"""Harmonic motion: against waves in closed form, against transient runs, and its derivatives."""
 
 import tomllib
 
@@ -40,7 +40,7 @@ kind = "harmonic"
 
 
 def slab(n: int, order: int, **changes) -> lj.Scene:
-    """A slab of n cells along z that moves along x alone; its lower face is driven, its upper one is free."""
+    """A slab of n cells along z that moves along x only. Its lower face is driven, its upper face is free."""
     mesh = lj.shapes.box((LENGTH / n, LENGTH / n, LENGTH), (1, 1, n))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     return lj.Scene(
@@ -55,20 +55,20 @@ def slab(n: int, order: int, **changes) -> lj.Scene:
 
 
 def standing(z: np.ndarray, G: np.ndarray, length: float = LENGTH) -> np.ndarray:
-    """Amplitudes (F, V) [m] between a driven and a free face, of complex moduli G (F,) [Pa]."""
+    """Return amplitudes (F, V) [m] between a driven and a free face, for complex moduli G (F,) [Pa]."""
     k = (2 * np.pi * FREQUENCIES * np.sqrt(DENSITY / G))[:, None]
     return 1e-4 * np.cos(k * (length - z[None])) / np.cos(k * length)
 
 
 def modulus(prony: lj.Prony = PRONY) -> np.ndarray:
-    """G* (F,) [Pa] by the textbook's formula."""
+    """Return G* (F,) [Pa] by the textbook formula."""
     g, tau = np.asarray(prony.ratios), np.asarray(prony.relaxation_times)
     w = 2 * np.pi * FREQUENCIES[:, None]
     return MU * (1 - np.sum(g / (1 + 1j * w * tau), axis=1))
 
 
 def off(n: int, order: int, mass: str = "consistent") -> float:
-    """Largest error of the slab's motion, over the largest motion."""
+    """Return the largest error of the slab's motion, divided by the largest motion."""
     scene = slab(n, order)
     found = np.asarray(lj.harmonic(scene, FREQUENCIES, mass=mass).check().displacement[:, :, 0])
     exact = standing(np.asarray(scene.mesh.points)[:, 2], modulus())
@@ -77,12 +77,14 @@ def off(n: int, order: int, mass: str = "consistent") -> float:
 
 @pytest.mark.core
 def test_a_plane_shear_wave_and_its_order(verified):
-    """Wavelengths of 17 and 27 mm: the motion is wrong by h^2 and h^3, the phase of quadratic elements by h^4."""
+    """The wavelengths are 17 and 27 mm. The error of the motion is of order h^2 and h^3, that of the phase of quadratic
+    elements of order h^4.
+    """
     linear = [off(n, 1) for n in (40, 80)]
     quadratic = [off(n, 2) for n in (20, 40)]
     orders = [float(np.log2(e[0] / e[1])) for e in (linear, quadratic)]
     assert 1.9 < orders[0] < 2.1 and 2.8 < orders[1] < 4.2
-    # Eleven elements a wave, and twice as many.
+    # Eleven elements per wavelength, and twice as many.
     assert quadratic[0] < 2e-3 and quadratic[1] < 2e-4
     verified(
         "plane shear wave, viscoelastic, 23 quadratic elements a wave", "closed form", quadratic[1], 2e-4, orders[1]
@@ -95,7 +97,7 @@ def test_lumped_masses_cost_quadratic_elements_their_order():
 
 
 def test_a_torsional_wave(verified):
-    """A cylinder whose lower face turns: every section turns as a whole, by the slab's formula."""
+    """The lower face of a cylinder turns. Every section turns as a whole, by the formula of the slab."""
     mesh = lj.quadratic(lj.shapes.cylinder(0.004, 0.01, 0.002))
     low, points = np.asarray(mesh.node_sets["bottom"]), np.asarray(mesh.points)
     turn = 1e-4 / 0.004 * np.stack([-points[:, 1], points[:, 0], 0 * points[:, 0]], axis=1)
@@ -109,14 +111,14 @@ def test_a_torsional_wave(verified):
     found = np.asarray(lj.harmonic(scene, FREQUENCIES).check().displacement)
     exact = turn[None] * (standing(points[:, 2], modulus(), 0.01) / 1e-4)[:, :, None]
     error = np.abs(found - exact).max() / np.abs(exact).max()
-    assert error < 0.02  # eight elements a wave
+    assert error < 0.02  # eight elements per wavelength
     verified("torsional wave, viscoelastic, 2 mm quadratic elements", "closed form", error, 0.02)
 
 
 def around_a_sphere(X: np.ndarray, G: complex, K: complex, omega: float, radius: float) -> np.ndarray:
-    """Motion (V, 3) about a rigid sphere that swings along z with amplitude 1 (Oestreicher 1951, JASA 23, 707).
+    """Motion (V, 3) around a rigid sphere that oscillates along z with amplitude 1 (Oestreicher 1951, JASA 23, 707).
 
-    u = grad(A p(r) cos t) + curl curl(B g(r) e_z), p and g spherical Hankel functions of order 1 and 0.
+    u = grad(A p(r) cos t) + curl curl(B g(r) e_z), with spherical Hankel functions p and g of order 1 and 0.
     """
     r = np.linalg.norm(X, axis=1)
     cosine = X[:, 2] / r
@@ -126,7 +128,7 @@ def around_a_sphere(X: np.ndarray, G: complex, K: complex, omega: float, radius:
         e, g = np.exp(-1j * kp * r) / (kp * r), np.exp(-1j * ks * r) / (ks * r)
         p, dp = -(1j * kp + 1 / r) * e, ((1j * kp + 1 / r) ** 2 + 1 / r**2) * e
         dg, ddg = -(1j * ks + 1 / r) * g, ((1j * ks + 1 / r) ** 2 + 1 / r**2) * g
-        return p / r, dp, dg / r + ks**2 * g, ddg + ks**2 * g  # across and along r, for A and for B
+        return p / r, dp, dg / r + ks**2 * g, ddg + ks**2 * g  # perpendicular to r and along r, for A and for B
 
     pa, pr, ga, gr = waves(radius)
     A, B = np.linalg.solve(np.array([[pr, gr], [pa, ga]]), np.ones(2))
@@ -137,7 +139,9 @@ def around_a_sphere(X: np.ndarray, G: complex, K: complex, omega: float, radius:
 
 @pytest.mark.slow
 def test_waves_about_a_sphere_that_swings(verified):
-    """A box beside the sphere, driven at its surface by the closed form, moves within as that says; K is 10 G."""
+    """A box beside the sphere is driven at its surface by the closed form. Inside, the motion agrees with it; K is 10
+    G.
+    """
     radius, side, errors = 0.003, 0.009, []
     for n in (3, 6):
         box = lj.quadratic(lj.shapes.box((side,) * 3, (n,) * 3))
@@ -167,19 +171,21 @@ def test_waves_about_a_sphere_that_swings(verified):
 
 
 def stretched(scene: lj.Scene, stretch: float) -> jax.Array:
-    """Positions of the slab stretched along z."""
+    """Return the positions of the slab stretched along z."""
     return scene.mesh.points * jnp.array([[1.0, 1.0, stretch]])
 
 
 @pytest.mark.parametrize("part", [pytest.param("all", marks=pytest.mark.slow), "isochoric"])
 def test_about_a_stretched_state(part):
-    """The stress that has not relaxed stiffens the slab: its modulus there from derivatives of the energy alone."""
+    """The stress that has not relaxed stiffens the slab. Its modulus in this state is computed from the energy
+    alone.
+    """
     prony = replace(PRONY, part=part)
     scene = replace(slab(30, 2), viscosity=prony)
     F0, law = jnp.diag(jnp.array([1.0, 1.0, 1.2])), scene.law
 
     def of(law: Law) -> tuple[float, float]:
-        """d2W/dF_xz^2 and the second Piola-Kirchhoff stress S_zz."""
+        """Return d2W/dF_xz^2 and the second Piola-Kirchhoff stress S_zz."""
         P = jax.grad(law.energy)
         return float(jax.jacfwd(P)(F0)[0, 2, 0, 2]), float(P(F0)[2, 2] / 1.2)
 
@@ -190,17 +196,17 @@ def test_about_a_stretched_state(part):
     found = np.asarray(lj.harmonic(scene, FREQUENCIES, about=stretched(scene, 1.2)).check().displacement[:, :, 0])
     exact = standing(np.asarray(scene.mesh.points)[:, 2], C)
     assert np.abs(found - exact).max() < 2e-3 * np.abs(exact).max()
-    # Without the state the answer is another one.
+    # Without the state, the result would be different.
     assert np.abs(standing(np.asarray(scene.mesh.points)[:, 2], modulus()) - exact).max() > 0.1 * np.abs(exact).max()
 
 
 @pytest.mark.slow
 def test_a_run_in_time_comes_to_it():
-    """A compressed slab, at rest for long, is driven until it is steady: the error falls with dt^2."""
+    """A compressed slab, at rest for a long time, is driven until the motion is steady. The error falls with dt^2."""
     n, f, errors = 6, 100.0, []
     for per_cycle in (32, 64):
         dt, cycles = 1 / f / per_cycle, 40
-        at_rest = 10 * per_cycle  # as many steps, each 33 times the relaxation time in all
+        at_rest = 10 * per_cycle  # equally many steps, in total 33 times the relaxation time
         times = np.arange(at_rest + cycles * per_cycle + 1) * dt
         after = np.maximum(times - at_rest * dt, 0.0)
         wave = 1e-5 * np.sin(2 * np.pi * f * after) * np.minimum(after * f / 2, 1.0) ** 2
@@ -235,14 +241,14 @@ def test_a_run_in_time_comes_to_it():
 
 @pytest.mark.parametrize(("order", "n"), [pytest.param(1, 20, marks=pytest.mark.slow), (2, 10)])
 def test_the_error_of_the_mesh(order, n):
-    """It is what the closed form says, within a tenth: 18 % and 1.2 % of the motion."""
+    """The estimated error agrees with the closed form within a tenth: 18 % and 1.2 % of the motion."""
     scene = slab(n, order)
     found = lj.harmonic(scene, FREQUENCIES)
     estimate = np.asarray(lj.harmonic_mesh_error(scene, found))[:, :, 0]
     exact = standing(np.asarray(scene.mesh.points)[:, 2], modulus())
     missing = exact - np.asarray(found.displacement)[:, :, 0]
     assert np.all(np.linalg.norm(estimate - missing, axis=1) < 0.1 * np.linalg.norm(missing, axis=1))
-    # The force on the driven face, in closed form: the slope of the motion there.
+    # The force on the driven face in closed form follows from the derivative of the motion there.
     low = np.asarray(scene.mesh.node_sets["z_min"])
     area = np.ptp(np.asarray(scene.mesh.points)[:, :2], axis=0).prod()
     k = 2 * np.pi * FREQUENCIES * np.sqrt(DENSITY / modulus())
@@ -256,7 +262,9 @@ def test_the_error_of_the_mesh(order, n):
 
 
 def test_derivatives_in_both_modes_and_by_differences():
-    """By moduli of elements, the relaxation time and the density; differences have their floor at eps^(2/3)."""
+    """Derivatives with respect to element moduli, the relaxation time and the density. The error of differences has its
+    minimum at eps^(2/3).
+    """
     scene = slab(4, 2)
     E = scene.mesh.number_of_elements
     rng = np.random.default_rng(3)
@@ -283,7 +291,7 @@ def test_derivatives_in_both_modes_and_by_differences():
 
 
 def test_supports_and_regions_take_part():
-    """A stiff slab on springs is a mass on a spring: u = p A / (k A - omega^2 m) of a traction p."""
+    """A stiff slab on springs is a mass on a spring: u = p A / (k A - omega^2 m) for a traction p."""
     from liverjax.physics.elastic_support import ElasticSupport
 
     mesh = lj.shapes.box((0.02, 0.02, 0.01), (2, 2, 1))
@@ -298,7 +306,7 @@ def test_supports_and_regions_take_part():
     )
     u = np.asarray(lj.harmonic(scene, FREQUENCIES).check().displacement[:, :, 2])
     exact = 2.0 / (1e6 - (2 * np.pi * FREQUENCIES) ** 2 * 1000.0 * 0.01)
-    # The slab itself gives way by p h/(K + 4/3 mu), 2e-6 of it.
+    # The strain of the slab itself is p h/(K + 4/3 mu), 2e-6 of u.
     assert np.allclose(u, exact[:, None], rtol=1e-5)
 
 
@@ -340,7 +348,9 @@ def test_what_cannot_be_is_refused(changes, words):
     ids=["numbers", "law", "viscosity"],
 )
 def test_the_state_of_rest_of_regions_has_relaxed(region):
-    """Against a static run of very long steps, in which all modes relax: regions kept their first moduli, 12 % off."""
+    """Compare with a static run of very long steps, in which all modes relax. Regions once kept their instantaneous
+    moduli, with an error of 12 %.
+    """
     content = tomllib.loads(FILE) | {"viscosity": {"ratios": [0.5], "relaxation_times": [0.1]}}
     content["region"] = [{"where": {"x_min": 0.0149}} | region]
     content["mesh"] = content["mesh"] | {"cells": [4, 1, 1]}
@@ -352,15 +362,16 @@ def test_the_state_of_rest_of_regions_has_relaxed(region):
     content["solve"] = {"kind": "harmonic", "frequencies": [40.0]}
     rest = under_its_weight(scene_from(content))
     moved = np.abs(long - scene_from(content).mesh.points).max()
-    assert np.abs(rest - long).max() < 1e-6 * moved  # Newton's tolerance of 1e-8, and modes of exp(-1e7)
+    # Newton's tolerance is 1e-8, and the modes have relaxed to exp(-1e7)
+    assert np.abs(rest - long).max() < 1e-6 * moved
 
 
 def test_histories_are_refused():
-    """They were dropped without a word, or ended in a traceback."""
+    """Without this check, histories were ignored silently, or ended in a traceback."""
     scene = slab(2, 1)
     moved = replace(scene.displaced[0], times=jnp.array([0.0, 1.0]), history=jnp.array([1.0, 2.0]))
     solve = replace(scene.solve, kind="harmonic", frequencies=jnp.array([10.0]))
-    with pytest.raises(lj.InputError, match=r"displaced\.0\.history is for runs in time"):
+    with pytest.raises(lj.InputError, match=r"displaced\.0\.history cannot be used with kind = 'harmonic'"):
         lj.check_scene(replace(scene, displaced=(moved, *scene.displaced[1:]), solve=solve))
 
 
@@ -377,12 +388,14 @@ def test_what_acts_in_one_direction_is_told_and_a_motion_without_a_drive():
     assert cautions_of_waves(replace(scene, physics=(wall,)), 0.99 * scene.mesh.points) == []
     assert cautions_of_waves(replace(scene, physics=(wall,)), 1.01 * scene.mesh.points) == []
     (said,) = cautions_of_waves(replace(scene, displaced=()))
-    assert said.startswith("nothing drives the motion")
+    assert said.startswith("the scene has no excitation")
 
 
 @pytest.mark.slow
 def test_an_obstacle_stands_where_it_begins():
-    """Scenes of Python may have histories for their runs in time: harmonic motion takes where they begin."""
+    """Scenes made in Python may have histories for transient runs. Harmonic motion uses the position at their
+    beginning.
+    """
     scene = slab(2, 1)
     side = lj.boundary.boundary_triangles(
         scene.mesh, np.flatnonzero(scene.mesh.points[:, 0] > 0.999 * scene.mesh.points[:, 0].max())

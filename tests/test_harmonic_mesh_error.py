@@ -1,4 +1,4 @@
-"""Three waves in closed form by ten quadratic elements a wave: how far off, and with the mesh's estimate added."""
+"""Three waves in closed form with ten quadratic elements per wavelength: errors without and with the estimate added."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +24,10 @@ def scene_of(mesh, displaced, **changes):
 
 
 def plane(edge):
-    """A column of cells between a driven and a free face, 1.8 waves long: scene, prescribed and exact motion, nodes."""
+    """A column of cells between a driven and a free face, 1.8 wavelengths long.
+
+    Returns the scene, prescribed and exact motion, and nodes.
+    """
     n = round(1.8 * WAVE / edge)
     mesh = lj.quadratic(lj.shapes.box((edge, edge, n * edge), (1, 1, n)))
     exact = np.zeros((mesh.number_of_nodes, 3), complex)
@@ -35,7 +38,7 @@ def plane(edge):
 
 
 def torsional(edge):
-    """A quarter of a cylinder of 40 sides that is turned below: of the polygon itself 0.02 % is left."""
+    """A quarter of a cylinder with 40 sides, turned at its bottom. The polygon causes an error of 0.02 %."""
     n, radius = round(0.6 * WAVE / edge), 0.004
     mesh = lj.quadratic(cylinders.sector(np.linspace(0, radius, 3), edge * np.arange(n + 1), 40, 10).mesh)
     X, low = np.asarray(mesh.points), np.asarray(mesh.node_sets["bottom"])
@@ -47,9 +50,10 @@ def torsional(edge):
 
 
 def about_a_sphere(edge):
-    """A box of 0.8 waves beside a sphere that swings, driven at its surface by the closed form (Oestreicher).
+    """A box of 0.8 wavelengths beside an oscillating sphere, driven at its surface by the closed form (Oestreicher).
 
-    The drive is known at nodes alone, which leaves 0.13 % beside the surface: the outermost cells are left out.
+    The drive is known at nodes only, which causes an error of 0.13 % near the surface. So the outermost cells are left
+    out.
     """
     n = round(0.8 * WAVE / edge)
     mesh = lj.quadratic(lj.shapes.box((n * edge,) * 3, (n,) * 3))
@@ -62,8 +66,9 @@ def about_a_sphere(edge):
 
 
 def off(wave, elements):
-    """Largest error over the largest motion: of the answer, of the answer with its estimate; and the mean square error
-    of the estimate over what is missing."""
+    """Return the largest error over the largest motion, without and with the estimate, and the root mean square error
+    of the estimate over the true error.
+    """
     scene, motion, exact, where = wave(WAVE / elements)
     found = lj.harmonic(scene, HERTZ, motion=motion).check()
     estimate = np.asarray(lj.harmonic_mesh_error(scene, found, motion=motion))[0]
@@ -78,7 +83,7 @@ def off(wave, elements):
     [pytest.param(w, marks=pytest.mark.slow) for w in (plane, torsional, about_a_sphere)],
 )
 def test_ten_quadratic_elements_a_wave(wave, verified):
-    """They leave a few thousandths of the motion, by h^3; the estimate says how much, and where."""
+    """The error is a few thousandths of the motion, of order h^3. The estimate shows its size and position."""
     coarse, fine = (off(wave, elements) for elements in (5, 10))
     order = float(np.log2(coarse[0] / fine[0]))
     assert 2.5 < order < 4.2 and fine[0] < 6e-3
@@ -89,7 +94,7 @@ def test_ten_quadratic_elements_a_wave(wave, verified):
 
 
 def test_a_body_whose_density_varies_keeps_it_in_the_richer_space():
-    """Functions that were added had the mean of the body: a stated error was four times the true one."""
+    """Added shape functions once had the mean density of the body, and a stated error was four times the true one."""
     mesh = lj.quadratic(lj.shapes.box((0.1, 0.03, 0.03), (4, 1, 1)))
     density = 2000.0 + 1500.0 * jnp.tanh((mesh.points[:, 0] - 0.05) / 0.02)
     scene = lj.Scene(
@@ -99,7 +104,7 @@ def test_a_body_whose_density_varies_keeps_it_in_the_richer_space():
         solve=lj.Solve(kind="harmonic", frequencies=jnp.array([2.0])),
     )
     richer = enriched(scene)
-    # The functions of vertices and middles add up to one in both spaces; so do the masses of every element.
+    # The functions of vertices and middle nodes add up to one in both spaces, and so do the masses of every element.
     own, more = (np.asarray(element_operator(s).mass)[:10, :10].sum(axis=(0, 1)) for s in (scene, richer))
     np.testing.assert_allclose(more, own, rtol=1e-12)
     exact = np.asarray(mesh.volumes * jnp.mean(density[mesh.tetrahedra], axis=1))
@@ -107,6 +112,6 @@ def test_a_body_whose_density_varies_keeps_it_in_the_richer_space():
     added = np.asarray(richer.body.density)[mesh.number_of_nodes :]
     nodes = np.stack([np.asarray(n) for n in richer.mesh.element_nodes])[10:] - mesh.number_of_nodes
     of_element = exact / np.asarray(mesh.volumes)
-    for k, value in enumerate(added):  # between the densities of the elements around
+    for k, value in enumerate(added):  # between the densities of the surrounding elements
         around = of_element[np.any(nodes == k, axis=0)]
         assert around.min() - 1e-9 <= value <= around.max() + 1e-9

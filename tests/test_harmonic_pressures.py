@@ -1,4 +1,4 @@
-"""Harmonic motion of sponges and of bodies that keep their volume: against closed forms, runs in time, derivatives."""
+"""Harmonic motion of porous and of nearly incompressible bodies: closed forms, transient runs, derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +19,12 @@ from liverjax.waves.operator import forces_of_motion
 
 pytestmark = pytest.mark.quick_to_compile
 
-#: One cycle in two, and in a fifth of, the time of diffusion.
+#: One cycle takes twice the diffusion time, and a fifth of it.
 SLOW, FAST = 0.5 / DIFFUSION_TIME, 5 / DIFFUSION_TIME
 
 
 def oscillating(z: np.ndarray, hertz: float, permeability: float = 2e-5) -> tuple[np.ndarray, np.ndarray]:
-    """Settlement and pressure of Terzaghi's column under a load of this amplitude (Biot 1941, J. Appl. Phys. 12, 155).
+    """Settlement and pressure of Terzaghi's column under an oscillating load (Biot 1941, J. Appl. Phys. 12, 155).
 
     M u' = load + p, and i omega (p/K + u') = kappa p'', with p = 0 at the top and no flow at the base.
     """
@@ -37,7 +37,7 @@ def oscillating(z: np.ndarray, hertz: float, permeability: float = 2e-5) -> tupl
 
 
 def off_terzaghi(scene: lj.Scene) -> list[float]:
-    """Largest errors of settlement and pressure at the higher frequency, over the largest value."""
+    """Return the largest errors of settlement and pressure at the higher frequency, over the largest value."""
     found = lj.harmonic(scene, [SLOW, FAST]).check()
     exact = oscillating(np.asarray(scene.mesh.points)[:, 2], FAST)
     pairs = ((found.displacement[1, :, 2], exact[0]), (found.pressure[1], exact[1]))
@@ -45,7 +45,7 @@ def off_terzaghi(scene: lj.Scene) -> list[float]:
 
 
 def test_terzaghis_column_under_an_oscillating_load(verified):
-    """Of first order in the layer that is open to the top, as runs in time are."""
+    """The error is of first order in the thickness of the layer at the drained top, as in transient runs."""
     errors = np.array([off_terzaghi(column(n, 1, 1.0)) for n in (12, 24)])
     orders = np.log2(errors[0] / errors[1])
     assert np.all(errors[1] < 0.013) and np.all(orders > 0.9)
@@ -54,7 +54,7 @@ def test_terzaghis_column_under_an_oscillating_load(verified):
 
 @pytest.mark.slow
 def test_quadratic_elements_and_fluid_that_is_pumped():
-    """Eight quadratic layers settle as well as 24 linear ones; a pressure at the base drives what the load does not."""
+    """Eight quadratic layers settle as 24 linear ones do. Then a pressure or a flux at the base replaces the load."""
     assert off_terzaghi(enriched(column(8, 1, 1.0)))[0] < 0.013
     scene = column(24, 1, 1.0)
     base = np.flatnonzero(np.asarray(scene.mesh.points)[:, 2] < 1e-9)
@@ -62,25 +62,27 @@ def test_quadratic_elements_and_fluid_that_is_pumped():
     pumped = replace(scene, traction=(), porosity=replace(scene.porosity, inlet=(pump,)))
     p = np.asarray(lj.harmonic(pumped, [FAST]).check().pressure[0])
     z = np.asarray(scene.mesh.points)[:, 2]
-    # No load: u' = p/M, so that p'' = q^2 p.
+    # Without a load u' = p/M, so that p'' = q^2 p.
     q = np.sqrt(2j * np.pi * FAST / 2e-5 * (1 / 2200.0 + 1 / MODULUS))
     assert np.abs(p - np.sinh(q * (HEIGHT - z)) / np.sinh(q * HEIGHT)).max() < 0.013
-    # A flux through the base: -kappa p' = 1e-6 m/s of the fluid that enters.
+    # A flux through the base: -kappa p' is the 1e-6 m/s of fluid that enters.
     face = jnp.asarray(lj.boundary.boundary_triangles(scene.mesh, scene.mesh.node_sets["z_min"]))
     entering = Inlet(triangles=face, flux=1e-6)
     p = np.asarray(
         lj.harmonic(replace(pumped, porosity=replace(scene.porosity, inlet=(entering,))), [FAST]).pressure[0]
     )
     exact = 1e-6 / (2e-5 * q) * np.sinh(q * (HEIGHT - z)) / np.cosh(q * HEIGHT)
-    # Of first order in the layer that it enters.
+    # First order in the thickness of the layer at the inlet.
     assert np.abs(p - exact).max() < 0.04 * np.abs(exact).max()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_porous_run_in_time_comes_to_it(order):
-    """A viscous sponge is pressed until nothing flows, then swings: the error falls with dt, as implicit Euler's."""
-    # A cycle is a time of diffusion: what lags behind falls to 0.08 in each.
+    """A viscous porous body is compressed until the flow has ended, and then oscillates. The error falls with dt, as
+    expected for implicit Euler.
+    """
+    # A cycle takes one diffusion time. The transient part falls to 0.08 of itself in each cycle.
     hertz, errors = 2 * SLOW, []
     for per_cycle in (20, 40):
         dt, cycles, at_rest = 1 / hertz / per_cycle, 4, 8
@@ -104,17 +106,20 @@ def test_a_porous_run_in_time_comes_to_it(order):
         errors.append([float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs])
     orders = np.log2(np.array(errors[0]) / np.array(errors[1]))
     assert np.all(np.array(errors[1]) < 0.1) and np.all(abs(orders - 1) < 0.15), (errors, orders)
-    # The pressed sponge is another one than the sponge at rest.
+    # The compressed body moves differently from the body at rest.
     bare = lj.harmonic(small, [hertz]).displacement[0]
     assert np.abs(bare - exact.displacement[0]).max() > 0.05 * np.abs(bare).max()
 
 
 def sphere_box(n: int, bulk: float, volumetric: str) -> float:
-    """Largest error of a box beside a swinging sphere, over the largest motion; the law's bulk modulus is bulk mu."""
+    """Return the largest error of a box beside an oscillating sphere, over the largest motion.
+
+    The law's bulk modulus is bulk mu.
+    """
     side = 0.009
     box = lj.quadratic(lj.shapes.box((side,) * 3, (n,) * 3))
     X = np.asarray(box.points) + np.array([0.002, -0.004, 0.005])
-    # Volumes do not relax where they have pressures of their own.
+    # With separate pressures, the volumetric part does not relax.
     exact = around_a_sphere(X, modulus()[1], bulk * MU, 2 * np.pi * FREQUENCIES[1], 0.003)
     outer = np.flatnonzero(np.any((np.asarray(box.points) < 1e-9) | (np.asarray(box.points) > side - 1e-9), axis=1))
     scene = lj.Scene(
@@ -130,7 +135,7 @@ def sphere_box(n: int, bulk: float, volumetric: str) -> float:
 
 
 def test_waves_that_keep_the_volume(verified):
-    """About a swinging sphere with K = 100,000 G: mixed elements have their order, others are far off."""
+    """Around an oscillating sphere with K = 100,000 G, mixed elements have their order. Others have large errors."""
     errors = [sphere_box(n, 1e5, "mixed") for n in (3, 6)]
     order = float(np.log2(errors[0] / errors[1]))
     assert 2.5 < order < 4.2 and errors[1] < 3e-3
@@ -142,7 +147,7 @@ def test_waves_that_keep_the_volume(verified):
     ("volumetric", "order"), [*(pytest.param("mixed", k, marks=pytest.mark.slow) for k in (1, 2)), ("nodal", 1)]
 )
 def test_about_a_stretched_state_with_pressures(volumetric, order):
-    """The pressure of the state stiffens the slab too: its modulus there from derivatives of the energy alone."""
+    """The pressure of the state also stiffens the slab. Its modulus in this state is computed from the energy alone."""
     n = 30 if order == 2 else 160
     scene = replace(slab(n, order), viscosity=replace(PRONY, part="isochoric"), solve=lj.Solve(volumetric=volumetric))
     F0 = jnp.diag(jnp.array([1.0, 1.0, 1.2]))
@@ -161,7 +166,7 @@ def test_about_a_stretched_state_with_pressures(volumetric, order):
 
 @pytest.mark.slow
 def test_the_mesh_s_error_of_mixed_elements():
-    """From cubic elements: within a fifth of what the closed form says."""
+    """The estimate uses cubic elements, and agrees with the closed form within a fifth."""
     scene = replace(slab(10, 2), viscosity=replace(PRONY, part="isochoric"), solve=lj.Solve(volumetric="mixed"))
     found = lj.harmonic(scene, FREQUENCIES)
     estimate = np.asarray(lj.harmonic_mesh_error(scene, found))[:, :, 0]
@@ -171,7 +176,9 @@ def test_the_mesh_s_error_of_mixed_elements():
 
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_the_operator_is_the_derivative_of_the_forces(order):
-    """Against automatic differentiation of the forces of a body whose elements name their corners in any order."""
+    """Compare with automatic differentiation of the forces. The elements of the body list their corners in any
+    order.
+    """
     rng = np.random.default_rng(2)
     box = lj.shapes.box((1.0, 1.0, 1.0), (2, 1, 1))
     even = np.array([[0, 1, 2, 3], [1, 2, 0, 3], [3, 2, 1, 0], [2, 3, 0, 1]])
@@ -188,7 +195,7 @@ def test_the_operator_is_the_derivative_of_the_forces(order):
 
 
 def check_derivatives(scene: lj.Scene, at: dict, hertz: np.ndarray, about: jax.Array | None = None) -> None:
-    """Of a weighted sum of all results: backward against forward, and against differences with their floor."""
+    """Check the gradient of a weighted sum of all results: reverse against forward mode, and against differences."""
     way = {name: (0.2 + 0.1 * k) * value for k, (name, value) in enumerate(at.items())}
     rng = np.random.default_rng(3)
     found = lj.harmonic(scene, hertz, about=about)
@@ -200,7 +207,7 @@ def check_derivatives(scene: lj.Scene, at: dict, hertz: np.ndarray, about: jax.A
         kept = [a for a in (r.displacement, r.pressure) if a is not None]
         return sum(jnp.sum(w * a.real + w[::-1] * a.imag) for w, a in zip(weights, kept, strict=True))
 
-    # One program for values and gradients: a third fewer to compile.
+    # One program for values and gradients: a third less to compile.
     both = jax.jit(jax.value_and_grad(loss))
     gradient = both(at)[1]
     slope = sum(float(jnp.vdot(gradient[name], way[name])) for name in at)

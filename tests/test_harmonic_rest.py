@@ -1,4 +1,4 @@
-"""The state of rest about which a body moves: what acts there, and what is an amplitude of the motion alone."""
+"""The state of rest about which a body oscillates: which loads act there, and which are amplitudes only."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +19,9 @@ pytestmark = pytest.mark.quick_to_compile
 
 @pytest.mark.slow
 def test_inlets_are_amplitudes_and_no_loads_at_rest():
-    """Twice the inlet is twice the motion: its pressure swelled the body at rest, and the motion was 42 % off."""
+    """Twice the inlet gives twice the motion. The pressure of the inlet once swelled the body at rest, and the error of
+    the motion was 42 %.
+    """
     scene = column(6, 1, 1.0)
     base = np.flatnonzero(np.asarray(scene.mesh.points)[:, 2] < 1e-9)
     heavy = lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -1.0]))
@@ -64,11 +66,13 @@ steps = 4
 
 @pytest.mark.slow
 def test_a_body_rests_under_the_tension_of_its_ligaments(tmp_path):
-    """Without it the body moved about a shape that is in no balance, 18 % off, and nothing said so."""
+    """Without this tension the body oscillated about a shape that is not in equilibrium. The error was 18 %, without a
+    warning.
+    """
     (tmp_path / "scene.toml").write_text(LIGAMENT)
     scene = lj.load_scene(tmp_path / "scene.toml")
     x = under_its_weight(scene)
-    # A run in time that ends long after the relaxation.
+    # A transient run that ends long after the relaxation.
     rested = lj.simulate(scene).check().positions[-1]
     assert np.abs(x - rested).max() < 1e-6 * 0.06 and np.abs(rested - scene.mesh.points).max() > 0.005
     slack = replace(scene, physics=(replace(scene.physics[0], pre_tension=0.0),))
@@ -77,7 +81,7 @@ def test_a_body_rests_under_the_tension_of_its_ligaments(tmp_path):
 
 @pytest.mark.slow
 def test_a_run_whose_capsule_pulls_at_held_nodes_has_rested():
-    """Its forces were taken for those of stress that had not relaxed, of an elastic body."""
+    """The body is elastic. The membrane's forces were once taken for stress that has not relaxed."""
     table = {
         "mesh": {"shape": "box", "size": [0.08, 0.04, 0.04], "cells": [2, 1, 1]},
         "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
@@ -107,4 +111,4 @@ def test_a_region_that_relaxes_slowly_counts_in_a_loaded_shape():
         scene = scene_from(table | more)
         result = Result(times=0.05 * np.arange(1, 11), positions=None, reactions=None, status=None, statistics=None)
         said = cautions._of_stress_at_start(scene, result)
-        assert bool(said) == told and (not told or "relaxation time of 20 s" in said[0])
+        assert bool(said) == told and (not told or "relaxation time is 20 s" in said[0])

@@ -1,4 +1,4 @@
-"""Scenes of harmonic motion from files: what they may have, and refusals in one sentence."""
+"""Scenes of harmonic motion from files: allowed settings, and one-line messages for invalid input."""
 
 import json
 
@@ -30,7 +30,7 @@ def test_scene_files(tmp_path, capsys):
         assert file["mesh_error/reactions"].shape == expected.reactions.shape
     shown = meshio.read(tmp_path / "out" / "vtu" / "frequency_002.vtu").point_data["displacement_imaginary"]
     assert np.array_equal(shown, np.asarray(expected.displacement[1]).imag)
-    # About the last state of a run in time: there it is pulled by 10 %.
+    # The motion is about the last state of a transient run, stretched by 10 %.
     still = FILE.split("[[displaced]]")[0]
     pulled = "[[fixed]]\nwhere = {x_max = 0.0}\n[[displaced]]\nwhere = {x_min = 0.03}\nby = [0.003, 0.0, 0.0]\n"
     (tmp_path / "still.toml").write_text(still + pulled)
@@ -50,7 +50,7 @@ def test_scene_files(tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "told"), [(0.1, True), (1e4, False)])
 def test_a_run_that_has_not_rested_is_told(tmp_path, capsys, seconds, told):
-    """Four fifths of its stiffness relax in 100 s: after 0.1 s the forces are five times those at rest."""
+    """Four fifths of the stiffness relax in 100 s, so the forces after 0.1 s are five times those at rest."""
     viscous = FILE.split("[[displaced]]")[0] + "[viscosity]\nratios = [0.8]\nrelaxation_times = [100.0]\n"
     pulled = "[[fixed]]\nwhere = {x_max = 0.0}\n[[displaced]]\nwhere = {x_min = 0.03}\nby = [0.003, 0.0, 0.0]\n"
     (tmp_path / "pull.toml").write_text(f"{viscous}{pulled}history = [[0, 0], [0.1, 1]]\n[solve]\ndt = {seconds}\n")
@@ -80,12 +80,12 @@ def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
     expected = lj.harmonic(lj.load_scene(tmp_path / "scene.toml"), about=rest).displacement
     with h5py.File(tmp_path / "out" / "result.h5") as file:
         found = file["displacement"][()]
-    # Newton's tolerance of 1e-8; without the state the motion is another one.
+    # The bound is Newton's tolerance of 1e-8. Without the state, the motion is different.
     assert np.allclose(found, expected, rtol=1e-5, atol=1e-10)
     scene = lj.load_scene(tmp_path / "scene.toml")
     bare = lj.harmonic(scene, about=scene.mesh.points).displacement
     assert np.abs(bare - expected).max() > 1e-3 * np.abs(expected).max()
-    # In Python as from the command line.
+    # Python gives the same result as the command line.
     assert np.allclose(lj.harmonic(scene).displacement, expected, rtol=1e-5, atol=1e-10)
 
 
@@ -107,12 +107,12 @@ def test_gravity_has_a_derivative_through_the_state_of_rest(tmp_path):
 @pytest.mark.parametrize(
     ("part", "words"),
     [
-        ("[[support]]\nwhere = {x_max = 0.0}\nnormal = 1e3\nhistory = [[0, 0], [1, 1]]\n", "support.0.history is for"),
+        ("[[support]]\nwhere = {x_max = 0.0}\nnormal = 1e3\nhistory = [[0, 0], [1, 1]]\n", "support.0.history cannot"),
         (
             "[[obstacle]]\nshape = 'plane'\nposition = [0.05, 0, 0]\naxis = [-1, 0, 0]\nby = [-0.03, 0, 0]\n",
-            "obstacle.0.by is for runs in time",
+            "obstacle.0.by cannot be used with kind = 'harmonic'",
         ),
-        ("", "body.history is for runs in time"),
+        ("", "body.history cannot be used with kind = 'harmonic'"),
     ],
 )
 def test_what_moves_in_time_is_no_harmonic_motion(tmp_path, capsys, part, words):
@@ -126,13 +126,13 @@ def test_what_moves_in_time_is_no_harmonic_motion(tmp_path, capsys, part, words)
 @pytest.mark.parametrize(
     ("line", "more", "words"),
     [
-        ("", [], "frequencies = [60.0] (Hz) go together"),
+        ("", [], "frequencies = [60.0] (Hz) need each other"),
         ("frequencies = 60.0\n", [], "must be a list"),
-        ("frequencies = []\n", [], "frequencies = [] holds no frequency"),
-        ('frequencies = [60.0]\nreduced = "model.h5"\n', [], "reduced is for runs in time"),
+        ("frequencies = []\n", [], "frequencies = [] contains no frequency"),
+        ('frequencies = [60.0]\nreduced = "model.h5"\n', [], "reduced cannot be used with kind = 'harmonic'"),
         ("frequencies = [-60.0]\n", [], "frequencies"),
-        ("frequencies = [60.0]\n", ["--png"], "--png is for runs in time"),
-        ("frequencies = [60.0]\ndt = 0.01\n", [], "[solve] dt is for runs in time"),
+        ("frequencies = [60.0]\n", ["--png"], "--png cannot be used with [solve] kind = 'harmonic'"),
+        ("frequencies = [60.0]\ndt = 0.01\n", [], "[solve] dt cannot be used with [solve] kind = 'harmonic'"),
         ("frequencies = [60.0]\n", ["--about", "none.h5"], "holds no positions"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Springpots in harmonic motion: factors by element, about a stretched state, and from scene files."""
+"""Springpots in harmonic motion: factors for each element, about a stretched state, and from scene files."""
 
 import jax
 import jax.numpy as jnp
@@ -22,27 +22,29 @@ part = "isochoric"
 
 
 def test_springpots_by_element_are_factors():
-    """(i omega)^0.2 in two halves of the slab, one written by element."""
+    """The factor is (i omega)^0.2 in two halves of the slab, one of them written with one value per element."""
     scene = replace(slab(8, 2), viscosity=None)
     m = (1j * FREQUENCIES / 80) ** 0.2
     whole = lj.harmonic(scene, FREQUENCIES, factors=m)
     parts = lj.harmonic(scene, FREQUENCIES, factors=m[:, None] * np.ones(scene.mesh.number_of_elements))
     assert np.allclose(whole.displacement, parts.displacement, rtol=1e-12, atol=1e-16)
     z = np.asarray(scene.mesh.points)[:, 2]
-    # As coarse as this the mesh leaves 2 %.
+    # With this coarse mesh, the error is 2 %.
     assert np.abs(np.asarray(whole.displacement[:, :, 0]) - standing(z, MU * m)).max() < 0.02 * 2e-4
 
 
 @pytest.mark.parametrize("part", [pytest.param("all", marks=pytest.mark.slow), "isochoric"])
 def test_springpots_about_a_stretched_state(part):
-    """Spring, springpot and limit beside each other in the stretched slab: all numbers by mpmath from the energy."""
+    """Spring, springpot and limit act in parallel in the stretched slab. All numbers are computed by mpmath from the
+    energy.
+    """
     mpmath = pytest.importorskip("mpmath")
     own = lj.SpringpotSeries(
         times=jnp.array([0.0125]), exponents=jnp.array([0.2]), limits=jnp.array([4.0]), spring=0.6, part=part
     )
     scene = replace(slab(30, 2), viscosity=None, springpots=own)
 
-    def energy(shear, kept):  # F = diag(1, 1, 1.2) with F_xz = shear; without the volume's part if it is not kept
+    def energy(shear, kept):  # F = diag(1, 1, 1.2) with F_xz = shear; without the volumetric part unless it is kept
         def of(stretch):
             J, trace = stretch, 2 + stretch**2 + shear**2
             volume = 5 * MU * (J - 1) ** 2 if kept else 0  # half of 10 MU
@@ -64,7 +66,7 @@ def test_springpots_about_a_stretched_state(part):
     z = np.asarray(scene.mesh.points)[:, 2]
     exact = standing(z, np.array(C))
     assert np.abs(found - exact).max() < 2e-3 * np.abs(exact).max()
-    # Were the stress of the state that of the law, or none, the answer would be another one.
+    # With the full stress of the law in this state, or with none, the result would be different.
     for wrong in (1.0, 0.0):
         moved = standing(z, np.array(C) + (wrong - 0.6) * float(S))
         assert np.abs(moved - exact).max() > 1e-2 * np.abs(exact).max()
@@ -72,7 +74,7 @@ def test_springpots_about_a_stretched_state(part):
 
 @pytest.mark.slow
 def test_springpots_of_a_scene_file(tmp_path):
-    """A springpot, and one in a row with a spring, beside 0.3 of the law: factors by the formula in mpmath."""
+    """A springpot, and a springpot in series with a spring, in parallel with 0.3 of the law; factors by mpmath."""
     mpmath = pytest.importorskip("mpmath")
     (tmp_path / "scene.toml").write_text(FILE + "frequencies = [40.0, 60.0]\n" + SPRINGPOTS)
     scene = lj.load_scene(tmp_path / "scene.toml")
@@ -86,7 +88,7 @@ def test_springpots_of_a_scene_file(tmp_path):
     found = lj.harmonic(scene).check().displacement
     given = lj.harmonic(bare, factors=np.array(expected)).displacement
     np.testing.assert_allclose(found, given, rtol=1e-10, atol=1e-18)
-    # The volume does not relax: with part = "all" the motion is another one.
+    # The volumetric part does not relax. With part = "all" the motion is different.
     other = lj.harmonic(replace(scene, springpots=replace(scene.springpots, part="all"))).displacement
     assert np.abs(other - found).max() > 1e-3 * np.abs(found).max()
 
@@ -108,9 +110,9 @@ def test_springpots_of_a_scene_file(tmp_path):
         (
             "[springpots]",
             "[viscosity]\nratios = [0.1]\nrelaxation_times = [0.1]\n[springpots]",
-            "leave one of them out",
+            "remove one of them",
         ),
-        ('kind = "harmonic"\nfrequencies = [40.0]', 'kind = "static"', "for kind = 'harmonic'"),
+        ('kind = "harmonic"\nfrequencies = [40.0]', 'kind = "static"', "need kind = 'harmonic'"),
     ],
 )
 def test_springpots_that_cannot_be_are_refused(tmp_path, old, new, words):

@@ -1,4 +1,4 @@
-"""Histories of loads: the same run as one whose load has, at every step, the number of the table."""
+"""Histories of loads: the run equals a run whose load has the value of the table at every step."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from liverjax.scenes.scene_file import scene_from
 pytestmark = pytest.mark.quick_to_compile
 
 ROWS = [[0.0, 0.0], [0.1, 1.0], [0.2, 1.0], [0.3, -0.5]]
-#: Numbers of the table at the ends of four steps of 0.08 s.
+#: Values of the table at the ends of four steps of 0.08 s.
 FACTORS = np.interp([0.08, 0.16, 0.24, 0.32], *np.array(ROWS).T)
 
 
@@ -64,7 +64,7 @@ def test_a_history_of_factors_is_the_load_of_every_step(load):
     rows = [[t, abs(f)] for t, f in ROWS] if load == "springs" else ROWS
     factors = np.interp([0.08, 0.16, 0.24, 0.32], *np.array(rows).T)
     full = LOADS[load](lambda value: value, {"history": rows})
-    if load == "gravity":  # the constant part is a factor too
+    if load == "gravity":  # the constant part is multiplied by the history too
         full["body"]["gravity"][0] = 0.0
     scene = scene_from(content(**full))
     found = np.asarray(lj.simulate(scene).check().positions)
@@ -94,7 +94,7 @@ def test_vectors_files_and_rows_are_the_same(tmp_path):
 
 @pytest.mark.slow
 def test_a_dynamic_body_begins_with_the_load_of_the_beginning():
-    """A free cube, p(t) = p t/T: x = p t^3/(6 T rho h), which Newmark's method has to dt^2."""
+    """A free cube under p(t) = p t/T moves by x = p t^3/(6 T rho h). Newmark's method has this to order dt^2."""
     table = content(
         body={"density": 1000.0},
         traction=[{"where": TOP, "value": [0, 0, 80.0], "history": [[0.0, 0.0], [0.4, 1.0]]}],
@@ -104,7 +104,7 @@ def test_a_dynamic_body_begins_with_the_load_of_the_beginning():
     table.pop("fixed")
     scene = scene_from(table)
     moved = np.asarray(lj.simulate(scene).check().positions[-1] - scene.mesh.points)
-    # Average acceleration adds a T dt^2/12 to the integral of a ramp; lumped masses leave the centre of mass.
+    # Average acceleration adds a T dt^2/12 to the integral of a ramp. Lumped masses do not change the centre of mass.
     weights = np.asarray(lj.boundary.nodal_volumes(scene.mesh))
     centre = (weights[:, None] * moved).sum(axis=0) / weights.sum()
     rate = 80.0 / (1000.0 * 0.1) / 0.4
@@ -131,7 +131,7 @@ def test_derivative_by_an_entry_of_a_history():
     [
         (
             {"value": [0, 0, 1.0], "history": [[0, 0], [0, 1]]},
-            "traction.0 history must hold finite numbers at increasing",
+            "traction.0 history must have finite numbers at increasing",
         ),
         ({"value": [0, 0, 1.0], "history": [[0, 0, 1]]}, "traction.0 history is not a table of numbers: write"),
         ({"value": [0, 0, 1.0], "history": "none.csv"}, "none.csv cannot be read"),
@@ -159,7 +159,7 @@ def test_bad_histories_are_refused(table, words):
         (b"time\tfactor\n0\t1\n1\t2\n", "has one column"),
         (b"\xff\xfe\x00", "is not text"),
         (b"time,force\n0,0\n1,1\n", "has columns"),
-        (b"time,factor\n0,zero\n1,1\n", "must hold finite numbers"),
+        (b"time,factor\n0,zero\n1,1\n", "must have finite numbers"),
         (None, r"cannot be read \(No such file or directory\): give columns"),
     ],
 )
@@ -173,7 +173,7 @@ def test_files_that_are_no_table_are_one_sentence(tmp_path, content, words):
 
 
 def test_a_file_of_a_spreadsheet_is_read(tmp_path):
-    """It begins with a mark of its encoding and has empty lines."""
+    """The file begins with a byte-order mark and has empty lines."""
     (tmp_path / "h.csv").write_bytes(b"\xef\xbb\xbftime,factor\r\n0,0\r\n\r\n1,2\r\n")
     times, factors = history.read_history(tmp_path / "h.csv", "traction.0")
     assert list(times) == [0, 1] and list(factors) == [0, 2]

@@ -1,4 +1,4 @@
-"""What a fit says of its data: bounds of every material, the instrument's mark, order in residuals, the ends."""
+"""Messages on data: bounds that every material meets, signs of the instrument, structured residuals, band ends."""
 
 import itertools
 import json
@@ -28,7 +28,7 @@ OMEGA = np.geomspace(0.1, 100, 31)
 
 
 def material(seed: int, noise: float = 0.0, omega: np.ndarray = OMEGA) -> Sweep:
-    """Random Maxwell modes, some outside of the band."""
+    """Return random Maxwell modes, some of them outside the band."""
     rng = np.random.default_rng(seed)
     times, strengths = 10 ** rng.uniform(-4, 3, 6), rng.uniform(0, 100, 6)
     x = 1j * omega[:, None] * times
@@ -53,17 +53,19 @@ def test_chances_of_runs_are_those_of_counting_every_order(ups):
 
 
 def test_residuals_nearly_all_of_one_sign_are_not_random():
-    """One small residual of the other sign made them so: true stress read as nominal stress was not named."""
+    """One small residual of the other sign hid the structure. True stress read as nominal stress was not reported."""
     r = np.linspace(1.0, 2.0, 24)
     r[11] = -0.1
     assert runs_probability(r) == (3, pytest.approx(2 * 25 / 2**24, rel=1e-12))
     assert runs_probability(-r) == runs_probability(r)
-    r[11] = -20.0  # one outlier moves the fit away from all other points
+    r[11] = -20.0  # one outlier shifts the fit away from all other points
     assert runs_probability(r) == (3, 1.0)
 
 
 def test_the_runs_of_long_records_are_counted_at_once():
-    """Against whole numbers; 100,000 points took minutes, and by Wald and Wolfowitz's normal limit half are below."""
+    """Compare with exact integer counts. For 100,000 points this took minutes; the probability agrees with Wald and
+    Wolfowitz's normal limit.
+    """
     signs = np.sign(np.random.default_rng(3).standard_normal(600))
     runs, chance = runs_probability(signs)
     a, b = int((signs > 0).sum()), int((signs < 0).sum())
@@ -86,15 +88,15 @@ def test_no_material_is_accused(noise):
     accused = [
         bool(kramers_kronig.sentences(of_data(material(seed, noise)), material(seed, noise))) for seed in range(60)
     ]
-    # Four standard deviations, three bounds at 30 places: 0.3 % of sweeps by chance.
+    # Four standard deviations, three bounds at 30 frequencies: by chance in 0.3 % of the sweeps.
     assert sum(accused) <= 1
 
 
 @pytest.mark.parametrize(("slope", "breaks"), [(0.95, False), (1.3, True), (-0.1, True)])
 def test_the_bound_on_the_rise_is_the_loss_itself(slope, breaks):
-    """G'' of 100 Pa everywhere: G' may rise by 100 Pa an e-fold (a single mode at its time does), by no more."""
+    """G'' is 100 Pa everywhere. G' may rise by 100 Pa per e-fold (as a single mode does at its time), but not more."""
     s = Sweep(OMEGA, 600 + slope * 100 * np.log(OMEGA), np.full(31, 100.0))
-    # Between two frequencies the loss may be higher than at either by half of their step: 12 % here.
+    # Between two frequencies the loss may be larger than at both of them, by half of its change: 12 % here.
     assert bool(of_data(s).breaches) == breaks
 
 
@@ -107,14 +109,14 @@ def test_the_inertia_of_the_instrument_is_named(sign):
         found = of_data(spoiled)
         told = kramers_kronig.sentences(found, spoiled)
         assert found.onset is not None and "mark of the instrument" in told[0], seed
-        # what the sentence asks for keeps the last good point and mends the sweep
+        # the advice of the message keeps the last good point and repairs the sweep
         limit = float(told[0].split("--max-frequency ")[1].split()[0])
         kept = within(spoiled, None, limit)
         assert np.isclose(kept.angular_frequency[-1], found.onset)
 
 
 def test_the_mark_is_called_by_the_bound_that_it_breaks():
-    """A loss that jumps at the last point is a breach as well, behind that of the inertia."""
+    """A loss that jumps at the last point is a breach too, but it is listed after that of the inertia."""
     s = material(0, 0.001)
     k = len(s.storage) - 3
     storage, loss = s.storage.copy(), s.loss.copy()
@@ -133,7 +135,9 @@ def test_a_drift_is_called_one():
 
 
 def test_measured_sweeps_are_judged_as_their_raw_torque_is():
-    """The sample carries 0.4 to 1.8 % of the raw torque at the end of these sweeps; elsewhere it carries it all."""
+    """At the end of these sweeps, the sample carries 0.4 to 1.8 % of the raw torque. In the other sweeps it carries
+    all.
+    """
     s = read_sweep(LIONS_MANE)
     found = of_data(s)
     assert found.onset == pytest.approx(79.4327, rel=1e-4)
@@ -170,7 +174,7 @@ def test_changes_are_those_of_a_fit_to_the_points_left():
     s = two_modes(0.02)
     f = viscoelastic.closed_form(s, 2)
     changes = edges.sensitivity(f, s)
-    # A fresh fit to a file without the points, with the weights that they have among all: other starts.
+    # A new fit without the points, but with their weights among all points. Its starting points are different.
     weights = dict(zip(("storage_sd", "loss_sd"), s.deviations, strict=True))
     left = some(s._replace(**weights), s.angular_frequency < 100 / np.sqrt(10) * 0.999)
     last = viscoelastic.closed_form(left, 2)
@@ -192,8 +196,8 @@ def test_exact_data_are_moved_by_no_end():
 def test_noise_alone_is_not_told_to_be_an_end_and_a_wrong_model_is():
     right = [honest_modes(two_modes(0.02, seed=k), 2) for k in range(12)]
     told = [any("half decade moves" in w for w in f.warnings) for f in right]
-    assert sum(told) <= 2  # one of twenty is expected; half of them were told before
-    # The changes have the scatter that is predicted, where noise moves a number much (chi^2 of 12 numbers: 4 to 23).
+    assert sum(told) <= 2  # one of twenty is expected; before, half of them were reported
+    # Where noise dominates, the changes have the predicted scatter (chi^2 of 12 numbers: 4 to 23).
     moved = (("first", "equilibrium_modulus"), ("last", "shear_modulus"), ("last", "relaxation_times[1]"))
     for end, name in moved:
         part = f"without_{end}_half_decade"
@@ -211,7 +215,7 @@ def test_noise_alone_is_not_told_to_be_an_end_and_a_wrong_model_is():
 
 
 def test_what_a_model_misses_is_no_noise_that_explains_a_change():
-    """Smooth residuals of 6 % as noise would explain a change of G0 by 8 %."""
+    """If smooth residuals of 6 % counted as noise, they would explain a change of G0 by 8 %."""
     G = 300 + 100 * (1j * OMEGA) ** 0.4
     f = honest_modes(Sweep(OMEGA, *noisy(G, 1e-3)), 2)
     assert np.mean(f.relative_errors(Sweep(OMEGA, G.real, G.imag))) > 0.03
@@ -236,13 +240,14 @@ def test_the_front_page_says_that_its_ends_decide(tmp_path, capsys):
     assert code == 0 and set(changes) == set(content["standard_errors"])
     assert len(changes["ratios"]) == 3 and len(changes["relaxation_times"]) == 3
     assert abs(changes["shear_modulus"]) > content["standard_errors"]["shear_modulus"]
-    assert "Pa *" in out and "without the first or the last half decade" in out
-    words = ("the fit misses the data", "structured misfit", SHORT, "so the ends of the band decide", "between samples")
-    assert len(content["warnings"]) == 5  # the most important one first, each with what to do
+    assert "Pa *" in out and "if the first or the last half decade is left out" in out
+    words = ("the fit misses the data", "structured misfit", SHORT, "depend on the ends of the band", "between samples")
+    assert len(content["warnings"]) == 5  # the most important one first, each with advice
     for sentence, word in zip(content["warnings"], words, strict=True):
         assert word in sentence
     assert "Kramers-Kronig" in content["warnings"][0]
-    # The last point is the instrument's: left out and named; --max-frequency keeps it and warns.
+    # The last point is affected by the instrument. It is left out with a note; --max-frequency keeps it, with a
+    # warning.
     assert any("1 of 31 points above 12.64 Hz is left out" in note for note in content["notes"])
     main([str(LIONS_MANE), "--method", "closed-form", "--max-frequency", "16", "--out", str(tmp_path)])
     kept = json.loads((tmp_path / "fit.json").read_text())
@@ -255,7 +260,7 @@ def test_the_total_error_has_every_share(tmp_path):
     main([*args, "--out", str(tmp_path)])
     content = json.loads((tmp_path / "fit.json").read_text())
     shares, total, G0 = content["error_shares"], content["total_errors"], content["shear_modulus"]
-    # 50 um of 9.2 mm, and 10 um of a radius of 4 mm, to the fourth power.
+    # Relative errors: 50 um of 9.2 mm, and 10 um of a radius of 4 mm, to the fourth power.
     geometry = np.hypot(50e-6 / 9.2e-3, 4 * 10e-6 / 4e-3)
     assert shares["geometry"]["shear_modulus"] == pytest.approx(geometry * G0)
     assert shares["geometry"]["ratios"] == [0, 0, 0] == shares["geometry"]["relaxation_times"]
@@ -267,9 +272,11 @@ def test_the_total_error_has_every_share(tmp_path):
     assert total["shear_modulus"] == pytest.approx(np.sqrt(square))
     main([*args, "--gap-error", "1e-3", "--out", str(tmp_path)])
     told = json.loads((tmp_path / "fit.json").read_text())
-    assert told["error_shares"]["geometry"]["shear_modulus"] == pytest.approx(0.01 * G0)  # the gap is in the noise
+    # the error of the gap is in the noise
+    assert told["error_shares"]["geometry"]["shear_modulus"] == pytest.approx(0.01 * G0)
     assert told["standard_errors"]["shear_modulus"] > 0.1 * G0
-    # The last half decade moves G0 by less than this error: no star in the table, and no word in the warnings.
+    # Leaving out the last half decade changes G0 by less than this error. So the table has no star, and there is no
+    # warning.
     assert abs(change) < told["standard_errors"]["shear_modulus"]
     ends = [w for w in told["warnings"] if "half decade moves" in w]
     assert len(ends) == 1 and "relaxation_times" in ends[0] and "modulus" not in ends[0]
@@ -277,7 +284,9 @@ def test_the_total_error_has_every_share(tmp_path):
 
 @pytest.mark.slow
 def test_whole_intervals_hold_the_moduli_where_the_gap_is_not_told():
-    """Noise of 1 %, a gap off by 50 um of 4 mm (seeded): intervals of noise alone miss half of them."""
+    """The noise is 1 %, and the gap is wrong by 50 um of 4 mm (fixed seed). Intervals of the noise alone miss half of
+    the moduli.
+    """
     rng, inside, noise_alone = np.random.default_rng(0), 0, 0
     s = two_modes(0.0)
     for _ in range(60):
@@ -307,7 +316,9 @@ def test_points_outside_the_limits_are_left_out_and_said():
 
 @pytest.mark.slow
 def test_total_errors_hold_what_a_shorter_band_says():
-    """Ten raw samples: cut from 100 to 20 rad/s, the shortest time and G0 move by less than one total error."""
+    """Ten raw samples: if the band is cut from 100 to 20 rad/s, the shortest time and G0 change by less than one total
+    error.
+    """
     folder = SHARED / "data" / "lions_mane"
     if not folder.is_dir():
         pytest.skip("the raw sweeps of the samples are not here")
@@ -316,10 +327,11 @@ def test_total_errors_hold_what_a_shorter_band_says():
         whole, cut = (_honest_fit(some(s, s.angular_frequency < end)) for end in (101.0, 20.1))
         errors, last = total_error.total_errors(whole), f"relaxation_times[{whole.modes - 1}]"
         apart = cut.uncertainty.values - whole.uncertainty.values
-        # Of the stiffest sample the cut is the half decade that the error is made of: equal to rounding.
+        # For the stiffest sample, this cut is the half decade that defines the error. Both are equal up to rounding.
         assert abs(apart[0]) < errors["shear_modulus"] * (1 + 1e-9), file.name
         assert abs(apart[-1]) < errors[last] * (1 + 1e-9), file.name
-        assert abs(apart[0]) > whole.uncertainty.standard_errors[0], file.name  # the error by noise does not hold it
+        # the error due to noise alone does not cover it
+        assert abs(apart[0]) > whole.uncertainty.standard_errors[0], file.name
 
 
 def _honest_fit(s: Sweep) -> viscoelastic.Fit:
@@ -329,7 +341,7 @@ def _honest_fit(s: Sweep) -> viscoelastic.Fit:
 
 @pytest.mark.parametrize(("noise", "found"), [(0.001, 0.0012), (0.005, 0.0058), (0.02, 0.0205)])
 def test_the_scatter_of_few_points_is_their_noise(noise, found):
-    """Six points a decade: about a parabola through four neighbours the curve itself scatters by 1 %."""
+    """With six points per decade, the curve itself deviates by 1 % from a parabola through four neighbours."""
     w = 2 * np.pi * np.logspace(-1, 1.5, 16)
     G = 1000 * (0.5 + 0.3j * w * 0.5 / (1 + 0.5j * w) + 0.2j * w * 0.03 / (1 + 0.03j * w))
     rng = np.random.default_rng(0)
@@ -338,7 +350,7 @@ def test_the_scatter_of_few_points_is_their_noise(noise, found):
 
 
 def test_data_that_contradict_themselves_are_told_and_sound_ones_are_not():
-    """A loss modulus 30 % too large, and a drift of 15 %, were inside of five times the curvature."""
+    """A loss modulus 30 % too large, and a drift of 15 %, were below the bound of five times the curvature."""
     w = 2 * np.pi * np.logspace(-1, 1.5, 16)
     G = 1000 * (0.5 + 0.3j * w * 0.5 / (1 + 0.5j * w) + 0.2j * w * 0.03 / (1 + 0.03j * w))
     rng, told = np.random.default_rng(1), []
@@ -351,7 +363,7 @@ def test_data_that_contradict_themselves_are_told_and_sound_ones_are_not():
 
 @pytest.mark.parametrize("noises", [(0.01, 0.05), pytest.param((0.05, 0.01), marks=pytest.mark.slow)])
 def test_storage_and_loss_have_noise_of_their_own(noises):
-    """One relative noise for both made errors of G0 2.7 times too large and those of the ratio too small."""
+    """With one relative noise for both, errors of G0 were 2.7 times too large, and those of the ratio too small."""
     hertz = np.logspace(-1, 1.2, 24)
     iwt = 2j * np.pi * hertz * 0.3
     G = 2000 * (0.7 + 0.3 * iwt / (1 + iwt))
@@ -362,13 +374,15 @@ def test_storage_and_loss_have_noise_of_their_own(noises):
         values.append(fit.uncertainty.values)
         errors.append(fit.uncertainty.standard_errors)
         equal.append(uncertainty.estimate(fit.solution, False).standard_errors)
-    scatter = np.std(values, axis=0)  # of 60 draws: to 9 %
+    scatter = np.std(values, axis=0)  # of 60 draws: known to 9 %
     assert np.all(np.abs(np.log(np.median(errors, axis=0) / scatter)) < 0.3), np.median(errors, axis=0) / scatter
     assert np.any(np.abs(np.log(np.median(equal, axis=0) / scatter)) > 0.5)
 
 
 def test_repeats_share_the_noise_of_their_frequency():
-    """Three lines a frequency count as one measurement if they share their noise: errors were half of the scatter."""
+    """Three lines with the same frequency count as one measurement if they share their noise. Otherwise the errors were
+    half of the scatter.
+    """
     hertz = np.repeat(np.logspace(-1, 1.2, 8), 3)
     iwt = 2j * np.pi * hertz * 0.3
     G = 2000 * (0.7 + 0.3 * iwt / (1 + iwt))
@@ -379,12 +393,14 @@ def test_repeats_share_the_noise_of_their_frequency():
         fit = viscoelastic.closed_form(Sweep(2 * np.pi * hertz, G.real * noise[0], G.imag * noise[1]), 1)
         off = np.abs(fit.uncertainty.values - [2000, 0.3, 0.3])
         held.append(off < 2.02 * fit.uncertainty.standard_errors)
-    # 60 draws: the binomial spread is 0.03 at 95 %; 0.55 to 0.72 before.
+    # 60 draws: the binomial standard deviation is 0.03 at 95 %. Without this, 0.55 to 0.72 were covered.
     assert np.all(np.mean(held, axis=0) > 0.85), np.mean(held, axis=0)
 
 
 def test_repeats_that_share_their_noise_are_no_structure():
-    """Three lines with one error keep its sign: of 25 frequencies 75 points changed sign 11 times, "by chance 4e-9"."""
+    """Three lines with one error keep its sign. With 25 frequencies, 75 points changed sign 11 times, and this was
+    reported as "by chance 4e-9".
+    """
     omega, told = np.repeat(np.geomspace(0.1, 100, 25), 3), 0
     for seed in range(20):
         shared, own = np.random.default_rng(seed).normal(size=(2, 25)), np.random.default_rng(99 + seed)
@@ -409,7 +425,7 @@ def test_equal_noise_of_storage_and_loss_is_left_alone():
 
 
 def test_a_number_that_the_other_points_do_not_determine_is_unknown_by_its_own_size():
-    """Without the last half decade the fast mode runs away, and G0 with it: its total error was 1e8 Pa."""
+    """Without the last half decade the fast mode diverges, and G0 with it. The total error was 1e8 Pa."""
     omega = 2 * np.pi * np.geomspace(0.1, 1, 12)
     G = 200 + sum(g * 1j * omega * tau / (1 + 1j * omega * tau) for g, tau in ((2000.0, 10.0), (300.0, 0.08)))
     noise = 1 + 0.03 * np.random.default_rng(2).standard_normal((2, 12))

@@ -1,4 +1,4 @@
-"""The closed form in NumPy: the formulas, derivatives and minima that JAX has."""
+"""The closed form in NumPy: formulas, derivatives and minima agree with those in JAX."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ from fitting.readers.rheometer import read_sweep
 
 
 def test_numpy_and_jax_run_the_same_formula_and_its_derivative():
-    """Derivatives by complex steps are those of forward mode; axes in front are fits side by side."""
+    """Derivatives by complex steps agree with forward mode. Leading axes are separate fits."""
     rng = np.random.default_rng(0)
     omega, u = 2 * np.pi * np.logspace(-2, 2, 9), rng.normal(0, 1, (3, 7))
     data = (omega, np.full(9, 300.0), np.full(9, 60.0), np.linspace(20, 90, 18))
@@ -32,7 +32,7 @@ def test_numpy_and_jax_run_the_same_formula_and_its_derivative():
 
 
 def test_the_fit_on_the_host_is_the_compiled_one():
-    """Same minimum, same number of iterations, and a start that leads nowhere is left aside."""
+    """Both have the same minimum and number of iterations. A starting point that leads nowhere is ignored."""
     s = read_sweep(ROOT / "data" / "porcine_liver_frequency_sweep.csv")
     data = (s.angular_frequency, s.storage, s.loss, np.concatenate(s.deviations))
     starts = generalised_maxwell.starts(s, 2, generalised_maxwell.spectrum(s), count=3)
@@ -46,7 +46,9 @@ def test_the_fit_on_the_host_is_the_compiled_one():
 
 @pytest.mark.parametrize("case", springpots.FRACTIONAL, ids=lambda case: case.name)
 def test_springpots_have_the_derivatives_of_jax(case):
-    """Moduli, residuals and reported numbers, by complex steps and forward mode, to roundoff; exponents near 0 too."""
+    """Moduli, residuals and reported numbers agree for complex steps and forward mode up to rounding, also for
+    exponents near 0.
+    """
     rng, reference = np.random.default_rng(0), 3.0
     omega, u = np.logspace(-3, 4, 9), rng.normal(0, 2, (3, len(case.free)))
     u[0] = np.where(np.isin(case.free, (1, 3, 5)), -8.0, u[0])
@@ -65,17 +67,17 @@ def test_springpots_have_the_derivatives_of_jax(case):
 
 @pytest.mark.parametrize("model", ["prony", "auto"])
 def test_the_closed_form_compiles_nothing(tmp_path, model):
-    """Compiling would take longer than all the rest; results and picture included."""
+    """Compilation would take longer than the whole command, with results and picture."""
     file, before = ROOT / "data" / "porcine_liver_frequency_sweep.csv", len(COMPILED)
     assert main([str(file), "--method", "closed-form", "--model", model, "--out", str(tmp_path)]) == 0
     assert len(COMPILED) == before
     jax.jit(lambda x: x + 1)(1.0)
-    assert len(COMPILED) > before  # it does count
+    assert len(COMPILED) > before  # the counter works
 
 
 @pytest.mark.parametrize("kind", ["relaxation", pytest.param("creep", marks=pytest.mark.slow)])
 def test_every_model_of_a_test_in_time_compiles_nothing(tmp_path, kind):
-    """Springpots and spectra too: for each of them a program took ten seconds."""
+    """No model is compiled, springpots and spectra included. Before, a program for each of them took ten seconds."""
     time, file, before = np.geomspace(0.1, 100, 12), tmp_path / "test.csv", len(COMPILED)
     G = 300 + 200 * np.exp(-time / 0.5) + 150 * np.exp(-time / 20)
     name, answer = ("relaxation_modulus_Pa", G) if kind == "relaxation" else ("creep_compliance_1/Pa", 1 / G)
@@ -87,7 +89,9 @@ def test_every_model_of_a_test_in_time_compiles_nothing(tmp_path, kind):
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])
 @pytest.mark.parametrize("name", ["prony", "prony_fluid"])
 def test_the_answers_of_a_test_in_time_have_the_derivatives_of_jax(kind, name):
-    """By hand against forward mode, to roundoff; steps of 1e-7 to 1e4 relaxation times, so that all branches run."""
+    """Derivatives by hand agree with forward mode up to rounding. Steps of 1e-7 to 1e4 relaxation times reach all
+    branches.
+    """
     rng = np.random.default_rng(0)
     times = np.concatenate([[0.0], np.logspace(-6, 3, 70)])
     driven, rows = 0.02 + 0.1 * np.minimum(times / 0.5, 1), np.arange(3, 71, 2)
@@ -98,7 +102,7 @@ def test_the_answers_of_a_test_in_time_have_the_derivatives_of_jax(kind, name):
     function = time_tests._residuals(kind, name)
     expected, slope = with_jacobian(function)(jnp.asarray(u), *map(jnp.asarray, data))
     found, J = time_response.residuals_with_jacobian(kind, maxwell, np.stack([u, u + 0.1]), *data)
-    # Roundoff of a rate is that of the largest one, and acts over the whole test.
+    # Rounding of a rate is relative to the largest rate, and acts over the whole test.
     roundoff = 1e-15 if kind == "relaxation" else 2e-16 * times[-1] / maxwell(u).relaxation_times[-1]
     assert np.abs(found[0] - expected).max() < 10 * roundoff * np.abs(expected).max()
     assert np.abs(J[0] - slope).max() < 10 * roundoff * np.abs(slope).max()
@@ -106,7 +110,7 @@ def test_the_answers_of_a_test_in_time_have_the_derivatives_of_jax(kind, name):
 
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])
 def test_a_test_in_time_compiles_nothing(tmp_path, kind):
-    """Four fits of modes: compiling each would take ten times as long as all the rest."""
+    """There are four fits of modes. Compilation of each would take ten times as long as the rest."""
     t = np.geomspace(0.01, 30, 60)
     answer = 1 + np.exp(-t / 0.2) + np.exp(-t / 5) if kind == "relaxation" else 3 - np.exp(-t / 0.2) - np.exp(-t / 5)
     columns = "time_s,strain,stress_Pa" if kind == "relaxation" else "time_s,stress_Pa,strain"

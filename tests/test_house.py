@@ -1,4 +1,4 @@
-"""How the code is built: imports point downwards, public names say what they are."""
+"""Structure of the code: imports point downwards, and public names are documented."""
 
 import ast
 import importlib
@@ -22,12 +22,12 @@ TREES = {_module(file): ast.parse(file.read_text()) for file in FILES}
 
 
 def _imported(tree: ast.Module) -> set[str]:
-    """Modules of the project that a module imports, for its types too, but not those inside its functions."""
+    """Return the modules of the project that a module imports, also for its types, but not inside its functions."""
     found = set()
     for node in (*tree.body, *(n for own in tree.body if isinstance(own, ast.If) for n in own.body)):
         if isinstance(node, ast.ImportFrom) and node.module:
             names = {f"{node.module}.{a.name}" for a in node.names}
-            # `from liverjax import mesh` asks for the module, not for all that the package offers.
+            # `from liverjax import mesh` imports the module, not everything that the package offers.
             found |= names if names <= set(TREES) else names | {node.module}
         elif isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
@@ -50,7 +50,7 @@ def test_imports_have_no_circle_and_point_downwards():
         visit(module, [])
 
 
-#: Rooms from the ground up: a room knows those below it, and itself.
+#: Subpackages from the lowest upwards: each may import from those below it, and from itself.
 STOREYS = {
     "liverjax": (
         "core",
@@ -70,7 +70,7 @@ STOREYS = {
     ),
     "fitting": ("readers", "rigs", "methods", "waves", "fits", "amplitude", "master", "reports", "commands"),
 }
-#: Files of a package that belong to no room: what users import, and the way in.
+#: Files of a package that belong to no subpackage: the modules for users, and the entry points.
 DOORS = {"liverjax": {"check"}, "fitting": {"fit", "joint", "rheometer", "torsion"}}
 
 
@@ -111,7 +111,7 @@ def test_functions_take_few_parameters_and_fit_a_screen(module):
         assert lines <= MOST_LINES, f"{function.name} has {lines} lines"
 
 
-#: Names that every file of a folder has, since they are what the folder is called for.
+#: Names that every file of a folder has, because they are the purpose of the folder.
 PROTOCOL = {
     "liverjax.commands": {"add", "run"},
     "fitting.commands": {"parser", "run"},
@@ -123,7 +123,7 @@ PROTOCOL = {
     "liverjax.solvers": {"product", "solve"},
 }
 EVERYWHERE = {"__getattr__", "main", "_"}
-#: Names that several modules define nevertheless; a new one is to be named otherwise.
+#: Number of names that several modules define nevertheless. New functions need other names.
 MOST_HOMONYMS = 15
 
 
@@ -139,7 +139,7 @@ def test_few_names_are_defined_in_several_modules():
     assert len(several) <= MOST_HOMONYMS, several
 
 
-#: `Any` where nothing better can be said: lower this number with each one that goes.
+#: Number of `Any` where no better type is possible. Lower it with each one that is removed.
 MOST_ANY = 370
 
 
@@ -171,6 +171,6 @@ def test_public_names_have_docstrings_and_hints(module):
 def test_old_addresses_offer_what_they_offered(old):
     package, _, name = old.partition(".")
     new = importlib.import_module(addresses.MOVED[old])
-    # `lj.struct` is what makes a class one; the module of that name is found by its address.
+    # `lj.struct` is the decorator of classes. The module of the same name is found by its address.
     found = sys.modules[old] if name == "struct" else getattr(importlib.import_module(package), name)
     assert {n for n in dir(new) if not n.startswith("_")} <= set(dir(found))

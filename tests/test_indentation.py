@@ -1,4 +1,4 @@
-"""Modulus and contact point of indentation curves: other laws of contact, coverage, files, the command."""
+"""Modulus and contact point of indentation curves: other contact laws, coverage, files, the command."""
 
 import json
 
@@ -16,21 +16,23 @@ DEPTH = np.linspace(0.0, 7e-4, 80)
 
 
 def hertz(depth: np.ndarray) -> np.ndarray:
-    """Force [N] of an incompressible half-space."""
+    """Return the force [N] of an incompressible half-space."""
     return 16 / 9 * E * np.sqrt(R) * np.maximum(depth, 0.0) ** 1.5
 
 
 def test_a_thick_layer_gives_hertz_back():
     layer = Layer(Indenter("sphere", 1e3 * H, 0.5, R))
     found = fit_contact(DEPTH, hertz(DEPTH - START), layer.force)
-    # The layer is 10 m thick: 1.133 chi is 1.8e-4 at the deepest point.
+    # The layer is 10 m thick, so 1.133 chi is 1.8e-4 at the deepest point.
     assert np.isclose(found.modulus, E, rtol=3e-4) and np.isclose(found.contact_point, START, atol=3e-8)
     exact = fit_contact(DEPTH, E * layer.force(DEPTH - START), layer.force)
-    assert exact.independent is None  # the order of roundoff is no noise that neighbours share
+    assert exact.independent is None  # structure of rounding errors is not correlated noise
 
 
 def test_a_thin_layer_by_the_first_terms_of_its_series():
-    """Hertz times 1 + 1.133 chi + 1.497 chi^2 (c and 7/6 c^2), chi up to 0.1: the rest is below 0.2 %."""
+    """Compare with Hertz times 1 + 1.133 chi + 1.497 chi^2 (c and 7/6 c^2), for chi up to 0.1. The rest is
+    below 0.2 %.
+    """
     depth = np.linspace(0.0, 4e-4, 80)
     chi = np.sqrt(R * np.maximum(depth - START, 0.0)) / H
     force = hertz(depth - START) * (1 + 1.133 * chi + 1.497 * chi**2)
@@ -42,7 +44,7 @@ def test_a_thin_layer_by_the_first_terms_of_its_series():
     ("draws", "low", "high"), [(60, 0.87, 1.0), pytest.param(120, 0.9, 0.99, marks=pytest.mark.slow)]
 )
 def test_intervals_cover_with_five_percent_of_noise(draws, low, high):
-    """Curves of Hertz's law with noise of 5 % of the largest force: mean within 5 %, 95 % covered."""
+    """Curves of Hertz's law have noise of 5 % of the largest force. The mean is within 5 %, and 95 % are covered."""
     force, layer = hertz(DEPTH - START), Layer(Indenter("sphere", 1e3 * H, 0.5, R))
     rng, found = np.random.default_rng(0), []
     for _ in range(draws):
@@ -53,11 +55,11 @@ def test_intervals_cover_with_five_percent_of_noise(draws, low, high):
     assert abs(np.median(moduli) / E - 1) < 0.05 and abs(np.median(points) - START) < 1e-5
     for values, sd, true in ((moduli, errors[:, 0], E), (points, errors[:, 1], START)):
         covered = np.mean(np.abs(values - true) < found[0].quantile * sd)
-        assert low <= covered <= high, covered  # the binomial spread is 0.028 of 60 draws, 0.020 of 120
+        assert low <= covered <= high, covered  # the binomial standard deviation is 0.028 for 60 draws, 0.020 for 120
 
 
 def _shared(rng: np.random.Generator, n: int, part: float = 0.7) -> np.ndarray:
-    """Noise (n,) of variance 1 of which each value has a part in common with the one before: an autoregression."""
+    """Return noise (n,) of variance 1 from an autoregression: each value contains a part of the value before."""
     own, out = rng.normal(size=n), np.empty(n)
     out[0] = own[0]
     for k in range(1, n):
@@ -68,7 +70,7 @@ def _shared(rng: np.random.Generator, n: int, part: float = 0.7) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["shared", "larger with the force"])
 def test_intervals_hold_with_noise_that_is_not_independent_or_equal(kind):
-    """Errors of equal, independent noise held 57 and 84 % of the 95 % intervals of the modulus."""
+    """Errors for equal, independent noise covered only 57 and 84 % with the 95 % intervals of the modulus."""
     depth = np.linspace(0.0, 7e-4, 160)
     force, layer = hertz(depth - START), Layer(Indenter("sphere", 1e3 * H, 0.5, R))
     rng, held = np.random.default_rng(3), []
@@ -76,16 +78,18 @@ def test_intervals_hold_with_noise_that_is_not_independent_or_equal(kind):
         noise = _shared(rng, 160) * 0.02 * force.max() if kind == "shared" else 0.05 * force * rng.normal(size=160)
         found = fit_contact(depth, force + noise, layer.force)
         held.append(abs(found.modulus - E) < found.quantile * found.standard_errors[0])
-        if kind == "shared":  # 0.7 leaves (1 - 0.7) / (1 + 0.7) of the points
+        if kind == "shared":  # 0.7 leaves the information of (1 - 0.7) / (1 + 0.7) of the points
             assert found.independent is not None and 8 < found.independent < 90
         else:
             assert found.independent is None or len(held) > 1
-    # 50 draws: the binomial spread is 0.031 at 95 %.
+    # 50 draws: the binomial standard deviation is 0.031 at 95 %.
     assert np.mean(held) > 0.85, np.mean(held)
 
 
 def test_noise_of_the_depth_is_no_shared_noise():
-    """The derivatives are computed at the noisy depths: their scatter is that of the residuals: no order."""
+    """The derivatives are computed at the noisy depths, so they scatter as the residuals do. This is not a
+    correlation.
+    """
     depth, layer = np.linspace(0.0, 7e-4, 200), Layer(Indenter("sphere", 1e3 * H, 0.5, R))
     force = hertz(depth - START)
     for seed in range(10):
@@ -96,7 +100,9 @@ def test_noise_of_the_depth_is_no_shared_noise():
 
 
 def test_adhesion_is_named(tmp_path, capsys):
-    """A pull of 5 % of the largest force after contact: it enlarged the noise that it was compared with."""
+    """A tensile force of 5 % of the largest force after contact increased the noise estimate that it was
+    compared with.
+    """
     depth = np.linspace(0.0, 7e-4, 200)
     force = hertz(depth - START)
     force += force.max() * np.where(depth > START, -0.05, 0.0)
@@ -135,7 +141,7 @@ def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
         (
             "depth_m,force_N\n" + "".join(f"{k}e-5,-{k**2}e-3\n" for k in range(30)),
             [],
-            "the force falls while the depth grows: change its sign",
+            "the force falls while the depth grows, so change its sign",
         ),
         ("depth_m,force_N\n", [], "there are no numbers below the header in line 1"),
         ("depth_m,force_N\n" + "".join(f"{k}e-5,0\n" for k in range(8)), [], "the force is the same in all rows"),
@@ -190,7 +196,9 @@ def test_no_such_file():
 
 
 def held_at_the_end(kind):
-    """A loading, and then what instruments do: hold the depth (force relaxes) or the force (it creeps), or cycles."""
+    """Return a loading followed by what instruments do: hold the depth (the force relaxes), hold the force (the depth
+    creeps), or cycle.
+    """
     rng, late = np.random.default_rng(2), np.linspace(0, 1, 160)
     if kind == "cycles":
         depth = np.concatenate([DEPTH, DEPTH[-2::-1], 1.01 * DEPTH[1:]])
@@ -226,9 +234,9 @@ def test_an_offset_of_the_sensor_is_taken_off_and_decimals_follow_the_table(tmp_
         content = json.loads((tmp_path / "fit.json").read_text())
         assert np.isclose(content["young_modulus"], E, rtol=0.01) and not content["warnings"]
         assert np.isclose(content["contact_point"], START, atol=3e-6)
-        # What the subtraction leaves is fitted: the noise of a point, 1e-6 N, over the root of some 20 points.
+        # The remaining offset is fitted. Its error is the noise of a point, 1e-6 N, over the root of some 20 points.
         assert abs(content["force_offset_N"]) < 1e-6 and 1e-7 < content["force_offset_standard_error_N"] < 5e-7
-    # A curve that begins in contact has no offset.
+    # A curve that begins in contact has no measurable offset.
     np.savetxt(
         tmp_path / "c.csv", np.column_stack([DEPTH, force])[40:], "%.9g", ",", header="depth_m,force_N", comments=""
     )
@@ -237,7 +245,9 @@ def test_an_offset_of_the_sensor_is_taken_off_and_decimals_follow_the_table(tmp_
 
 @pytest.mark.parametrize("offset", [0.05, *(pytest.param(v, marks=pytest.mark.slow) for v in (0.3, 0.0, -0.05))])
 def test_the_zero_of_the_force_is_fitted_with_its_error(offset):
-    """5 % of the largest force as an offset moved the modulus by 11 %, and 3 to 17 errors of noise at 5 %."""
+    """An offset of 5 % of the largest force changed the modulus by 11 %, and by 3 to 17 standard errors with 5 % of
+    noise.
+    """
     force, layer = hertz(DEPTH - START), Layer(Indenter("sphere", 1e3 * H, 0.5, R))
     rng, hits = np.random.default_rng(0), []
     for _ in range(40):
@@ -260,8 +270,9 @@ def test_without_an_approach_the_zero_is_taken_as_it_is():
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1, -0.1])
 def test_a_base_line_that_tilts_is_told_and_taken_off(tmp_path, capsys, tilt):
-    """A sensor that drifts moves the contact point by 13 errors of independent noise; the plain fit's contain the order
-    of its residuals."""
+    """Drift of a sensor shifts the contact point by 13 errors of independent noise. The errors of the plain fit include
+    the structure of its residuals.
+    """
     depth = np.linspace(-4e-4, 7e-4, 120)
     force = hertz(depth - START)
     force += 0.005 * force.max() * np.random.default_rng(3).standard_normal(len(depth))
@@ -293,7 +304,9 @@ def test_a_radius_in_millimetres_is_refused(tmp_path, capsys):
 
 
 def test_a_wrong_shape_is_told_behind_a_long_approach(tmp_path, capsys):
-    """The noise of the approach hid the misfit: a punch on data of a sphere had a third of the modulus, unsaid."""
+    """The noise of the approach hid the misfit. A punch fitted to data of a sphere had a third of the modulus, without
+    a warning.
+    """
     depth = np.linspace(-1e-3, 1e-3, 101)
     force = hertz(np.maximum(depth, 0.0))
     force = force + 0.003 * force.max() * np.random.default_rng(3).normal(size=len(force))
@@ -310,7 +323,9 @@ def test_a_wrong_shape_is_told_behind_a_long_approach(tmp_path, capsys):
 
 
 def test_an_approach_as_long_as_the_layer_is_thick_is_fitted():
-    """The search tries contact points before the first reading: depths beyond the thickness are only tried there."""
+    """The search also tries contact points before the first reading. Only there are depths larger than the
+    thickness.
+    """
     depth = np.linspace(-8e-3, 1e-3, 181)
     for rig in (Indenter("sphere", H, 0.5, R), Indenter("punch", H, 0.5, R / 5), Indenter("cone", H, 0.5)):
         layer = Layer(rig)
@@ -320,7 +335,7 @@ def test_an_approach_as_long_as_the_layer_is_thick_is_fitted():
 
 @pytest.mark.parametrize("noise", [0.0, 0.02, 0.2])
 def test_only_a_real_hold_at_the_end_is_left_out(noise):
-    """Noise of 20 % brought points near the largest force long before the end; the last points then decided E."""
+    """With 20 % of noise, points long before the end came near the largest force. Then the last points determined E."""
     rng, depth = np.random.default_rng(38), np.linspace(-2e-4, 6e-4, 200)
     force = 0.03 * (np.maximum(depth, 0) / 6e-4) ** 1.5
     shaken = force + noise * 0.03 * rng.standard_normal(200)
@@ -329,7 +344,7 @@ def test_only_a_real_hold_at_the_end_is_left_out(noise):
     relaxing = np.append(force, 0.03 * (1 - 0.3 * (1 - np.exp(-np.arange(60) / 20))))
     last, _ = _end_of_loading(held, relaxing + noise * 0.03 * rng.standard_normal(260))
     assert abs(last - 200) <= 2
-    # The force is held, and the depth creeps.
+    # The force is constant, and the depth creeps.
     creeping, constant = np.append(depth, 6e-4 + 2e-6 * np.arange(60)), np.append(force, np.full(60, 0.03))
     last, told = _end_of_loading(creeping, constant + noise * 0.03 * rng.standard_normal(260))
     assert (noise > 0.1 and not told) or 190 <= last <= 205

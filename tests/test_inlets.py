@@ -1,4 +1,6 @@
-"""Pressure and flux of the fluid at parts of the body: steady flow through a stiff sponge, and what has entered."""
+"""Pressure and flux of the fluid at parts of the surface: steady flow through a stiff porous body, and fluid
+balance.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +41,7 @@ def content(inlet: list, order: int = 1, **more) -> dict:
 
 
 def pressures(scene: lj.Scene, steps: int = 1) -> np.ndarray:
-    """Of a sponge so stiff that it does not move (V,)."""
+    """Return the pressures (V,) of a porous body that is so stiff that it does not move."""
     mesh, sponge = scene.mesh, scene.porosity
     memory, J = porosity.initial_fluid(sponge, mesh), jnp.ones_like(mesh.weights)
     for k in range(1, steps + 1):
@@ -51,7 +53,7 @@ def pressures(scene: lj.Scene, steps: int = 1) -> np.ndarray:
 
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_fluid_is_driven_through(order):
-    """Steady: linear from one given pressure to the other; with a flux v/kappa is the slope."""
+    """Steady flow: linear from one given pressure to the other. With a given flux v, the gradient is v/kappa."""
     scene = scene_from(content([{"where": LOW, "pressure": 300.0}, {"where": TOP, "pressure": 100.0}], order))
     x = np.asarray(scene.mesh.points)[: scene.mesh.number_of_vertices, 0]
     assert np.allclose(pressures(scene), 300.0 - 2000.0 * x, rtol=1e-6)
@@ -60,7 +62,7 @@ def test_fluid_is_driven_through(order):
 
 
 def test_forces_and_fluid_together_lack_nothing_and_are_symmetric():
-    """Derivatives of a step are of both together, with pressures that are given among them."""
+    """The derivatives of a step contain forces and fluid, with given pressures among the unknowns."""
     soft = {"bulk": 400.0, "limit_bulk": 2200.0, "permeability": 2e-5}
     body = content([{"where": LOW, "pressure": 300.0}, {"where": TOP, "flux": 1e-3}], **soft)
     scene = scene_from(body | {"law": {"name": "neo_hookean", "mu": 300.0, "bulk": 400.0}})
@@ -84,7 +86,9 @@ def test_forces_and_fluid_together_lack_nothing_and_are_symmetric():
 
 
 def test_a_sealed_sponge_keeps_what_enters():
-    """Storage 1/K_lim: the mean pressure rises by K_lim v A dt/V; a history is a factor, a start is kept."""
+    """With storage 1/K_lim, the mean pressure rises by K_lim v A dt/V. A history is a factor, and a starting pressure
+    is kept.
+    """
     inlet = [{"where": LOW, "flux": 1e-9, "history": [[0.0, 0.0], [10.0, 2.0], [20.0, 1.0]]}]
     scene = scene_from(content(inlet, initial_pressure=7.0))
     P = pressures(scene, 2)
@@ -94,7 +98,7 @@ def test_a_sealed_sponge_keeps_what_enters():
 
 @pytest.mark.slow
 def test_the_energy_has_the_force_for_its_gradient():
-    """Robust steps need it: given pressures push as they are, free ones by what is left."""
+    """Robust steps need this energy. Given pressures act as they are, free pressures by the change of their fluid."""
     import jax
 
     from liverjax.simulation.equations import energy, equations, initial_state, residual, unknowns
@@ -112,7 +116,9 @@ def test_the_energy_has_the_force_for_its_gradient():
 
 @pytest.mark.slow
 def test_perfusion_swells_a_soft_sponge():
-    """Pressure p on two sides of a free sponge: in the end sigma(J) = p of the drained sponge, without shear."""
+    """With pressure p on two sides of a free porous body, the final state has sigma(J) = p of the drained body, without
+    shear.
+    """
     table = content([{"where": w, "pressure": 50.0} for w in (LOW, TOP)], bulk=400.0, limit_bulk=2200.0)
     table |= {"law": {"name": "neo_hookean", "mu": 100.0, "bulk": 400.0}, "solve": {"dt": 50.0, "steps": 4}}
     table["fixed"] = [
@@ -141,7 +147,9 @@ def test_bad_inlets_are_refused(inlet, words):
 
 
 def test_inlets_that_would_do_nothing_are_refused():
-    """A node has one pressure; through a surface with given pressures what enters leaves at once. Edges are shared."""
+    """A node has one pressure. Through a surface with given pressures, incoming fluid leaves at once. Edges may be
+    shared.
+    """
     low, top = {"where": LOW, "pressure": 1.0}, {"where": TOP, "flux": 1e-3}
     side = {"where": {"y_max": 0.0}, "pressure": 2.0}
     scene_from(content([low, top, side]))
@@ -156,8 +164,8 @@ def test_inlets_that_would_do_nothing_are_refused():
 
 
 def test_places_of_the_fluid_that_hold_middles_of_edges_alone_are_refused():
-    """Pressures belong to vertices: at x = 0.05, between vertices at 0.033 and 0.067, there are none."""
+    """Pressures belong to vertices. At x = 0.05, between vertices at 0.033 and 0.067, there are none."""
     middle = {"x_min": 0.04, "x_max": 0.06}
     for more in ({"inlet": [{"where": middle, "pressure": 5.0}]}, {"inlet": [], "drained": [middle]}):
-        with pytest.raises(InputError, match="meets only middles of edges, which have no pressure"):
+        with pytest.raises(InputError, match="contains only midside nodes, which have no pressure"):
             scene_from(content(more["inlet"], 2, **{k: v for k, v in more.items() if k == "drained"}))

@@ -1,4 +1,4 @@
-"""Errors that all points share: the inertia that an instrument subtracted, and the gap."""
+"""Errors common to all points: the inertia that an instrument subtracted, and the gap."""
 
 import json
 
@@ -15,12 +15,12 @@ from fitting.readers.frequency_sweep import Sweep
 pytestmark = pytest.mark.quick_to_compile
 
 OMEGA = np.geomspace(0.1, 100, 31)
-SHARE = 20 * OMEGA**2  # [Pa]: 200 kPa at the end, 200 times the sample
+SHARE = 20 * OMEGA**2  # [Pa]: 200 kPa at the end, 200 times the sample's modulus
 TRUTH = Maxwell(np.float64(800.0), np.array([0.3, 0.3]), np.array([2.0, 0.05]))
 
 
 def sweep(off: float, seed: int, noise: float = 0.01) -> Sweep:
-    """Two modes, measured where the inertia is really larger by `off` than what was subtracted."""
+    """A sweep with two modes. The true inertia exceeds the subtracted one by the fraction `off`."""
     G = generalised_maxwell.moduli(TRUTH, OMEGA)
     factor = 1 + noise * np.random.default_rng(seed).standard_normal((2, len(OMEGA)))
     return Sweep(OMEGA, (G[0] - off * SHARE) * factor[0], G[1] * factor[1], inertia=SHARE)
@@ -34,7 +34,7 @@ def test_the_error_of_the_inertia_is_found_and_its_standard_error_is_right():
     off = 5e-4
     found = [corrected(sweep(off, seed))[0].details["instrument"] for seed in range(16)]
     z = np.array([(f["inertia_off_by"] - off) / f["standard_error"] for f in found])
-    assert abs(z.mean()) < 0.75 and 0.6 < z.std() < 1.5  # of 16: 0.25 and 18 %, three of them
+    assert abs(z.mean()) < 0.75 and 0.6 < z.std() < 1.5  # of 16: known to 0.25 and 18 %, three of these
     steady = [not f["moves_with_the_band"] for f in found]
     assert np.mean(steady) > 0.8  # two standard errors: 5 % by chance
 
@@ -50,38 +50,42 @@ def test_what_is_corrected_comes_nearer_and_has_an_honest_error():
         plain.append(np.abs(viscoelastic.closed_form(s, 2).uncertainty.values / values - 1))
         mended.append(np.abs(fit.uncertainty.values / values - 1))
         z.append((fit.uncertainty.values - values) / fit.uncertainty.standard_errors)
-        assert "larger than what it subtracted" in better.notes[-1] and "are corrected for it" in better.notes[-1]
+        assert (
+            "larger than the value that it subtracted" in better.notes[-1]
+            and "are corrected for it" in better.notes[-1]
+        )
     assert np.mean(mended) < 0.7 * np.mean(plain)
     assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.5
 
 
 def test_a_prior_holds_what_the_data_do_not_say():
     s = sweep(0.0, 1)._replace(inertia=1e-9 * SHARE)
-    (told,) = [note for note in corrected(s)[1].notes if "inertia" in note]  # it said "corrected for it"
-    assert told.startswith("the data do not tell the instrument's inertia: its standard error stays 3")
+    (told,) = [note for note in corrected(s)[1].notes if "inertia" in note]  # this once said "corrected for it"
+    assert told.startswith("the data do not determine the instrument's inertia: its standard error is 3")
     found = corrected(s)[0].details["instrument"]
     assert found["standard_error"] == pytest.approx(0.03, rel=1e-6) and abs(found["inertia_off_by"]) < 1e-4
 
 
 def test_a_misfit_that_poses_as_inertia_is_not_corrected():
-    """A springpot followed by two modes: the term would take up what they miss, more of it the shorter the band."""
+    """Two modes cannot follow a springpot. The inertia term would absorb their misfit, more of it in a shorter band."""
     G = 300 + 200 * (1j * OMEGA) ** 0.5
     s = Sweep(OMEGA, G.real, G.imag, inertia=SHARE)
     fit, same = corrected(s)
     assert same is s and fit.details["instrument"]["moves_with_the_band"]
-    assert "poses as inertia, so it is not corrected" in fit.warnings[-1]
+    assert "poses as inertia, so this error is not corrected" in fit.warnings[-1]
 
 
-FRICTION = 0.4 * OMEGA  # [Pa] by one standard deviation: 40 Pa at the end, half of the loss modulus
+FRICTION = 0.4 * OMEGA  # [Pa] for one standard deviation: 40 Pa at the end, half of the loss modulus
 
 
 @pytest.mark.slow
 def test_friction_and_inertia_are_found_together():
-    """Both within their errors, which are those of least squares with the priors as rows."""
+    """Both are found within their errors, which are those of least squares with the priors as additional rows."""
     z = []
     for seed in range(8):
         s = sweep(5e-4, seed)._replace(friction=FRICTION, friction_error=2e-7)
-        s = s._replace(loss=s.loss + 0.7 * FRICTION)  # the bearing has 0.7 deviations more than what was subtracted
+        # the friction of the bearing exceeds the subtracted one by 0.7 deviations
+        s = s._replace(loss=s.loss + 0.7 * FRICTION)
         fit, _ = corrected(s)
         found = fit.details["instrument"]
         z.append(
@@ -111,13 +115,16 @@ def test_the_error_of_friction_is_that_of_scipy():
     numbers = found.details["instrument"]
     assert numbers["friction_off_by_N_m_s"] == pytest.approx(2e-7 * best.x[-1], abs=0.01 * 2e-7 * error)
     assert numbers["friction_standard_error"] == pytest.approx(2e-7 * error, rel=0.01)
-    assert "the instrument's friction is 1" in better.notes[-1] and "larger than what it subtracted" in better.notes[-1]
+    assert (
+        "the instrument's friction is 1" in better.notes[-1]
+        and "larger than the value that it subtracted" in better.notes[-1]
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [2.0, 40.0])
 def test_a_friction_above_the_loss_modulus_is_found(size):
-    """The first linear step is far too long; and the noise is that of all that was measured, 0.4 % of it."""
+    """The first linear step is far too long. The noise is 0.4 % of the measured values with friction."""
     z = []
     for seed in range(6):
         draws = 1 + 0.004 * np.random.default_rng(seed).standard_normal((2, len(OMEGA)))
@@ -141,7 +148,7 @@ def test_exact_data_have_exact_errors_of_the_instrument():
 
 
 def test_a_misfit_is_told_after_a_correction_too():
-    """G'' weighs as much as it did; a corrected sweep is no sweep whose phase scatters."""
+    """G'' keeps its weight. A corrected sweep is not one whose phase scatters."""
     G = 300 + 100 * (1j * OMEGA) ** 0.4
     s = Sweep(OMEGA, G.real, G.imag, friction=1e-3 * FRICTION, friction_error=1e-9)
     fit, better = corrected(s)
@@ -194,20 +201,22 @@ def test_the_error_of_the_gap_is_that_of_the_moduli_alone():
 
 @pytest.mark.slow
 def test_the_simulation_has_the_errors_of_gap_and_instrument_too():
-    """Its mesh and its steps move nothing by a tenth of an error, so its errors are those of the closed form."""
+    """Mesh and steps change nothing by more than a tenth of an error, so the errors are those of the closed form."""
     s = sweep(5e-4, 3, noise=0.03)._replace(friction=FRICTION, friction_error=2e-7)
     fit, better = corrected(s)
     alone = uncertainty.estimate(fit.solution, False).standard_errors
     closed = instrument.with_gap_error(fit, 0.03)
     simulation = simulated_rheometer.Simulation(cell_size=0.004, steps=100)
     found = simulated_rheometer.through_torsion(better, closed, simulation)
-    assert closed.uncertainty.standard_errors[-1] > 1.4 * alone[-1]  # by the instrument: the gap moves no time
+    assert closed.uncertainty.standard_errors[-1] > 1.4 * alone[-1]  # by the instrument: the gap does not change a time
     assert found.uncertainty.standard_errors == pytest.approx(closed.uncertainty.standard_errors, rel=0.02)
     assert found.details["gap_error"] == 0.03
 
 
 def end_of_profile(fit: viscoelastic.Fit, better: Sweep, gap: float, side: int) -> float:
-    """An end of the 95 % interval of G0: SciPy refits all other numbers, the gap and the inertia with their priors."""
+    """Return one end of the 95 % interval of G0. SciPy fits all other numbers, with the gap and the inertia and their
+    priors.
+    """
     noise, names = fit.uncertainty.noise, ("inertia_off_by", "prior_standard_deviation")
     told = fit.details.get("instrument")
     before = 0.0 if told is None else told[names[0]] / told[names[1]]
@@ -238,7 +247,7 @@ def test_a_profile_has_the_error_of_the_gap_and_of_the_inertia(gap, share):
     low, high = uncertainty.profile_intervals(fit.solution, better, fit.uncertainty)["shear_modulus"]
     for side, end in ((-1, low), (1, high)):
         exact = end_of_profile(fit, better, gap, side) - fit.uncertainty.values[0]
-        # The grid's chords leave 0.5 % of the half width, the second order of the errors (of 1 %) the rest.
+        # The chords of the grid leave 0.5 % of the half width. The rest is of second order in the errors (of 1 %).
         assert end - fit.uncertainty.values[0] == pytest.approx(exact, rel=0.02), (end, exact)
 
 

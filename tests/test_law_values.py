@@ -1,6 +1,7 @@
-"""Every law against numbers from outside: law_values.json, computed with 50 digits (`experiments/sources`).
+"""Every law compared with independent numbers: law_values.json, computed with 50 digits (`experiments/sources`).
 
-Other tests compare an energy with its own derivatives. These see an energy that is wrong together with them.
+Other tests compare an energy with its own derivatives. These tests also detect an energy that is wrong together with
+its derivatives.
 """
 
 import json
@@ -22,14 +23,14 @@ TABLE = json.loads((ROOT / "tests" / "law_values.json").read_text())
 CASES = TABLE["cases"]
 DIRECTION = np.array(TABLE["direction"])
 
-#: Roundoff. A value takes at most 200 roundings of 1.1e-16. What magnifies them at these gradients: a difference such
-#: as Ibar1 - 3 by Ibar1/(Ibar1 - 3) <= 18, a squared J - 1 by 11, an exponential by its exponent's 10; together at most
-#: 40. 200 x 1.1e-16 x 40 = 9e-13. (Found: 5e-15.)
+#: Bound of rounding. A value takes at most 200 roundings of 1.1e-16. They are magnified at these gradients: a
+#: difference such as Ibar1 - 3 by Ibar1/(Ibar1 - 3) <= 18, a squared J - 1 by 11, an exponential by its exponent 10; in
+#: total by at most 40. 200 x 1.1e-16 x 40 = 9e-13. (Found: 5e-15.)
 TOLERANCE = 1e-12
 
 
 def made(case: dict) -> lj.Law:
-    """The law of a case, as from the tables of a scene file."""
+    """Return the law of a case, as from the tables of a scene file."""
     parts = []
     for table in case["laws"]:
         below = table.get("continued_below")
@@ -39,7 +40,7 @@ def made(case: dict) -> lj.Law:
 
 
 def is_product(law: lj.Law) -> bool:
-    """Whether the chapter's form exists."""
+    """Return whether the law has the chapter's product form."""
     try:
         return all(products.groups(part) is not None for part in lj.laws.summands(law))
     except lj.InputError:
@@ -59,7 +60,7 @@ def column(case: dict, quantity: str) -> np.ndarray:
 
 
 def compare(case: dict, P: jnp.ndarray, curvature: jnp.ndarray) -> None:
-    """First Piola stresses relative to their largest entry, second derivatives relative to themselves."""
+    """Compare first Piola stresses relative to their largest entry, and second derivatives relative to themselves."""
     exact = column(case, "first_piola")
     error = np.abs(np.asarray(P) - exact).max(axis=(1, 2)) / np.abs(exact).max(axis=(1, 2))
     assert error.max() < TOLERANCE
@@ -122,7 +123,7 @@ def test_ground_state_moduli(name):
         assert np.isclose(getattr(law, modulus)(), CASES[name][modulus], rtol=TOLERANCE), modulus
 
 
-#: Formulas of the literature: what the program that makes the table can be held against.
+#: Formulas of the literature, to check the program that makes the table.
 KNOWN_MODULI = {
     "neo_hookean": 770.0,
     "mooney_rivlin": 2 * (300 + 85),

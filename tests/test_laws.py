@@ -1,4 +1,4 @@
-"""Every shipped law: hand-derived derivatives against automatic differentiation, rest state, bounds, user laws."""
+"""Every shipped law: derivatives by hand against automatic differentiation, rest state, bounds, user-defined laws."""
 
 from functools import cache, partial
 from typing import Any, ClassVar
@@ -46,7 +46,7 @@ ANISOTROPIC = {"costa", "costa, turned"}
 
 
 def random_gradients(n: int) -> np.ndarray:
-    """Near rigid, stretched to 3, and compressed to J = 0.1, each under random rotations."""
+    """Return gradients near rigid, stretched to 3, and compressed to J = 0.1, each between random rotations."""
     rng = np.random.default_rng(1)
     stretches = np.concatenate(
         [
@@ -62,38 +62,41 @@ def random_gradients(n: int) -> np.ndarray:
     return F * np.sign(np.linalg.det(F))[:, None, None]
 
 
-#: Rest, and so many others: the same for all tests, so that a law is compiled once.
+#: Rest and many other gradients. They are the same for all tests, so that each law is compiled once.
 POINTS = np.concatenate([np.eye(3)[None], random_gradients(1000)])
 
 
 @jax.jit
 def by_hand(law, F):
-    """Energy, stress and tangent."""
+    """Return energy, stress and tangent."""
     return law.energy(F), law.first_piola(F), law.tangent(F)
 
 
 @cache
 def at_points(name):
-    """`by_hand` at POINTS."""
+    """Return `by_hand` at POINTS."""
     return tuple(np.asarray(v) for v in by_hand(LAWS[name], POINTS))
 
 
 @jax.jit
 def by_autodiff(law, F):
-    """Stress and tangent: nine derivatives of the stress, which come with the stress itself."""
+    """Return stress and tangent by automatic differentiation; nine derivatives of the stress are computed with the
+    stress.
+    """
     stress = partial(lj.reference.first_piola, law)
     directions = jnp.broadcast_to(jnp.eye(9).reshape(9, *[1] * (F.ndim - 2), 3, 3), (9, *F.shape))
     P, columns = jax.vmap(lambda d: jax.jvp(stress, (F,), (d,)), out_axes=(None, 0))(directions)
     return P, jnp.moveaxis(columns, 0, -1).reshape(*F.shape, 3, 3)
 
 
-#: Laws of one power of the stretches. Its derivatives are most of their programs: one program has those of all laws.
+#: Laws with one power of the stretches. Its derivatives are most of their programs, so one program serves all these
+#: laws.
 ONE_POWER = ("bogen", "logarithmic", "exponential")
 
 
 @lj.struct
 class SideBySide(lj.Law):
-    """Several laws of the same power: row k of F has law k."""
+    """Several laws with the same power: row k of F belongs to law k."""
 
     laws: tuple = lj.param("1")
     alpha: Any = lj.param("1")
@@ -110,7 +113,7 @@ class SideBySide(lj.Law):
 
 @cache
 def references_of_one_power():
-    """`by_autodiff` of these laws at POINTS."""
+    """Return `by_autodiff` of these laws at POINTS."""
     laws = tuple(LAWS[name] for name in ONE_POWER)
     ((alpha, volumetric),) = {(law.alpha, law.volumetric) for law in laws}
     bulk = jnp.array([[law.bulk] for law in laws])
@@ -120,25 +123,26 @@ def references_of_one_power():
 
 
 def references(name):
-    """Stress and tangent at POINTS by automatic differentiation of the energy."""
+    """Return stress and tangent at POINTS by automatic differentiation of the energy."""
     if name in ONE_POWER:
         return references_of_one_power()[name]
     return tuple(np.asarray(v) for v in by_autodiff(LAWS[name], POINTS))
 
 
-#: Laws of each kind: one invariant, two, stretches, fibres. The others run with -m slow.
+#: One law of each kind: one invariant, two, stretches, fibres. The others run with -m slow.
 KINDS = ("neo_hookean", "mooney_rivlin", "arruda_boyce", "costa")
 
 
 @pytest.mark.parametrize("name", [n if n in KINDS else pytest.param(n, marks=pytest.mark.slow) for n in LAWS])
 def test_stress_and_tangent_against_autodiff(name):
-    # NumPy for maxima: jnp.max of jax 0.12.0.1 passes over NaN in arrays of several dimensions.
+    # NumPy computes the maxima, because jnp.max of jax 0.12.0.1 ignores NaN in arrays with several dimensions.
     law, (W, P, A) = LAWS[name], at_points(name)
-    exists = np.isfinite(W)  # the logarithmic law ends at a finite stretch
+    exists = np.isfinite(W)  # the logarithmic law is undefined beyond a finite stretch
     assert np.array_equal(np.isfinite(P).all(axis=(1, 2)), exists)
     P, A = P[exists], A[exists]
     P_ref, A_ref = (v[exists] for v in references(name))
-    # Relative to the size of the terms that make up an entry: near rest the stress itself is their small difference.
+    # Errors are relative to the size of the terms of an entry. Near rest the stress is a small difference of such
+    # terms.
     size_A = np.abs(A_ref).max(axis=(1, 2, 3, 4))
     size_P = np.abs(P_ref).max(axis=(1, 2)) + law.shear_modulus()
     assert exists.mean() > 0.7
@@ -155,7 +159,7 @@ def test_rest_state_and_stated_moduli(name):
     assert abs(W) < 1e-12 * G
     assert np.abs(P).max() < 1e-12 * (G + K)
     normal, shear = np.einsum("iijj->ij", A), np.array([A[0, 1, 0, 1], A[0, 2, 0, 2], A[1, 2, 1, 2]])
-    # Voigt's means; of an isotropic law every direction's.
+    # Voigt averages; for an isotropic law they are the moduli in every direction.
     coupled = normal[0, 1] + normal[0, 2] + normal[1, 2]
     assert np.isclose((np.trace(normal) + 2 * coupled) / 9, K, rtol=1e-12, atol=1e-12 * G)
     assert np.isclose((np.trace(normal) - coupled) / 15 + shear.sum() / 5, G, rtol=1e-12)
@@ -170,7 +174,7 @@ def test_objective_and_symmetric(name):
     Q = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
     Q = Q * np.sign(np.linalg.det(Q))
     turned = by_hand(LAWS[name], np.einsum("ij,njk->nik", Q, POINTS))[0]
-    # Near rest an energy is the small difference of numbers of the size of its modulus.
+    # Near rest, an energy is a small difference of numbers of the size of its modulus.
     assert np.allclose(turned, W, rtol=1e-9, atol=1e-12 * LAWS[name].shear_modulus(), equal_nan=True)
     assert np.nanmax(np.abs(A - np.transpose(A, (0, 3, 4, 1, 2)))) < 1e-12 * np.nanmax(np.abs(A))
 
@@ -178,7 +182,7 @@ def test_objective_and_symmetric(name):
 def test_user_law_needs_only_its_energy():
     @lj.struct
     class Mine(lj.Law):
-        """W = mu/2 (J^(-2/3) I1 - 3) + bulk/2 (J - 1)^2."""
+        """A user-defined law: W = mu/2 (J^(-2/3) I1 - 3) + bulk/2 (J - 1)^2."""
 
         mu: Any = lj.param("Pa")
         bulk: Any = lj.param("Pa")
@@ -209,7 +213,7 @@ def test_a_planted_mistake_is_caught():
 
 
 def test_only_invariants_asked_for_are_computed():
-    # Structure, not multiplication with zero: neo-Hookean never forms C = F^T F nor I2.
+    # The structure counts, not a multiplication by zero: neo-Hookean never forms C = F^T F or I2.
     F = jnp.eye(3)
     text = str(jax.make_jaxpr(LAWS["neo_hookean"].energy)(F))
     more = str(jax.make_jaxpr(LAWS["mooney_rivlin"].energy)(F))

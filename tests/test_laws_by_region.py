@@ -1,4 +1,4 @@
-"""Regions with a law of another kind: terms against autodiff, bodies in series by hand, every scene, refusals."""
+"""Regions with another kind of law: terms against autodiff, parts in series by hand, all scenes, invalid input."""
 
 import dataclasses
 
@@ -47,10 +47,10 @@ def test_subsets_come_apart_and_together():
     assert second["vectors"].tolist() == [[12, 13, 14], [3, 4, 5]]
     found = put_together(groups, [(in_subset(groups, k, numbers["points"]), float(k)) for k in range(3)])
     assert found[0].tolist() == numbers["points"].tolist() and found[1][0].tolist() == [0, 1, 0, 0, 1, 2]
-    assert len(subsets([jnp.array([1, 0])], 2).elements) == 1  # no element is left: no empty subset
+    assert len(subsets([jnp.array([1, 0])], 2).elements) == 1  # no element is left, and there is no empty subset
 
 
-#: Kinds that differ in what they depend on: invariants, I2, stretches, Green's strain with fibres.
+#: Kinds that depend on different quantities: invariants, I2, stretches, Green's strain with fibres.
 KINDS = ("mooney_rivlin", "ogden", "costa", "exponential")
 
 
@@ -67,7 +67,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(order, kinds):
     x = mesh.points + 2e-4 * jax.random.normal(jax.random.key(0), mesh.points.shape)
 
     def energy(x):
-        """Every element by the energy of its law, without subsets."""
+        """Return the energy of every element by its own law, without subsets."""
         F = deformation_gradient(mesh, x)
         whole = mesh.at_points(by_element)
         density = whole.strain_energy(whole.measures(F))
@@ -100,7 +100,7 @@ def test_projected_stiffness_has_no_negative_eigenvalue():
     whole = K.reshape(3, 3, 3, 3, E).transpose(4, 0, 2, 1, 3).reshape(E, 9, 9)
     values = np.linalg.eigvalsh(whole)
     assert values.min() > -1e-10 * values.max()
-    # The scene's law alone, where it acts.
+    # Compare with the scene's law alone, where it acts.
     alone = np.array(projection.blocks([(jnp.linspace(0.5, 0.9, E), stable)], S, F, D, pairs))
     below = np.setdiff1d(np.arange(E), np.asarray(own[0].elements))
     np.testing.assert_allclose(K[..., below], alone[..., below], rtol=1e-12, atol=1e-9)
@@ -108,7 +108,7 @@ def test_projected_stiffness_has_no_negative_eigenvalue():
 
 @pytest.mark.slow
 def test_two_laws_in_series_carry_one_force(verified):
-    """Held at the sides, each half is stretched uniformly: equal nominal stress, and stretches that add up."""
+    """With fixed sides, each half is stretched uniformly. The nominal stresses are equal, and the stretches add up."""
     mesh = block(1, (1, 1, 4))
     sides = lj.Fixed(nodes=jnp.arange(mesh.number_of_nodes), axes="xy")
     bottom = lj.Fixed(nodes=mesh.node_sets["z_min"], axes="z")
@@ -137,7 +137,7 @@ def test_two_laws_in_series_carry_one_force(verified):
     np.testing.assert_allclose(np.asarray(result.positions)[-1][middle, 2], 0.01 * lower, rtol=1e-9)
 
 
-#: What a scene may have: its changes and its element order.
+#: Features of a scene: changes and element order.
 SCENES = {
     "static": ({}, 1),
     "projected": ({"solve": lj.Solve(steps=2, robust="projected")}, 1),
@@ -184,10 +184,12 @@ def pulled(name, region):
     return replace(scene, **changes)
 
 
-@pytest.mark.slow  # the two laws in series are the quick one
+@pytest.mark.slow  # the test of two laws in series is the quick one
 @pytest.mark.parametrize("name", SCENES)
 def test_a_law_of_its_own_is_that_with_other_numbers(name):
-    """A region's own neo-Hookean law and other numbers of the scene's give one body, whatever the scene has."""
+    """A region with a separate neo-Hookean law equals a region with other parameters of the scene's law, in every
+    scene.
+    """
     other = {"mu": 2000.0, "bulk": 4000.0}
     numbers = lj.simulate(pulled(name, lambda e: lj.Region(elements=e, law=other))).check()
     own = lj.simulate(pulled(name, lambda e: lj.Region(elements=e, law=lj.laws.NeoHookean(**other)))).check()
@@ -258,7 +260,7 @@ def test_scene_files_name_a_law_for_a_region():
         ({"region": [{"where": {"z_min": 0.01}, "law": [{"mu": 1.0}]}]}, "region.0: law needs name"),
         (
             {"region": [{"where": {"z_min": 0.01}, "law": OGDEN}, {"where": {"z_min": 0.0}, "law": {"mu": 1.0}}]},
-            "region.1 changes the law of elements to which region.0",
+            "region.1 changes the law of elements that have a separate law from region.0",
         ),
         (
             {
@@ -279,7 +281,7 @@ def test_unusable_laws_of_regions_get_one_sentence(more, sentence):
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_averaged_volumes_know_laws_of_several_kinds(order):
-    """Where all volume ratios are the same, averaging changes nothing: each element has the energy of its own law."""
+    """If all volume ratios are equal, averaging changes nothing: each element has the energy of its own law."""
     from liverjax.physics.volumes import averaged
 
     scene = prepared(pulled("static", lambda e: lj.Region(elements=e, law=replace(TUMOUR, volumetric="log"))))
@@ -292,7 +294,7 @@ def test_averaged_volumes_know_laws_of_several_kinds(order):
     exact = share[0] * 0.5 * first * (J - 1) ** 2 + share[1] * 0.5 * second * np.log(J) ** 2
     assert np.isclose(found, exact, rtol=1e-12)
     p = averaged.averaged_pressure(mesh, own, jnp.full(mesh.weights.shape, J))
-    # Inside either part the pressure is its own law's.
+    # Inside each part the pressure is that of its own law.
     assert np.isclose(p.min(), first * (J - 1), rtol=1e-12) or np.isclose(p.min(), second * np.log(J) / J, rtol=1e-12)
     assert np.isclose(
         jnp.sum(p * averaged._mean(mesh, jnp.ones(mesh.weights.shape))[1]),
@@ -303,7 +305,9 @@ def test_averaged_volumes_know_laws_of_several_kinds(order):
 
 @pytest.mark.slow
 def test_averaged_volumes_of_a_region_with_the_same_law_written_otherwise():
-    """Mooney-Rivlin without its second constant is neo-Hookean; and another number of one law is a law of its own."""
+    """Mooney-Rivlin without its second constant is neo-Hookean. Other parameters of the same law count as
+    another law.
+    """
     same = lj.laws.MooneyRivlin(c10=LIVER.mu / 2, c01=0.0, bulk=LIVER.bulk)
     nodal = lj.Solve(volumetric="nodal", tolerance=1e-10)
 
@@ -321,7 +325,7 @@ def test_averaged_volumes_of_a_region_with_the_same_law_written_otherwise():
 
 def test_elements_named_twice_and_reduced_models_are_refused():
     scene = pulled("static", lambda e: lj.Region(elements=jnp.concatenate([e, e[:1]]), law=TUMOUR))
-    with pytest.raises(lj.InputError, match="names an element twice"):
+    with pytest.raises(lj.InputError, match="contains an element twice"):
         lj.check_scene(scene)
     from liverjax.reduced.model import refuse_unknown_physics
 
@@ -330,7 +334,9 @@ def test_elements_named_twice_and_reduced_models_are_refused():
 
 
 def test_volumes_of_several_kinds_are_not_mixed():
-    """Pressures as unknowns have one kind of U(J): with two, all elements had the first one's, 25 % off and unsaid."""
+    """With pressures as unknowns there can be only one kind of U(J). With two kinds, all elements had the first one.
+    The error was 25 %, without a message.
+    """
     own = {"name": "neo_hookean", "mu": 800.0, "bulk": 3000.0, "volumetric": "log"}
     region = {"region": [{"where": {"z_min": 0.01}, "law": own}]}
     with pytest.raises(lj.InputError, match="one kind of volumetric energy in all laws"):

@@ -1,4 +1,4 @@
-"""A run that is killed goes on from its finished parts and ends with the same numbers."""
+"""A killed run continues from its finished parts and ends with the same numbers."""
 
 import os
 import signal
@@ -79,7 +79,7 @@ tolerance = 1e-4
 
 @pytest.fixture(autouse=True, scope="module")
 def _kept(tmp_path_factory):
-    """A command finds the program of the one before, as a user's does: it is compiled once for all tests here."""
+    """A command finds the program of the command before, as for a user. All tests here compile it once."""
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_logging_level")
     before = {name: getattr(jax.config, name) for name in names}
     with pytest.MonkeyPatch.context() as patch:
@@ -92,7 +92,7 @@ def _kept(tmp_path_factory):
 
 @pytest.fixture
 def scene(tmp_path) -> Path:
-    """Everything that has a state: inertia of second order, memory, fluid."""
+    """A scene with every kind of state: inertia of second order, viscous memory, fluid."""
     file = tmp_path / "scene.toml"
     file.write_text(SCENE)
     return file
@@ -105,7 +105,7 @@ def _numbers(file: Path) -> dict[str, np.ndarray]:
 
 
 def _stop_after(monkeypatch, count: int) -> None:
-    """Ctrl-C at the write of part `count`, from 0."""
+    """Simulate Ctrl-C while part `count` (from 0) is written."""
     write, written = resumable_parts.write, []
 
     def until(file, content):
@@ -128,7 +128,8 @@ def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch,
     assert not (stopped / "result.h5").exists()
     assert main([*command, str(stopped)]) == 2
     assert "go on with --resume" in capsys.readouterr().err
-    damaged = sorted(stopped.glob("result.h5.parts/part_*.h5"))[1]  # the machine lost power while it was written
+    # as if the machine had lost power while the file was written
+    damaged = sorted(stopped.glob("result.h5.parts/part_*.h5"))[1]
     damaged.write_bytes(damaged.read_bytes()[:-1000])
     with monkeypatch.context() as patch:
         _stop_after(patch, 1)
@@ -147,7 +148,7 @@ def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch,
 def test_a_run_in_parts_is_the_run_in_one(scene, tmp_path):
     assert main(["simulate", str(scene), "--every", "4", "--out", str(tmp_path)]) == 0
     found = _numbers(tmp_path / "result.h5")
-    # Parts differ from one run by the tangents that a part does not inherit: within the tolerance of Newton.
+    # A part does not inherit the tangent of the part before. The difference from one run is below Newton's tolerance.
     once = lj.simulate(lj.load_scene(scene)).check()
     moved = np.abs(np.asarray(once.positions) - np.asarray(once.positions)[0]).max()
     assert np.abs(np.asarray(once.positions) - found["positions"]).max() < 1e-4 * moved
@@ -163,7 +164,7 @@ def test_parts_of_another_scene_are_refused(scene, tmp_path, monkeypatch, capsys
     assert "of another run (not the same scene)" in capsys.readouterr().err
     scene.write_text(SCENE)
     load = scene_file.load_scene
-    with monkeypatch.context() as patch:  # the same text, but a file that it names has changed
+    with monkeypatch.context() as patch:  # the text is the same, but a file that it names has changed
         patch.setattr(scene_file, "load_scene", lambda file: lj.with_parameters(load(file), {"body.density": 1000.0}))
         assert main([*command, "--resume"]) == 2
     assert "of another run (not the same numbers)" in capsys.readouterr().err
@@ -172,19 +173,19 @@ def test_parts_of_another_scene_are_refused(scene, tmp_path, monkeypatch, capsys
 
 
 def test_the_result_of_another_scene_is_not_replaced_by_resume(scene, tmp_path, capsys):
-    """It was computed anew and replaced, without a word."""
+    """The result was computed again and replaced, without a message."""
     out = tmp_path / "result.h5"
     with h5py.File(out, "w") as file:
         file.attrs["scene"] = SCENE.replace("770.0", "700.0")
     assert main(["simulate", str(scene), "--resume", "--out", str(tmp_path)]) == 2
-    assert "result.h5 is the result of another scene: name another --out, or leave --resume" in capsys.readouterr().err
+    assert "result.h5 is the result of another scene: name another --out, or remove --resume" in capsys.readouterr().err
     long_run.refuse_unfinished(out, resume=False, text=SCENE)
     long_run.refuse_unfinished(out, resume=True, text="# of the same numbers\n" + SCENE.replace("770.0", "700.0"))
 
 
 @pytest.mark.parametrize("steps", [5, 8125, 8126, 40_000])
 def test_runs_of_any_length_are_written(steps, tmp_path):
-    """HDF5 takes no attribute of more than 64 kB, which is 8,190 residuals."""
+    """HDF5 does not allow attributes above 64 kB, which is 8,190 residuals."""
     scene = lj.Scene(mesh=lj.shapes.box((1, 1, 1), (1, 1, 1)), law=lj.laws.create("neo_hookean", mu=1.0, bulk=1.0))
     number = np.arange(steps)
     codes = number.astype(np.int32) % 2

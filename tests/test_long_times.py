@@ -1,4 +1,4 @@
-"""What a test leaves open of the equilibrium modulus: materials that relax after its end."""
+"""Uncertainty of the equilibrium modulus if the material relaxes after the end of a test."""
 
 import json
 
@@ -18,13 +18,13 @@ REST = G0 * (1 - RATIOS.sum())
 
 
 def moduli(hertz: np.ndarray, modes: int) -> np.ndarray:
-    """Complex moduli [Pa] of the first modes; those that are left out have not relaxed."""
+    """Return the complex moduli [Pa] of the first modes. Modes that are left out have not relaxed."""
     iwt = 2j * np.pi * hertz[:, None] * TIMES[:modes]
     return G0 * (1 - RATIOS[:modes].sum() + (RATIOS[:modes] * iwt / (1 + iwt)).sum(axis=1))
 
 
 def sweep(seed: int, modes: int = 3) -> Sweep:
-    """0.1 to 16 Hz with 2 % of noise; the mode of 8 s has its loss at 0.02 Hz."""
+    """A sweep from 0.1 to 16 Hz with 2 % of noise. The mode of 8 s has its loss peak at 0.02 Hz."""
     hertz, noise = np.logspace(-1, 1.2, 24), 1 + 0.02 * np.random.default_rng(seed).normal(size=(2, 24))
     G = moduli(hertz, modes)
     return Sweep(2 * np.pi * hertz, G.real * noise[0], G.imag * noise[1])
@@ -40,7 +40,7 @@ def interval(test: Sweep):
 
 @pytest.mark.slow
 def test_the_interval_holds_where_a_mode_relaxes_after_the_test():
-    """Two modes were chosen, and their 820 ± 12 Pa missed the true 500 by 16 to 30 errors in 20 of 20 sweeps."""
+    """Two modes were chosen. Their 820 ± 12 Pa missed the true 500 by 16 to 30 standard errors in 20 of 20 sweeps."""
     held, errors = [], []
     for seed in range(12):
         rest, error, found = interval(sweep(seed))
@@ -52,7 +52,7 @@ def test_the_interval_holds_where_a_mode_relaxes_after_the_test():
 
 @pytest.mark.slow
 def test_the_interval_is_that_of_the_standard_error_where_the_test_is_long_enough():
-    """The same material without the slow mode."""
+    """The material is the same without the slow mode."""
     held, ratios = [], []
     for seed in range(16):
         _, error, found = interval(sweep(seed, 2))
@@ -62,7 +62,7 @@ def test_the_interval_is_that_of_the_standard_error_where_the_test_is_long_enoug
 
 
 def test_the_interval_of_exact_modes_is_their_profile():
-    """The sum of squares at the ends, by another minimiser (SciPy's trust region) over all other numbers."""
+    """The sum of squares at the ends is found by another minimiser (SciPy's trust region) over all other numbers."""
     import scipy.optimize
 
     test = sweep(504)
@@ -101,7 +101,9 @@ def test_the_command_tells_that_a_record_is_too_short(tmp_path, capsys, seconds,
 
 
 def test_an_interval_of_few_independent_residuals_is_told_too(tmp_path, capsys):
-    """A test of half the slowest time, with one mode of two: 629 ± 82 Pa was said of 400, without a word or a share."""
+    """A test takes half of the slowest time, and one of two modes was found. The result was 629 ± 82 for a true 400 Pa,
+    without a warning or a share of error.
+    """
     time, rng = np.geomspace(0.02, 10.0, 120), np.random.default_rng(5)
     G = 400 + 300 * np.exp(-time / 0.5) + 300 * np.exp(-time / 20)
     for _ in range(2):
@@ -129,7 +131,9 @@ def test_the_share_of_long_times_is_in_the_total_error(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_fluid_that_has_relaxed_is_not_told_to_be_a_solid(tmp_path, capsys):
-    """No modulus is left at the end of the record: 0 to 30 % of G0 was said of it once, from a start never fitted."""
+    """At the end of the record no modulus is left. An unfitted starting point once gave an interval of 0 to 30
+    % of G0.
+    """
     time, rng = np.logspace(-2, 2.5, 90), np.random.default_rng(0)
     G = G0 * (0.6 * np.exp(-time / 0.1) + 0.4 * np.exp(-time / 20)) + rng.normal(size=90)
     rows = "\n".join(f"{t:.8g},{g:.8g}" for t, g in zip(time, G, strict=True))

@@ -1,4 +1,4 @@
-"""Consistent masses: their sums, free fall, the factorisation, derivatives; and the mesh's estimate in motion."""
+"""Consistent masses: sums, free fall, factorisation, derivatives; and the estimated mesh error in motion."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ def falling(order: int, mass: str, integrator: str = "newmark", **solve) -> lj.S
 
 
 def fallen(scene: lj.Scene) -> np.ndarray:
-    """Where all points of a free body are, by the recursion of the integrator (T, 1, 3)."""
+    """Return the positions (T, 1, 3) of all points of a free body, by the recursion of the integrator."""
     n, dt = np.arange(1, scene.solve.steps + 1), scene.solve.dt
     way = dt**2 * (n**2 if scene.solve.integrator == "newmark" else n * (n + 1)) / 2
     return way[:, None, None] * GRAVITY
@@ -39,7 +39,9 @@ def fallen(scene: lj.Scene) -> np.ndarray:
 
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_masses_integrate_products_of_functions(order):
-    """Times a constant field they give the weight; times a linear one, with itself, its second moments."""
+    """Multiplied by a constant field they give the weight; by a linear field, together with itself, its second
+    moments.
+    """
     mesh = MESHES[order]
     mass, shared = Inertia(density=1000.0, mass="consistent")._masses(mesh)
 
@@ -51,7 +53,7 @@ def test_masses_integrate_products_of_functions(order):
     one = jnp.zeros_like(mesh.points).at[:whole].set(1.0)
     assert np.allclose(product(one)[:, 0], 1000.0 * load_volumes(mesh), rtol=1e-13, atol=1e-13 * mass.max())
     moment = jnp.vdot(mesh.points[:, 0], product(mesh.points)[:, 0])
-    # By the corners X_a of tetrahedra: V/20 (sum_a X_a^2 + (sum_a X_a)^2).
+    # For the corners X_a of tetrahedra: V/20 (sum_a X_a^2 + (sum_a X_a)^2).
     X = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra), 0]
     exact = 1000.0 * np.sum(np.asarray(mesh.volumes) / 20 * ((X**2).sum(axis=1) + X.sum(axis=1) ** 2))
     assert np.isclose(moment, exact, rtol=1e-13)
@@ -68,7 +70,7 @@ def test_numbers_by_node_are_means_by_element():
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["euler", "newmark"])
 def test_a_free_quadratic_body_falls_as_one(integrator):
-    """Lumped masses of quadratic elements are not as their weight: the body bends itself."""
+    """Lumped masses of quadratic elements are not proportional to their weight, so the body would bend."""
     found = []
     for mass in ("consistent", "lumped"):
         scene = falling(2, mass, integrator, tolerance=1e-10)
@@ -78,7 +80,7 @@ def test_a_free_quadratic_body_falls_as_one(integrator):
 
 
 def test_accelerations_at_the_beginning_are_those_of_the_weight():
-    """With a side held: m a = f where the body is free, 0 where it is held."""
+    """With one side fixed, m a = f where the body is free, and 0 where it is fixed."""
     mesh = MESHES[2]
     own = Inertia(density=1000.0, integrator="newmark", mass="consistent")
     mask = jnp.ones_like(mesh.points).at[mesh.node_sets["x_min"]].set(0.0)
@@ -117,7 +119,9 @@ def test_derivatives_go_through_the_first_acceleration():
 
 @pytest.mark.slow
 def test_the_estimate_in_free_fall_is_nothing():
-    """The richer functions have weight and as much mass: a body of linear elements falls as one in both spaces."""
+    """The added functions have weight and mass in the same proportion. A body of linear elements falls equally in both
+    spaces.
+    """
     scene = falling(1, "lumped", tolerance=1e-10)
     result = lj.simulate(scene, mesh_error=True).check()
     assert bool(result.mesh_error.found.all())
@@ -127,8 +131,10 @@ def test_the_estimate_in_free_fall_is_nothing():
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_the_estimate_in_motion_is_the_way_to_the_richer_run(order):
-    """A beam that swings through a period, little: of linear elements the estimate leads to quadratic ones on the same
-    mesh; of quadratic ones, two thirds of it to a finer mesh (`moving_mesh` has more)."""
+    """A beam oscillates with a small amplitude. For linear elements, the estimate gives the motion of quadratic ones on
+    the same mesh. For quadratic elements, it gives two thirds of the difference to a finer mesh (`moving_mesh` has
+    more).
+    """
     mesh = lj.shapes.box((0.1, 0.02, 0.02), (5, 1, 1) if order == 1 else (2, 1, 1))
     scene = lj.Scene(
         mesh=mesh if order == 1 else lj.quadratic(mesh),
@@ -151,6 +157,6 @@ def test_the_estimate_in_motion_is_the_way_to_the_richer_run(order):
     off = truth - found
     size = np.linalg.norm(change) / np.linalg.norm(off)
     if order == 1:
-        # Linear solves to a hundredth in each of thirty steps; the motion is linear to its size, 4 mm of 100.
+        # The linear solves of thirty steps have an error of a hundredth. The motion of 4 mm (of 100) is nearly linear.
         assert np.linalg.norm(change - off) < 0.05 * np.linalg.norm(off)
     assert 0.5 < size < 2 and np.vdot(change, off) > 0.9 * np.linalg.norm(change) * np.linalg.norm(off)

@@ -1,4 +1,4 @@
-"""Sweeps at several temperatures: shift factors against the ones that made the data, laws, files, sentences."""
+"""Sweeps at several temperatures: shift factors against those of the data, temperature laws, files, messages."""
 
 import json
 
@@ -23,7 +23,9 @@ TRUE_B = -0.002 * (TEMPERATURES - TEMPERATURES[REFERENCE])
 
 
 def moduli_of_polymer(omega: np.ndarray) -> np.ndarray:
-    """A smooth wide spectrum: one mode for every third of a decade, weights of a power law with a plateau."""
+    """Return moduli of a smooth wide spectrum: one mode per third of a decade, weights of a power law with a
+    plateau.
+    """
     times = np.geomspace(1e-9, 1e6, 46)
     x = 1j * omega[:, None] * times
     return 5e3 + (2e4 * (1 + (times / 1e-3) ** -0.45) / 3 * x / (1 + x)).sum(axis=1)
@@ -46,11 +48,11 @@ def test_factors_of_exact_data_are_those_that_made_them():
 
 
 def test_sweeps_with_a_gap_between_them_are_refused():
-    """They were joined by the smoothness of the curve, 1.7 decades off with an error of 0.08."""
+    """The sweeps were joined because the curve was assumed smooth. The error was 1.7 decades, the stated error 0.08."""
     true = np.array([0.0, -4.0])
     far = [moduli_of_polymer(10**a * OMEGA) for a in true]
     parts = [Sweep(OMEGA, G.real, G.imag) for G in far]
-    with pytest.raises(InputError, match="0 and 60 °C do not overlap where they lie best"):
+    with pytest.raises(InputError, match="0 and 60 °C do not overlap after the best shifts"):
         shifts.found(parts, 273.15 + np.array([0.0, 60.0]), 0)
 
 
@@ -63,13 +65,16 @@ def test_standard_errors_of_factors_are_right():
         assert 0.015 < found.apart < 0.025
         wlf = temperature_laws.temperature_laws_of(found)[0].numbers
         of_law.append([(wlf[name][0] - true) / wlf[name][1] for name, true in (("C1", C1), ("C2_K", C2))])
-    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4  # neighbours share errors: 24 sets of about 3 independent ones
-    # C1 and C2 go together, so 24 values: 1 +- 0.3. With independent factors their errors were half as large.
+    # errors of neighbours are correlated: 24 sets of about 3 independent ones
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
+    # C1 and C2 are correlated, so 24 values give 1 +- 0.3. With independent factors, their errors were half as large.
     assert 0.6 < np.sqrt(np.mean(np.square(of_law))) < 1.4
 
 
 def test_errors_of_factors_contain_the_noise_where_points_scatter():
-    """A curve with knots 0.4 decades apart follows the noise: errors were a half to a fifth of what they should be."""
+    """A curve with knots 0.4 decades apart follows the noise. Then the errors were only a half to a fifth of the right
+    size.
+    """
     z, told = [], 0
     for seed in range(12):
         parts = sweeps(0.1, seed)[2:8]
@@ -91,7 +96,7 @@ def test_vertical_factors_are_found_where_the_curve_has_a_shape():
 
 @pytest.mark.parametrize("vertical", [True, False])
 def test_factors_of_the_moduli_are_told_where_only_frequencies_are_shifted(vertical):
-    """They moved log a by seven of its standard errors while the curves lay 2.4 % apart."""
+    """These factors changed log a by seven of its standard errors, although the curves deviated by 2.4 %."""
     data = temperature_sweeps.AtTemperatures(sweeps(0.01, 2, vertical), TEMPERATURES, None)
     notes = master_curve.master_curve(data, None).sweep.notes
     assert any("the moduli have factors too" in n and "give --vertical" in n for n in notes) == vertical
@@ -100,7 +105,9 @@ def test_factors_of_the_moduli_are_told_where_only_frequencies_are_shifted(verti
 
 @pytest.mark.parametrize("noise", [pytest.param(0.02, marks=pytest.mark.slow), 0.05])
 def test_no_factors_are_told_of_a_power_law(noise):
-    """Every a has its own b there: the note moved log a by more than a decade in 8 to 12 of 40 data sets."""
+    """For a power law, any shift a can be replaced by a factor b. The note changed log a by more than a decade in 8 to
+    12 of 40 data sets.
+    """
     true, omega = np.array([1.2, 0.6, 0.0, -0.55, -1.1]), np.geomspace(0.1, 100.0, 16)
     T = 273.15 + np.linspace(10.0, 50.0, 5)
     for seed in range(12):
@@ -264,14 +271,14 @@ def test_twenty_measured_tables_make_one_curve():
     data = temperature_sweeps.read_temperatures([file])
     found = master_curve.master_curve(data, 333.15)
     assert len(data.sweeps) == 20 and np.ptp(np.log10(found.sweep.angular_frequency)) > 14
-    # All but the three coldest sweeps, which are glassy, lie within 1 % of one curve.
+    # All sweeps except the three coldest ones, which are glassy, agree with one curve within 1 %.
     assert np.all(found.shifts.misfit[3:] < 0.01)
     wlf = found.laws[0]
     assert wlf.name == "WLF" and wlf.apart < 0.1
-    # Of another reference the law is the same where C2 moves by the difference of the temperatures (Ferry, 11-22).
+    # For another reference temperature the law is equal if C2 changes by the difference of temperatures (Ferry, 11-22).
     other = master_curve.master_curve(data, 293.15).laws[0]
     apart = found.shifts.temperatures[found.shifts.reference] - 293.15
     assert other.numbers["C2_K"][0] == pytest.approx(wlf.numbers["C2_K"][0] - apart, rel=0.03)
-    # A smooth spectrum of 2 times a decade follows 14 decades; half a decade at the cold end is noise.
+    # A smooth spectrum with 2 times per decade follows 14 decades. Half a decade at the cold end is noise.
     fit = models.spectrum_fit(found.sweep)
     assert np.mean(fit.relative_errors(found.sweep)) < 0.015 and fit.details["spectrum"]["decades_carried"] > 12

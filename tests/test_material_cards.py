@@ -1,4 +1,4 @@
-"""Material cards, read back as the program reads them: the moduli are those of the model."""
+"""Material cards, read back in the way the target program reads them: the moduli are those of the model."""
 
 import re
 import tomllib
@@ -20,7 +20,7 @@ MANY = Maxwell(np.array(1e4), np.full(7, 0.1), np.geomspace(100, 1e-3, 7))
 
 
 def complex_modulus(rest, strengths, times, omega=OMEGA):
-    """Of what stays [Pa] and modes [Pa, s]: the sum over the elements, nothing of the project."""
+    """Return the sum over the equilibrium modulus [Pa] and the modes [Pa, s], without code of the project."""
     s = 1j * omega[:, None] * np.asarray(times)
     return rest + (np.asarray(strengths) * s / (1 + s)).sum(axis=1)
 
@@ -31,7 +31,10 @@ def exact(model):
 
 
 def from_febio(text):
-    """Stress = integral of G(t - s) dS_elastic/ds with G(t) = g0 + sum g_i exp(-t / t_i) (FEBio theory manual, 5.3)."""
+    """Return the modulus of FEBio's card.
+
+    Stress = integral of G(t - s) dS_elastic/ds with G(t) = g0 + sum g_i exp(-t / t_i) (FEBio theory manual, 5.3).
+    """
     material = ET.fromstring(text.split("?>", 1)[1]).find("Material/material")
     terms = {e.tag: float(e.text) for e in material if e.tag != "elastic"}
     shear = float(material.find("elastic/E").text) / (2 * (1 + float(material.find("elastic/v").text)))
@@ -41,7 +44,9 @@ def from_febio(text):
 
 
 def from_abaqus(text):
-    """G0 = 2 C10, K0 = 2 / D1; g, k, tau a line (Abaqus Analysis User's Guide, time domain viscoelasticity)."""
+    """Return the modulus of Abaqus's card: G0 = 2 C10, K0 = 2 / D1; one line of g, k, tau per mode (Abaqus Analysis
+    User's Guide, time domain viscoelasticity).
+    """
     keyword, rows = "", {}
     for line in text.splitlines():
         if line.startswith("*") and not line.startswith("**"):
@@ -56,7 +61,9 @@ def from_abaqus(text):
 
 
 def from_ansys(text):
-    """mu, d of TB,HYPER,,,,NEO and pairs a_i, t_i of TB,PRONY (Ansys material reference)."""
+    """Return the modulus of Ansys's card: mu, d of TB,HYPER,,,,NEO and pairs a_i, t_i of TB,PRONY (Ansys material
+    reference).
+    """
     tables, now = {}, ""
     for line in text.splitlines():
         cells = line.split(",")
@@ -66,7 +73,7 @@ def from_ansys(text):
             if cells[1] == "PRONY":
                 tables[now]["terms"] = int(cells[4])
         elif cells[0] == "TBDATA":
-            assert len(cells) <= 8  # six numbers a line
+            assert len(cells) <= 8  # six numbers per line
             tables[now] |= {int(cells[1]) + k: float(v) for k, v in enumerate(cells[2:])}
     assert tables["PRONYSHEAR"] == tables["PRONYBULK"]
     n, shear = tables["PRONYSHEAR"]["terms"], tables["HYPER"][1]
@@ -75,7 +82,9 @@ def from_ansys(text):
 
 
 def from_liverjax(text):
-    """As a scene file is read: the shear modulus of the law at rest, the part of it that each mode relaxes."""
+    """Return the modulus of a scene file: shear modulus of the law at rest, and the part of it that each mode
+    relaxes.
+    """
     body = '[mesh]\nshape = "box"\nsize = [1, 1, 1]\ncells = [1, 1, 1]\n[[fixed]]\nwhere = {z_max = 0.0}\n'
     motion = "[[displaced]]\nwhere = {z_min = 1.0}\nby = [0.01, 0, 0]\n[solve]\ndt = 0.01\n"
     scene = scene_from(tomllib.loads(body + motion + text), ".")
@@ -94,7 +103,7 @@ def test_cards_read_back_are_the_model(model, tmp_path):
         if name == "febio.feb" and len(model.ratios) > 6:
             assert not (tmp_path / name).exists() and "FEBio has at most 6 modes" in told[0]
             continue
-        # Ten digits; of a fluid Abaqus and liverjax keep a millionth of G0.
+        # Numbers have ten digits. For a fluid, Abaqus and liverjax keep a millionth of G0.
         off = np.abs(reader((tmp_path / name).read_text()) - exact(model))
         assert np.all(off <= 1e-8 * np.abs(exact(model)) + 2e-6 * float(model.shear_modulus) * (model is FLUID)), name
     assert any("fluid" in t for t in told) == (model is FLUID)
@@ -102,7 +111,7 @@ def test_cards_read_back_are_the_model(model, tmp_path):
 
 @pytest.mark.parametrize("card", ["scene_tables", "febio", "abaqus", "ansys", "sofa"])
 def test_cards_say_which_times_they_hold(card):
-    """The modes of a springpot follow it over the measured band; a card alone does not show that."""
+    """The modes replace a springpot only in the measured band. A card alone does not show this."""
     text = getattr(material_cards, card)(SOLID)
     assert "Modes of 0.03 to 0.27 s: faster and slower relaxation is not in this card." in text
 
@@ -110,7 +119,7 @@ def test_cards_say_which_times_they_hold(card):
 def test_the_card_of_sofa_is_the_equilibrium(tmp_path):
     field = ET.fromstring("<s>" + material_cards.sofa(SOLID) + "</s>")[0]
     mu, lame = (float(v) for v in field.get("ParameterSet").split())
-    # Its energy has lambda/2 (ln J)^2: nu = lambda / (2 (lambda + mu)).
+    # The energy contains lambda/2 (ln J)^2, so nu = lambda / (2 (lambda + mu)).
     assert lame / (2 * (lame + mu)) == pytest.approx(material_cards.POISSON, abs=1e-9)
     assert mu == pytest.approx(770 * (1 - 0.568)) and field.get("materialName") == "NeoHookean"
     assert "of these modes" in material_cards.sofa(SOLID)

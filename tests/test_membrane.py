@@ -1,4 +1,4 @@
-"""A membrane against what a thin layer must do: analytic tension, a balloon, a layer of elements."""
+"""A membrane compared with a thin layer: analytic tension, a balloon, a layer of elements."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ def box(order: int, cells=(2, 2, 1), size=(0.04, 0.03, 0.01)) -> lj.TetMesh:
 
 
 def capsule(mesh: lj.TetMesh, law: lj.Law, thickness=1e-4, **where) -> Membrane:
-    """A membrane on a place of the surface."""
+    """A membrane on a region of the surface."""
     triangles = lj.boundary.boundary_triangles(mesh, lj.boundary.select(mesh, where))
     return Membrane(triangles=jnp.asarray(triangles), thickness=thickness, law=law)
 
@@ -51,20 +51,22 @@ LAWS = {
 @ORDERS
 @pytest.mark.parametrize("name", [n if n != "ogden" else pytest.param(n, marks=pytest.mark.slow) for n in LAWS])
 def test_a_patch_in_tension_takes_the_stress_of_an_incompressible_sample(order, name):
-    """Force on a straight edge: thickness times nominal stress (`laws.homogeneous`, another way to the same)."""
+    """The force on a straight edge is thickness times nominal stress (`laws.homogeneous`, an independent
+    computation).
+    """
     mesh = box(order)
     own = capsule(mesh, LAWS[name], z_min=0.01).freeze(None, None)
     edge = lj.boundary.select(mesh, {"x_min": 0.04, "z_min": 0.01})
     F = np.array([[1.3, 0.1, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1 / (1.3 * 0.9)]])
     force = np.asarray(own.force(mesh, stretched(mesh, 1.3, 0.9, 0.1), 1.0))[edge].sum(axis=0)
     P = np.asarray(homogeneous.nominal_stress(LAWS[name], jnp.asarray(F)))
-    # Of the compressible law: mu / lambda is what is left.
+    # For the compressible law, an error of mu / lambda remains.
     allowed = 1e-4 if name == "nearly incompressible" else 1e-11
     assert np.allclose(force, 1e-4 * 0.03 * P[:, 0], rtol=allowed, atol=allowed * abs(P).max() * 3e-6)
 
 
 def test_saint_venant_in_plane_stress(verified):
-    """E_33 = -nu/(1-nu) (E_11 + E_22) exactly: the energy of a plate, t mu (|E|^2 + nu/(1-nu) (tr E)^2)."""
+    """E_33 = -nu/(1-nu) (E_11 + E_22) is exact. The energy of a plate is t mu (|E|^2 + nu/(1-nu) (tr E)^2)."""
     mu, lame = 5e4, 7e4
     nu = lame / (2 * (lame + mu))
     mesh = box(1)
@@ -80,10 +82,10 @@ def test_saint_venant_in_plane_stress(verified):
 
 
 def patch_of_sphere(order: int, n: int) -> lj.TetMesh:
-    """A sixth of a thick sphere, radius 1 inside."""
+    """Return a sixth of a thick sphere with inner radius 1."""
     flat_box = lj.shapes.box((2.0, 2.0, 0.5), (n, n, 1))
     a, b, r = np.asarray(flat_box.points).T
-    # Angles are as equal as they can be (equiangular cubed sphere).
+    # The angles are as equal as possible (equiangular cubed sphere).
     at = np.stack([np.tan((a - 1) * np.pi / 4), np.tan((b - 1) * np.pi / 4), np.ones(len(a))], axis=1)
     points = (1 + r)[:, None] * at / np.linalg.norm(at, axis=1, keepdims=True)
     mesh = lj.tet_mesh(points, flat_box.tetrahedra)
@@ -93,7 +95,7 @@ def patch_of_sphere(order: int, n: int) -> lj.TetMesh:
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_balloon_through_its_limit_point(order, verified):
-    """Volume control of a thin Mooney-Rivlin sphere: p = 4 t/(R l^2) (c10 (l - l^-5) + c01 (l^3 - l^-3))."""
+    """A thin Mooney-Rivlin sphere under volume control: p = 4 t/(R l^2) (c10 (l - l^-5) + c01 (l^3 - l^-3))."""
     c10, c01, t, errors = RUBBER.c10, RUBBER.c01, 1e-3, []
     for n in (4, 8):
         mesh = patch_of_sphere(order, n)
@@ -111,12 +113,13 @@ def test_a_balloon_through_its_limit_point(order, verified):
                     * mesh.points
                 )
             )
-            # Edges of the patch pull along it: work of a uniform growth is that of the whole sphere's sixth.
+            # The edges of the patch are loaded along the surface. The work of a uniform growth is a sixth of that of
+            # the sphere.
             total[stretch] = work / area
         exact = {k: 4 * t / k**2 * (c10 * (k - k**-5) + c01 * (k**3 - k**-3)) for k in total}
-        assert total[1.38] > total[1.1] and total[1.38] > total[2.0]  # a limit point lies between
+        assert total[1.38] > total[1.1] and total[1.38] > total[2.0]  # there is a limit point in between
         errors.append(max(abs(abs(total[k]) / exact[k] - 1) for k in exact))
-    assert errors[1] < 0.011 and np.log2(errors[0] / errors[1]) > 1.8  # flat triangles: of second order
+    assert errors[1] < 0.011 and np.log2(errors[0] / errors[1]) > 1.8  # flat triangles are of second order
     verified(
         f"balloon, Mooney-Rivlin, order {order}", "analytic", errors[1], 0.011, order=np.log2(errors[0] / errors[1])
     )
@@ -132,7 +135,7 @@ def scene_of(mesh: lj.TetMesh, *physics, **solve) -> lj.Scene:
 @pytest.mark.parametrize(
     ("order", "kind"),
     [
-        pytest.param(*c, marks=pytest.mark.slow)  # by default tests/test_quadratic.py looks at one of them
+        pytest.param(*c, marks=pytest.mark.slow)  # the default run of tests/test_quadratic.py tests one of them
         for c in ((1, "projected"), (1, "true"), (2, "true"), (2, "projected"))
     ],
 )
@@ -144,7 +147,7 @@ def test_the_tangent_is_the_derivative(order, kind):
     v = flat(e.free.vectors(jnp.asarray(np.random.default_rng(1).standard_normal(x.shape))))
     K = tangent.tangent(e, None, x, jnp.ones(()), None, kind)
     exact = jax.jvp(lambda q: residual(e, q, jnp.ones(()))[0], (flat(x),), (v,))[1]
-    # In tension nothing has to be projected.
+    # In tension, the projection changes nothing.
     assert np.abs(tangent.product(e, K)(v) - exact).max() < 1e-12 * np.abs(exact).max()
     again = tangent.solve(e._replace(scene=replace(scene, solve=lj.Solve(linear_solver="direct"))), K, exact, 0.0, 1)
     assert np.abs(again[0] - v).max() < 1e-8 * np.abs(v).max()
@@ -152,7 +155,7 @@ def test_the_tangent_is_the_derivative(order, kind):
 
 @pytest.mark.slow
 def test_a_capsule_is_a_thin_layer_of_elements(verified):
-    """A cantilever with a stiff skin on top, against a layer of quadratic elements."""
+    """A cantilever with a stiff skin on top is compared with a layer of quadratic elements."""
     height, t, mu = 0.01, 1e-4, 2e5
     skin = lj.laws.NeoHookean(mu=mu, bulk=20 * mu)
     plain = box(2, (6, 2, 2), (0.04, 0.02, height))
@@ -174,7 +177,7 @@ def test_a_capsule_is_a_thin_layer_of_elements(verified):
         return float(np.mean(np.asarray(lj.simulate(scene).check().positions[-1] - mesh.points)[tip, 2]))
 
     bare, membrane, layer = sinks(replace(thin, physics=())), sinks(thin), sinks(resolved)
-    assert bare < 1.5 * layer  # the skin matters
+    assert bare < 1.5 * layer  # the skin has a large effect
     verified("capsule against a layer of elements", "finer model", abs(membrane / layer - 1), 0.02)
     assert abs(membrane / layer - 1) < 0.02
 
@@ -194,7 +197,7 @@ def test_derivatives_by_the_numbers_of_a_membrane(order):
     found = lj.value_and_gradient(sinks, scene, at)
     assert found.status == 0
     by_mu, by_thickness = (np.asarray(found.gradient[k]) for k in at)
-    # Only their product counts.
+    # Only the product of mu and thickness counts.
     assert np.isclose(2e4 * by_mu, 1e-4 * by_thickness.sum(), rtol=1e-7)
 
     def quotient(step):
@@ -250,7 +253,7 @@ def test_bad_membranes_are_refused(table, words):
         scene_from(content(**table))
 
 
-@pytest.mark.slow  # by default tests/test_pay_for_what_is_there.py looks for the equations themselves
+@pytest.mark.slow  # the default run of tests/test_pay_for_what_is_there.py compares the equations themselves
 def test_a_scene_without_membranes_has_a_shorter_program():
     mesh = box(1)
     sizes = [

@@ -1,4 +1,4 @@
-"""Meshes: geometry, conformity, files, refusals."""
+"""Meshes: geometry, conformity, files, invalid input."""
 
 from collections import Counter
 
@@ -30,24 +30,24 @@ def test_generated_mesh_is_conforming(name):
     faces = np.sort(np.concatenate([t[:, [0, 1, 2]], t[:, [0, 1, 3]], t[:, [0, 2, 3]], t[:, [1, 2, 3]]]), axis=1)
     count = Counter(map(tuple, faces))
     assert set(count.values()) == {1, 2}
-    # Euler's formula of a ball's boundary: triangles = 2 * (boundary nodes) - 4.
+    # Euler's formula for the boundary of a ball: triangles = 2 * (boundary nodes) - 4.
     outer = [f for f, n in count.items() if n == 1]
     assert len(outer) == 2 * len(np.unique(outer)) - 4
 
 
 def test_a_set_without_nodes_or_elements_is_no_place():
-    """It held nothing, and the body fell freely, with status 0."""
+    """Such a set fixed nothing, and the body fell freely, with status 0."""
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
     mesh = replace(mesh, node_sets={"EMPTY": np.empty(0, int)}, element_sets={"EMPTY": np.empty(0, int)})
     with pytest.raises(lj.InputError, match="fixed: the node set 'EMPTY' of the mesh holds no node"):
         lj.boundary.select(mesh, None, "EMPTY", "fixed")
-    with pytest.raises(lj.InputError, match="the element set 'EMPTY' of the mesh holds no element"):
+    with pytest.raises(lj.InputError, match="the element set 'EMPTY' of the mesh is empty"):
         select_elements(mesh, None, "EMPTY")
 
 
 def test_volumes():
     assert np.isclose(SHAPES["box"]().volumes.sum(), 6.0, rtol=1e-14)
-    # A regular polygon of 6 n corners: area (6 n / 2) r^2 sin(2 pi / 6 n), approached at second order.
+    # A regular polygon with 6 n corners has the area (6 n / 2) r^2 sin(2 pi / 6 n), of second order.
     for rings, size in ((4, 0.0025), (8, 0.00125)):
         corners = 6 * rings
         area = corners / 2 * 1e-4 * np.sin(2 * np.pi / corners)
@@ -55,7 +55,9 @@ def test_volumes():
 
 
 def test_refined_meshes_fill_the_same_body():
-    """Eight elements for one, conforming, the same volume; a held face stays held, and the order is kept."""
+    """Each element becomes eight, the mesh is conforming, the volume is the same, and fixed faces and order are
+    kept.
+    """
     mesh = SHAPES["box"]()
     fine = lj.refined(mesh)
     lj.check_mesh(fine)
@@ -74,7 +76,9 @@ def test_refined_meshes_fill_the_same_body():
 
 @pytest.mark.parametrize("shape", ["box", "cylinder"])
 def test_meshes_refined_near_nodes_are_whole(shape):
-    """Twice at the edge of a held face: faces fit, the body is the same, elements stay round, held faces stay held."""
+    """Refined twice at the edge of a fixed face: faces match, the body is the same, elements keep their shape, and
+    fixed faces stay fixed.
+    """
     mesh = SHAPES[shape]()
     mesh = replace(mesh, node_sets={"bottom": np.flatnonzero(np.isclose(np.asarray(mesh.points)[:, 2], 0.0))})
     surface = _area(mesh)
@@ -82,7 +86,7 @@ def test_meshes_refined_near_nodes_are_whole(shape):
         near = lj.rim(mesh, mesh.node_sets["bottom"])
         fine = lj.refined(mesh, near=near)
         lj.check_mesh(fine)
-        # A node that hangs on a neighbour's face would leave faces of one element inside the body.
+        # With a hanging node on a neighbour's face, faces of one element only would be inside the body.
         assert np.isclose(_area(fine), surface, rtol=1e-12)
         assert np.isclose(fine.volumes.sum(), mesh.volumes.sum(), rtol=1e-13) and fine.volumes.min() > 0
         assert mesh.number_of_elements < fine.number_of_elements < 8 * mesh.number_of_elements
@@ -90,7 +94,7 @@ def test_meshes_refined_near_nodes_are_whole(shape):
         assert not any(set(edge) & set(near.tolist()) for edge in before & after)
         bottom = np.flatnonzero(np.isclose(np.asarray(fine.points)[:, 2], 0.0))
         assert sorted(np.asarray(fine.node_sets["bottom"])) == sorted(bottom)
-        # Bisection at the longest edge makes few shapes: the worst element loses less than a half of its quality.
+        # Bisection of the longest edge makes few shapes: the worst element loses less than half of its quality.
         quality = [qualities(np.asarray(m.points), np.asarray(m.tetrahedra), m.volumes).min() for m in (mesh, fine)]
         assert quality[1] > 0.5 * quality[0]
         mesh = fine
@@ -172,9 +176,11 @@ def test_copies_other_cells_and_millimetres_are_told(tmp_path):
 
 
 def test_a_bound_in_millimetres_is_told():
-    """It would exclude nothing, and select the whole mesh. A bound far outside is a common way to select everything."""
+    """This bound would exclude nothing and select the whole mesh. A bound far outside is a common way to select
+    everything.
+    """
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
-    with pytest.warns(UserWarning, match=r"where: z_max = 50 m excludes nothing.*write 0.05 if it is in mm"):
+    with pytest.warns(UserWarning, match=r"where: z_max = 50 m excludes no node.*write 0.05 if you meant mm"):
         assert len(lj.boundary.select(mesh, {"z_max": 50})) == 27
     for where in ({"z_min": -1.0}, {"z_max": 1e3}, {"x_max": 0.2}):
         assert len(lj.boundary.select(mesh, where)) == 27
@@ -183,7 +189,7 @@ def test_a_bound_in_millimetres_is_told():
 @pytest.mark.parametrize("top", [[0.2, 0.2, 2.0], [0.2, 0.2, 0.5]], ids=["around", "inside"])
 def test_elements_on_one_side_of_a_face_are_refused(top):
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], top])
-    with pytest.raises(lj.InputError, match=r"1 faces have two of them on the same side .*of element 0"):
+    with pytest.raises(lj.InputError, match=r"1 faces have two tetrahedra on the same side .*of element 0"):
         lj.check_mesh(lj.tet_mesh(corners, np.array([[0, 1, 2, 3], [0, 1, 2, 4]])))
     # The other side of the face z = 0 is free.
     lj.check_mesh(
@@ -191,7 +197,7 @@ def test_elements_on_one_side_of_a_face_are_refused(top):
     )
 
 
-#: Name of a file -> its text and what the sentence says of it. Gmsh's manual, "MSH file format version 1 (Legacy)".
+#: Name of a file -> its text and a part of the message. Gmsh's manual, "MSH file format version 1 (Legacy)".
 FOREIGN = {
     "old.msh": (
         "$NOD\n4\n1 0 0 0\n2 1 0 0\n3 0 1 0\n4 0 0 1\n$ENDNOD\n$ELM\n1\n1 4 1 1 4 1 2 3 4\n$ENDELM\n",
@@ -203,7 +209,7 @@ FOREIGN = {
         "VTK polygons.*fill the surface with tetrahedra",
     ),
     "surface.vtp": ('<?xml version="1.0"?>\n<VTKFile type="PolyData" version="0.1"/>\n', "VTK polygons"),
-    "junk.msh": ("not a mesh\n", r"its content is not what \.msh files hold"),
+    "junk.msh": ("not a mesh\n", r"its content is not in the format of \.msh files"),
 }
 
 
@@ -225,7 +231,7 @@ def test_a_gmsh_file_is_read_without_a_word(tmp_path, capsys):
 
 
 def _with_surface(file, order: int, cells: str, names: dict, **more) -> lj.TetMesh:
-    """Write a cube with its lower face as triangles, grouped and named as in Gmsh, and read it again."""
+    """Write a cube with its lower face as triangles, grouped and named as by Gmsh, and read it again."""
     mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
     triangles = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])
     if order == 2:
@@ -245,7 +251,7 @@ def _with_surface(file, order: int, cells: str, names: dict, **more) -> lj.TetMe
 
 @pytest.mark.parametrize("order, cells", [(1, "triangle"), (2, "triangle6"), (2, "triangle")])
 def test_a_named_group_of_triangles_is_a_place(order, cells, tmp_path):
-    """All nodes of the face, middles of edges too: also where the file has them in the tetrahedra alone."""
+    """The set contains all nodes of the face, also middle nodes that the file has in the tetrahedra only."""
     names = {"bottom": np.array([7, 2]), "liver": np.array([3, 3])}
     mesh = _with_surface(tmp_path / "m.msh", order, cells, names)
     below = np.flatnonzero(np.asarray(mesh.points)[:, 2] == 0)
@@ -257,7 +263,9 @@ def test_a_named_group_of_triangles_is_a_place(order, cells, tmp_path):
 
 @pytest.mark.parametrize("order, cells", [(1, "triangle"), (2, "triangle6")])
 def test_a_load_on_a_group_of_triangles_leaves_others_between_its_nodes_alone(order, cells, tmp_path):
-    """One cell thick: all nodes of the rim are in the group of the two faces, its triangles are not."""
+    """The plate is one cell thick. The group of its two faces contains all nodes of the rim, but no triangle of the
+    rim.
+    """
     mesh = lj.shapes.box((0.2, 0.2, 0.01), (4, 4, 1))
     z = np.asarray(mesh.points)[:, 2]
     outer = lj.boundary.boundary_triangles(mesh)
@@ -281,7 +289,7 @@ def test_a_load_on_a_group_of_triangles_leaves_others_between_its_nodes_alone(or
         assert np.allclose(force.sum(axis=0), [0, 0, 2 * 0.2**2 * 0.1], rtol=1e-12, atol=1e-15)
 
 
-#: Two tetrahedra; the second is in two groups, and so is the first triangle.
+#: Two tetrahedra; the second one and the first triangle are in two groups.
 _OVERLAP = """$MeshFormat
 4.1 0 8
 $EndMeshFormat
@@ -328,7 +336,7 @@ $EndElements
 
 
 def test_cells_in_several_groups_of_gmsh_are_in_all_of_them(tmp_path):
-    """meshio gives each cell one number, that of its first group: half of the organ was lost without a word."""
+    """meshio gives each cell the number of its first group only. Half of the organ was lost without a message."""
     (tmp_path / "two.msh").write_text(_OVERLAP)
     mesh = lj.read_mesh(tmp_path / "two.msh")
     assert {name: len(mesh.element_sets[name]) for name in ("stiff", "organ")} == {"stiff": 1, "organ": 2}
@@ -338,7 +346,7 @@ def test_cells_in_several_groups_of_gmsh_are_in_all_of_them(tmp_path):
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_files_keep_groups_of_triangles(tmp_path, order):
-    """They were lost, and a load on such a group acted on all triangles between its nodes."""
+    """The groups were lost, and a load on such a group acted on all triangles between its nodes."""
     (tmp_path / "two.msh").write_text(_OVERLAP)
     mesh = lj.read_mesh(tmp_path / "two.msh")
     mesh = mesh if order == 1 else lj.quadratic(mesh)
@@ -358,7 +366,7 @@ def test_files_keep_groups_of_triangles(tmp_path, order):
 def test_triangles_of_a_group_that_are_inside_are_told():
     mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
     outer = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])
-    inside = next(t for t in np.asarray(mesh.tetrahedra).T[[0, 1, 2]].T if 13 in t)  # 13 is in the middle
+    inside = next(t for t in np.asarray(mesh.tetrahedra).T[[0, 1, 2]].T if 13 in t)  # node 13 is in the middle
     mixed = replace(mesh, triangle_sets={"both": np.vstack([outer, inside])})
     with pytest.warns(UserWarning, match="1 of 9 triangles of 'both' are not on the surface"):
         found = lj.boundary.surface_of(mixed, None, "both")
@@ -367,7 +375,7 @@ def test_triangles_of_a_group_that_are_inside_are_told():
 
 @pytest.mark.parametrize("kind", [np.int64, np.float32, np.float64])
 def test_numbers_of_regions_may_be_of_any_type(kind, tmp_path):
-    """ParaView's filters write whole numbers as floats; numbers with fractions are no regions."""
+    """ParaView's filters write whole numbers as floats. Numbers with fractions are not regions."""
     mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
     region = np.repeat([1, 2], 24).astype(kind)
     data = {"region": [region], "density": [np.linspace(1, 2, 48)]}
@@ -399,7 +407,7 @@ def test_sets_of_triangles_in_other_files_and_names_that_collide(tmp_path):
 
 
 def test_gmsh_groups_without_their_entities_are_named(tmp_path):
-    """The sentence ended in a bare number in brackets, and asked for Gmsh, which the file was."""
+    """The message ended in a bare number in brackets, and asked for a Gmsh file, which this was."""
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     cells, groups = [("triangle", tets[:1, :3]), ("tetra", tets)], [np.array([1]), np.full(len(tets), 3)]

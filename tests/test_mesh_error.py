@@ -1,4 +1,4 @@
-"""The estimate of a mesh's error: near the true error, refused where it says nothing, and a correction of fits."""
+"""The estimated mesh error: close to the true error, rejected where it is meaningless, and a correction of fits."""
 
 import re
 
@@ -8,6 +8,8 @@ import pytest
 
 import liverjax as lj
 from liverjax.core.struct import replace
+from liverjax.physics.attached.ligament import Ligament
+from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.simulation.cautions import mesh_sentence
 
 pytestmark = pytest.mark.quick_to_compile
@@ -35,7 +37,7 @@ def _pulled(scene: lj.Scene) -> float:
     return float(_force(scene.mesh)(result.positions, result.reactions))
 
 
-#: Force [N] of the cube by 48 quadratic elements with pressures.
+#: Force [N] of the cube with 48 quadratic elements with pressures.
 QUADRATIC = 3.0073122563605554e-05
 
 
@@ -46,18 +48,18 @@ def test_the_force_by_quadratic_elements():
 
 
 def test_mesh_error_of_a_small_strain_is_the_way_to_quadratic_elements():
-    """A linear problem: one linear solve is all, but for its tolerance of 1e-2."""
+    """The problem is linear, so one linear solve gives the quadratic solution, up to the solver's tolerance of 1e-2."""
     scene = _pull(1, 2)
     result = lj.simulate(scene, mesh_error=True)
     value, change = result.mesh_error.change(_force(scene.mesh), result)
     assert bool(result.mesh_error.found.all()) and change < -0.05 * value
     assert abs(value + change - QUADRATIC) < 0.02 * abs(change)
-    assert re.search("nodes are up to .* m off.*take order = 2 in", mesh_sentence(scene, result))
+    assert re.search("nodal positions are wrong by up to .* m.*use order = 2 in", mesh_sentence(scene, result))
 
 
 @pytest.mark.slow
 def test_a_bar_of_two_compressible_materials_has_no_mesh_error():
-    """Linear elements hold the exact motion, whose pressure jumps between the materials."""
+    """Linear elements contain the exact motion, whose pressure jumps between the materials."""
     mesh = lj.shapes.box((0.01, 0.01, 0.04), (1, 1, 2))
     upper = np.flatnonzero(np.asarray(mesh.points)[np.asarray(mesh.tetrahedra), 2].mean(axis=1) > 0.02)
     law = lj.laws.NeoHookean(mu=700.0, bulk=1000.0)
@@ -73,7 +75,7 @@ def test_a_bar_of_two_compressible_materials_has_no_mesh_error():
     )
     result = lj.simulate(scene, mesh_error=True)
     assert np.all(np.asarray(result.mesh_error.found))
-    # The tolerance of Newton's method, 1e-8, is left.
+    # The rest is the tolerance of Newton's method, 1e-8.
     assert np.abs(result.mesh_error.positions).max() < 1e-8 * 0.004
 
 
@@ -81,7 +83,9 @@ def test_a_bar_of_two_compressible_materials_has_no_mesh_error():
 @pytest.mark.parametrize(("order", "cells"), [(1, 2), (1, 3), (2, 2)])
 @pytest.mark.parametrize("by", [1e-6, 5e-4])
 def test_effectivity_against_a_finer_mesh(order, cells, by, verified):
-    """Truth: quadratic elements, 4 and 6 cells, extrapolated by the order that edges of clamped faces leave (1.5)."""
+    """The reference has quadratic elements, 4 and 6 cells, extrapolated with the order of edges of clamped
+    faces (1.5).
+    """
     scene = _pull(order, cells, by)
     result = lj.simulate(scene, mesh_error=True)
     value, change = result.mesh_error.change(_force(scene.mesh), result)
@@ -94,7 +98,7 @@ def test_effectivity_against_a_finer_mesh(order, cells, by, verified):
 
 @pytest.mark.slow
 def test_a_quadratic_body_that_has_come_to_rest_has_the_estimate_of_one_at_rest():
-    """By Newmark's method, which begins with forces over masses; functions of order 3 have none.
+    """Newmark's method begins with force over mass, but the added functions of order 3 have no mass.
 
     Half of the stiffness relaxes, so the body at rest has the other half.
     """
@@ -113,7 +117,7 @@ def test_a_quadratic_body_that_has_come_to_rest_has_the_estimate_of_one_at_rest(
     for each in (scene, still):
         result = lj.simulate(each, mesh_error=True).check()
         assert bool(result.mesh_error.found.all())
-        # Newmark's method does not damp the fastest swings: the mean of the last hundred steps.
+        # Newmark's method does not damp the fastest oscillations, so the mean of the last hundred steps is taken.
         moved.append((result.positions[-100:].mean(axis=0), result.mesh_error.positions[-100:].mean(axis=0)))
     (x, change), (expected, its) = moved
     assert np.abs(x - expected).max() < 1e-3 * np.abs(expected - mesh.points).max()
@@ -124,13 +128,15 @@ def test_mesh_error_refuses_what_it_cannot_say():
     scene = _pull(1, 1)
     with pytest.raises(lj.InputError, match="leave start out"):
         lj.simulate(scene, start=scene.mesh.points, mesh_error=True)
-    with pytest.raises(lj.InputError, match="leaves an error of its own"):
+    with pytest.raises(lj.InputError, match="has an additional error"):
         lj.simulate(replace(scene, solve=lj.Solve(newton_iterations=1)), mesh_error=True)
 
 
 @pytest.mark.slow
 def test_the_mesh_bias_of_a_fitted_number_corrects_it():
-    """Data of quadratic elements on a finer mesh, fitted with coarse linear ones: the bias says what they cause."""
+    """Data of quadratic elements on a finer mesh are fitted with coarse linear ones. The bias shows the effect of the
+    mesh.
+    """
     from fitting.fits import scene_numbers
     from fitting.readers.displacements import Displacements
 
@@ -163,3 +169,17 @@ def test_the_mesh_bias_of_a_fitted_number_corrects_it():
         found = scene_numbers.fit_numbers(problem, ["law.mu"], mesh_error=True)
     off, left = found.values[0] - 800.0, found.values[0] - found.mesh_bias[0] - 800.0
     assert off < -20 and abs(left) < 0.3 * abs(off)
+
+
+def test_forces_at_single_nodes_are_named_beside_the_mesh_error():
+    """The corrected reaction of a ligament was three times as wrong as the uncorrected one, without a word."""
+    scene = _pull(1, 2)
+    result = lj.simulate(scene, mesh_error=True)
+    top = scene.mesh.node_sets["z_max"]
+    cable = Ligament(
+        nodes=top[None], weights=jnp.ones((1, len(top))), to=jnp.array([0.0, 0.0, 0.1]), stiffness=1.0, pre_tension=0.0
+    )
+    springs = ElasticSupport(nodes=top, stiffness=1.0)
+    for physics, said in ((cable, "[[ligament]] at single nodes"), (springs, "[[support]] at single nodes")):
+        assert said in mesh_sentence(replace(scene, physics=(physics,)), result)
+    assert "single nodes" not in mesh_sentence(scene, result)

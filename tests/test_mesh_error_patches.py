@@ -1,4 +1,4 @@
-"""Bodies in a uniform state, which quadratic elements have exactly: their estimated mesh error is 0."""
+"""Bodies in a uniform state, which quadratic elements represent exactly: their estimated mesh error is 0."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from liverjax.tensors.matrices import deformation_gradient, determinant
 pytestmark = pytest.mark.quick_to_compile
 
 MESH = lj.quadratic(lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2)))
-#: Linear solves of the run end at 1e-8 of the forces, and the estimate is relative to a strain of some percent.
+#: Linear solves of the run have a relative residual of 1e-8, and the estimate is relative to a strain of some percent.
 ROUNDOFF = 1e-6
 
 
@@ -32,7 +32,7 @@ def _cube(**more) -> lj.Scene:
 
 
 def _relative_error(scene: lj.Scene) -> float:
-    """Largest estimated error over the largest displacement."""
+    """Return the largest estimated error over the largest displacement."""
     result = lj.simulate(scene, mesh_error=True).check()
     assert bool(result.mesh_error.found.all())
     moved = np.abs(np.asarray(result.positions[-1] - scene.mesh.points)).max()
@@ -42,7 +42,7 @@ def _relative_error(scene: lj.Scene) -> float:
 
 @pytest.mark.slow
 def test_a_following_pressure_on_a_cube():
-    """The functions of a face have 9/20 of a uniform load; without them the error was 0.56."""
+    """The functions of a face carry 9/20 of a uniform load. Without them the relative error was 0.56."""
     assert _relative_error(_cube(traction=(lj.Traction(triangles=_face("z_max"), pressure=100.0),))) < ROUNDOFF
 
 
@@ -55,7 +55,9 @@ def test_a_following_pressure_on_a_cube():
     ],
 )
 def test_a_cube_between_planes_and_an_elastic_foundation(history):
-    """The foundation's traction is uniform where the body's motion is; without the functions of order 3 it was 0.07."""
+    """Where the motion of the body is uniform, the traction of the foundation is too. Without the functions of order 3,
+    the relative error was 0.07.
+    """
     times = None if history is None else jnp.array([0.0, 1.0])
     springs = ElasticSupport(triangles=_face("z_max"), normal=1e4, tangential=0.0, times=times, history=history)
     push = lj.Traction(triangles=_face("x_max"), value=jnp.array([-100.0, 0.0, 0.0]))
@@ -80,7 +82,9 @@ def test_a_foundation_of_order_3_has_the_derivatives_of_its_energy():
 
 
 def test_pressure_on_a_closed_surface_of_order_3_is_the_change_of_volume():
-    """At a sheared shape, against the volume of the elements: the force, and its change with a motion."""
+    """In a sheared shape, the force and its change with a motion are compared with derivatives of the elements'
+    volume.
+    """
     triangles = jnp.asarray(lj.boundary.boundary_triangles(MESH))
     scene = enriched(_cube(traction=(lj.Traction(triangles=triangles, pressure=3.0),)))
     rich, load = scene.mesh, scene.traction

@@ -1,4 +1,6 @@
-"""Pressures of their own, of linear and of quadratic elements: no locking, no wiggles, iterations that do not grow."""
+"""Elements with separate pressures, linear and quadratic: no locking, smooth pressures, and constant iteration
+counts.
+"""
 
 import json
 
@@ -26,7 +28,9 @@ pytestmark = pytest.mark.quick_to_compile
 
 
 def _cook(order: int, n: int, ratio: float, kind: str = "quadratic", **solve) -> lj.Scene:
-    """Cook's membrane in plane strain, n x n cells as thick as long: thin ones slow BiCGSTAB down sixfold."""
+    """Cook's membrane in plane strain with n x n cells. A cell is as thick as long, because thin cells slow BiCGSTAB
+    down by a factor of six.
+    """
     flat = lj.shapes.box((1.0, 1.0, 1.0), (n, n, 1))
     s, t, w = np.asarray(flat.points).T
     points = np.stack([48 * s, 44 * s + t * (44 - 28 * s), 10 * w], axis=1) * 1e-3
@@ -48,7 +52,7 @@ def test_g_of_every_volumetric_energy_is_its_root():
     for kind in ("quadratic", "log", "simo"):
         U = lj.laws.Volumetric(bulk=2.0, volumetric=kind).strain_energy(Invariants(J=J))
         g = mixed.strain(kind, J)
-        # U itself cancels near 1: 1e-16 of numbers of size 1.
+        # U itself cancels near 1: rounding of 1e-16 of numbers of size 1.
         assert np.abs(g**2 - U).max() < 1e-15 + 4e-16 * np.abs(U).max()
         assert np.all(np.sign(g) == np.sign(J - 1))
         slope = jax.vmap(jax.grad(lambda J, kind=kind: mixed.strain(kind, J)))(J)
@@ -73,14 +77,14 @@ def test_the_mixed_tangent_is_symmetric_and_the_derivative(order):
 
 
 def test_mixed_elements_do_not_lock_and_iterations_do_not_grow():
-    """As K/mu grows the answer settles, and so does the number of iterations."""
+    """As K/mu grows, the result converges, and the number of iterations stays bounded."""
     scene = _cook(2, 4, 1e2, volumetric="mixed")
     rises, taken = [], []
     for ratio in (1e2, 1e4, 1e5):
         result = lj.simulate(lj.with_parameters(scene, {"law.bulk": 770.0 * ratio})).check()
         rises.append(_rise(scene, result))
         taken.append(int(result.statistics.linear_iterations.sum()))
-    # What is left of compressibility goes with mu/K.
+    # The remaining compressibility is proportional to mu/K.
     assert abs(rises[1] / rises[0] - 1) < 0.03 and abs(rises[2] / rises[1] - 1) < 1e-3
     assert taken[2] < 1.5 * taken[0]
 
@@ -92,14 +96,14 @@ def test_linear_elements_without_pressures_lose_two_thirds():
 
 
 def _ended(scene: lj.Scene, ratio: float = 1e4) -> tuple[lj.Result, np.ndarray]:
-    """The run at a K/mu, and the pressures (V,) [Pa] of its end."""
+    """Return the run at a K/mu, and the pressures (V,) [Pa] at its end."""
     scene = prepared(lj.with_parameters(scene, {"law.bulk": 770.0 * ratio}))
     result, state = simulate_part(scene, initial_state(scene), 1.0, scene.solve.steps)
     return result.check(), np.asarray(state.memories[1])
 
 
 def test_linear_elements_with_pressures_do_not_lock_and_pressures_stay_smooth():
-    """Against quadratic ones, 4 % from converged: an error of the mesh, the same at every K/mu, not of locking."""
+    """Compared with quadratic elements, the error is 4 % at every K/mu. So it is a mesh error and not locking."""
     scene, fine = _cook(1, 8, 10.0, volumetric="mixed"), _cook(2, 4, 1e4, volumetric="mixed")
     ends = [_ended(scene, ratio) for ratio in (10.0, 1e2, 1e4, 1e5)]
     rises, most = ([f(*end) for end in ends] for f in (lambda r, p: _rise(scene, r), lambda r, p: np.abs(p).max()))
@@ -107,14 +111,15 @@ def test_linear_elements_with_pressures_do_not_lock_and_pressures_stay_smooth():
     assert abs(rises[2] / rises[1] - 1) < 0.03 and abs(rises[3] / rises[2] - 1) < 1e-3
     assert 0.75 < rises[2] / _rise(fine, lj.simulate(fine).check()) < 1
     assert max(taken) < 1.5 * taken[0]
-    # Pressures that move nothing grow with K: without what holds them they are four times as large at 1e5 as at 100.
+    # Pressures without effect on the motion grow with K. Without the stabilisation they are four times as large at 1e5
+    # as at 100.
     assert most[3] < 1.1 * most[1]
 
 
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["quadratic", pytest.param("log", marks=pytest.mark.slow)])
 def test_mixed_elements_pass_the_patch_test(order, kind):
-    """A stretch of the whole surface: the same inside; its pressure and its forces are the law's."""
+    """The whole surface is stretched. The inside has the same stretch, and pressure and forces are those of the law."""
     mesh = lj.shapes.box((0.03, 0.02, 0.02), (3, 2, 2))
     inside = np.setdiff1d(np.arange(len(mesh.points)), lj.boundary.boundary_triangles(mesh))
     askew = np.asarray(mesh.points).copy()
@@ -132,15 +137,15 @@ def test_mixed_elements_pass_the_patch_test(order, kind):
     g = np.linalg.det(F) - 1 if kind == "quadratic" else np.log(np.linalg.det(F))
     part = mixed._PART[order] * 770.0
     assert np.allclose(state.memories[1], (770e2 - part) * g, rtol=1e-6)
-    # Through the face x = 0.03 alone goes P N A: its nodes also take what the other faces give to their edges, so the
-    # moment of all forces is compared, the integral of P over the body.
+    # P N A is the force through the face x = 0.03 alone. Its nodes also carry parts of the other faces at their edges.
+    # Therefore the moment of all forces, the integral of P over the body, is compared.
     whole = np.einsum("ni,nj->ij", np.asarray(result.reactions[-1]), np.asarray(mesh.points))
     assert np.allclose(whole, law.first_piola(F) * 0.03 * 0.02 * 0.02, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow
 def test_cooks_membrane_is_that_of_another_program(verified):
-    """Sixteen cells, small near the clamped corner, at K/mu = 1e4: scikit-fem's converged mean rise within 0.5 %."""
+    """Sixteen cells, small near the clamped corner, at K/mu = 1e4: the mean rise is within 0.5 % of scikit-fem's."""
     from experiments.benchmarks import elements
 
     known = json.loads((ROOT / "experiments/results/cooks_membrane.json").read_text())["10000"]["64"]
@@ -154,11 +159,14 @@ def test_cooks_membrane_is_that_of_another_program(verified):
 
 
 def _squeezed(p: jax.Array, ratio: float) -> tuple[jax.Array, jax.Array]:
-    """A balanced motion [m] of a linear solid (Papkovich, Neuber), and its K div u over mu, which outlasts K."""
+    """Return an equilibrium motion [m] of a linear solid (Papkovich, Neuber), and its K div u over mu, finite for large
+    K.
+    """
     nu, a = (3 * ratio - 2) / (6 * ratio + 2), 100.0
 
     def b(p):
-        # Harmonic. So small that what is of second order, and roundoff, stay below the error when K multiplies them.
+        # The function is harmonic. It is so small that terms of second order and rounding stay below the error, times
+        # K.
         return 1e-10 * jnp.exp(a * p[0]) * jnp.sin(a * p[1])
 
     move = 4 * (1 - nu) * b(p) * jnp.array([1.0, 0, 0]) - jax.grad(lambda p: p[0] * b(p))(p)
@@ -166,7 +174,9 @@ def _squeezed(p: jax.Array, ratio: float) -> tuple[jax.Array, jax.Array]:
 
 
 def _pressure_error(order: int, n: int, ratio: float) -> tuple[float, float]:
-    """Root mean squares of what displacements [m] of vertices and pressures over mu miss; these at inner points."""
+    """Return root mean square errors of the displacements [m] of vertices, and of the pressures over mu at inner
+    points.
+    """
     box = lj.shapes.box((0.01, 0.01, 0.01), (n, n, n))
     mesh = lj.quadratic(box) if order == 2 else box
     X = np.asarray(mesh.points)
@@ -178,13 +188,13 @@ def _pressure_error(order: int, n: int, ratio: float) -> tuple[float, float]:
     result, state = simulate_part(own, initial_state(own), 1.0, 1)
     V = box.number_of_nodes
     u = np.asarray(result.check().positions[-1] - mesh.points - exact(mesh.points)[0])[:V]
-    # The memory is the part of K (J - 1) that the pressures carry.
+    # The memory is the part of K (J - 1) that the pressures represent.
     p = np.asarray(state.memories[1])[:V] / (770.0 * (1 - mixed._PART[order] / ratio))
     rule, tets = basis(3), np.asarray(box.tetrahedra)
     at = np.einsum("vq,evi->qei", rule.L, np.asarray(box.points)[tets])
     shown = np.einsum("vq,ev->qe", rule.L, p[tets])
     off = shown - np.asarray(exact(jnp.asarray(at.reshape(-1, 3)))[1]).reshape(shown.shape)
-    # K times the volume that the interpolated motion of the surface encloses too much is a constant pressure.
+    # The interpolated motion of the surface encloses a slightly wrong volume. K times this is a constant pressure.
     weights = rule.weights / rule.weights.sum()
     off = off - weights @ off.mean(axis=1)
     return float(np.sqrt(np.mean(u**2))), float(np.sqrt(weights @ np.mean(off**2, axis=1)))
@@ -197,7 +207,7 @@ def test_observed_orders_of_pressures(order, of_pressures, cells, ratio, verifie
     (u1, p1), (u2, p2) = (_pressure_error(order, n, ratio) for n in cells)
     motion, pressure = np.log2(u1 / u2), np.log2(p1 / p2)
     verified(f"smooth pressure, mixed elements of order {order}, K/mu = {ratio:g}", "analytic", p2, p1, order=pressure)
-    # Stabilised linear pressures: between 1, which is proven, and 2, which they reach on regular meshes.
+    # The order of stabilised linear pressures is between 1, which is proven, and 2, which regular meshes reach.
     assert motion > order + 0.75 and pressure > of_pressures - 0.25, (motion, pressure)
 
 
@@ -211,12 +221,12 @@ def test_the_factorisation_of_positions_and_pressures_solves_the_tangent(order):
     K = tangent.tangent(e, residual(e, q, 1.0)[2], positions(e, q, 1.0), 1.0)
     v = jnp.asarray(rng.standard_normal(len(q))).at[: 3 * len(x)].multiply(e.free.mask.T.ravel())
     found, iterations, _ = tangent.solve(e, K, tangent.product(e, K)(v), 1e-8, 10)
-    # The condition of the matrix is some 1e7 here: pressures of an unknown of 1 m against motions.
+    # The condition number of the matrix is about 1e7 here: pressures for an unknown of 1 m, compared with motions.
     assert int(iterations) == 0 and np.abs(found - v).max() < 1e-8
 
 
 def _confined(order: int, ratio: float, tolerance: float) -> lj.Scene:
-    """A box with fixed normal displacements on all faces but the upper one."""
+    """A box with fixed normal displacements on all faces except the upper one."""
     mesh = lj.shapes.box((0.04, 0.03, 0.06), (2, 2, 2))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     sides = tuple(lj.Fixed(nodes=mesh.node_sets[f"{axis}_{end}"], axes=axis) for axis in "xy" for end in ("min", "max"))
@@ -233,7 +243,9 @@ _CONFINED = pytest.mark.parametrize(("order", "ratio", "tolerance"), [(1, 1e4, 1
 
 @_CONFINED
 def test_pressures_of_a_confined_body_are_exact_to_the_tolerance(order, ratio, tolerance):
-    """Small volume changes alone determine the pressures. With a volume equation weighed by mu they were 2 % wrong."""
+    """Small volume changes alone determine the pressures. With a volume equation weighted by mu, they had an error of 2
+    %.
+    """
     scene, down = _confined(order, ratio, tolerance), -2e-4 * 1e3 / ratio
     mesh = scene.mesh
     lid = lj.Displaced(nodes=mesh.node_sets["z_max"], by=jnp.array([0.0, 0.0, down]))
@@ -250,7 +262,9 @@ def test_pressures_of_a_confined_body_are_exact_to_the_tolerance(order, ratio, t
 
 @_CONFINED
 def test_a_loaded_lid_of_a_confined_body_moves_as_far_as_its_bulk_allows(order, ratio, tolerance):
-    """The forces of the pressures are K/mu times larger than all others: the lid's motion was 0.03 to 0.3 % wrong."""
+    """The forces of the pressures are K/mu times larger than all others. The motion of the lid had an error of 0.03 to
+    0.3 %.
+    """
     scene, load = _confined(order, ratio, tolerance), -50.0
     upper = scene.mesh.node_sets["z_max"]
     area = jnp.asarray(lj.boundary.boundary_triangles(scene.mesh, upper))
@@ -266,7 +280,7 @@ def test_a_loaded_lid_of_a_confined_body_moves_as_far_as_its_bulk_allows(order, 
 
 @pytest.mark.slow
 def test_the_estimate_sees_the_locking():
-    """It is made of elements that do not lock."""
+    """The estimate uses elements that do not lock."""
     locked, free = _cook(1, 8, 1e4), _cook(2, 4, 1e4, volumetric="mixed")
     rise, stiff = _rise(free, lj.simulate(free).check()), lj.simulate(locked, mesh_error=True)
     edge = np.asarray(locked.mesh.node_sets["x_max"])
@@ -290,7 +304,7 @@ def test_gradients_through_pressures_of_their_own(order):
         return jnp.mean(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})).positions[-1, edge, 1])
 
     slope, other = jax.grad(rise)(770.0), jax.jacfwd(rise)(770.0)
-    # Truncation falls with h^2, 1.5e-7 at the first; the tolerance of 1e-11 of the rise, over h, is 2e-7 at the last.
+    # Truncation falls with h^2, at first 1.5e-7. The tolerance of 1e-11 of the rise, divided by h, is at last 2e-7.
     differences = [(rise(770.0 + h) - rise(770.0 - h)) / (2 * h) for h in (0.3, 0.1, 0.03)]
     assert abs(slope - other) < 1e-8 * abs(other)
     assert min(abs(d - slope) for d in differences) < 1e-7 * abs(slope)
@@ -299,9 +313,10 @@ def test_gradients_through_pressures_of_their_own(order):
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_robust_step_of_a_mixed_body(order):
-    """With the best pressures its energy has the residual as gradient, and its least is what the load leads to.
+    """With optimal pressures, the gradient of the energy is the residual, and its minimum is the solution under the
+    load.
 
-    The start has inverted elements and no pressure.
+    The starting point has inverted elements and no pressure.
     """
     scene = prepared(_cook(order, 2, 100.0, volumetric="mixed", robust="projected", tolerance=1e-10))
     followed = lj.simulate(replace(scene, solve=replace(scene.solve, robust="off"))).check()
@@ -312,7 +327,7 @@ def test_a_robust_step_of_a_mixed_body(order):
     q = settled(e, unknowns(e, scene.mesh.points + 2e-4 * noise))
     slope = jax.grad(lambda q: problem.potential.energy(q, q))(q)
     r = residual(e, q, 1.0)[0]
-    # Pressures to 1e-14 of their own size.
+    # Pressures are exact to 1e-14 of their size.
     assert np.abs(slope[:n] - r[:n]).max() < 1e-10 * np.abs(r).max() > 1e6 * np.abs(r[n:]).max()
     begin = unknowns(e, scene.mesh.points + 2e-2 * noise)
     assert problem.potential.volume(begin, jnp.ones(())) < 0
@@ -333,7 +348,7 @@ def test_mixed_refuses_what_it_cannot_be():
     for scene, words in (
         (
             replace(_cook(2, 1, 10.0, volumetric="mixed"), law=lj.laws.typical("saint_venant_kirchhoff")),
-            "shear part and a volumetric part",
+            "separate isochoric and volumetric energies",
         ),
     ):
         with pytest.raises(lj.InputError, match=words):

@@ -18,8 +18,8 @@ pytestmark = pytest.mark.quick_to_compile
 LAWS = list(lj.laws.LAWS)
 
 
-#: One law of every kind by default, that of Green's strain in tests/test_fibres.py; the others differ in scalars that
-#: tests/test_laws.py checks, all but the stretch-based ones (of which one stands for all) run with -m slow.
+#: One law of each kind by default; Green's strain is in tests/test_fibres.py. The others differ in scalars that
+#: tests/test_laws.py checks. They run with -m slow, apart from stretch-based laws, of which one stands for all.
 KINDS = ("neo_hookean", "mooney_rivlin", "saint_venant_kirchhoff")
 OTHERS = [n for n in LAWS if n not in (*KINDS, "ogden", "logarithmic", "exponential")]
 
@@ -44,7 +44,7 @@ def test_rigid_motion_makes_no_force(name):
     Q = np.linalg.qr(np.random.default_rng(5).standard_normal((3, 3)))[0]
     Q *= np.sign(np.linalg.det(Q))
     x = np.asarray(mesh.points) @ Q.T + np.array([3.0, -1.0, 2.0])
-    # Roundoff of the positions (4 m) over the cell (0.5 m), times stress scale K and face area 0.25 m^2, 24 faces.
+    # Rounding of the positions (4 m) over the cell (0.5 m), times stress scale K and face area 0.25 m^2, 24 faces.
     limit = 24 * 0.25 * 4 / 0.5 * np.finfo(float).eps * (law.bulk_modulus() + law.shear_modulus())
     assert np.abs(mjed.internal_force(mesh, law, x)).max() < limit
 
@@ -60,7 +60,7 @@ def test_regularised_stiffness_keeps_the_trace(distorted_box):
 
 
 NO_PRODUCTS = ("stable_neo_hookean", "ogden", "bogen", "logarithmic", "exponential", "costa")
-#: A function of a sum: regularised term by term it differs from the sum's regularisation.
+#: Functions of a sum: regularisation of each term differs from that of the sum.
 FUNCTIONS = ("fung_demiray", "veronda_westmann")
 
 
@@ -138,7 +138,7 @@ def test_febio_solution_is_in_equilibrium_here(febio, name, verified):
     rows = np.loadtxt(febio / f"a_{name}_nodes.csv", delimiter=",")
     mesh = lj.tet_mesh(points, tets)
     f = np.asarray(mjed.internal_force(mesh, FEBIO_LAWS[name], jnp.asarray(points + rows[:, 1:4])))
-    # Internal force = the support's force on the body at held nodes, nothing elsewhere.
+    # The internal force equals the support's force on the body at fixed nodes, and is zero elsewhere.
     off = np.abs(f - rows[:, 4:7]).max() / np.abs(rows[:, 4:7]).max()
     verified(f"forces in FEBio's solution of a cube, {name}", "FEBio, same mesh", off, 1e-9)
     assert off < 1e-9

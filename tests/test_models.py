@@ -1,4 +1,4 @@
-"""Models beyond Prony modes: springpots, a spectrum on a grid, fluids; their choice and their conversion to modes."""
+"""Models beyond Prony modes: springpots, a spectrum on a grid, fluids; their choice and conversion to modes."""
 
 import json
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.quick_to_compile
 
 OMEGA = np.geomspace(0.1, 100, 16)
 CASES = {model.name: model for model in springpots.FRACTIONAL}
-#: The models as the literature writes them, of the numbers that are reported.
+#: The models as written in the literature, as functions of the reported numbers.
 FORMULAS = {
     "springpot": lambda iw, v, a: v * iw**a,
     "fractional_kelvin_voigt": lambda iw, e, v, a: e + v * iw**a,
@@ -66,7 +66,7 @@ def test_the_reported_numbers_are_those_of_the_formula_of_the_literature(name):
 
 @pytest.fixture(scope="module")
 def fractional_fits():
-    """Every model fitted to the data of every model, without noise."""
+    """Return every model fitted to the data of every model, without noise."""
     return {name: models.fractional(fractional_sweep(name)) for name in CASES}
 
 
@@ -82,16 +82,19 @@ def test_noise_free_springpots_are_recovered_and_chosen(fractional_fits, name):
 def test_conversions_stay_within_a_percent_of_the_formula(fractional_fits, name):
     f = next(f for f in fractional_fits[name] if f.kind.name == name)
     stated = f.details["conversion"]["largest_relative_error"]
-    fine = np.geomspace(OMEGA[0], OMEGA[-1], 487)  # five times finer than where it was matched
+    fine = np.geomspace(OMEGA[0], OMEGA[-1], 487)  # five times finer than the grid of the conversion
     G, ours = FORMULAS[name](1j * fine, *TRUTHS[name]), prony_moduli(f.model, fine)
     found = max(np.abs(ours.real / G.real - 1).max(), np.abs(ours.imag / G.imag - 1).max())
-    assert stated < as_prony_modes.ALLOWED and found < 1.02 * stated + 1e-5  # between points it may be a little more
-    if name in ("springpot", "fractional_maxwell", "fractional_parallel"):  # fluids: nothing stays
+    # between grid points the error may be slightly larger
+    assert stated < as_prony_modes.ALLOWED and found < 1.02 * stated + 1e-5
+    if name in ("springpot", "fractional_maxwell", "fractional_parallel"):  # fluids: no modulus remains
         assert np.isclose(f.model.ratios.sum(), 1, rtol=1e-12)
 
 
 def test_converted_modes_relax_as_the_mittag_leffler_function(fractional_fits):
-    """In time, where nothing was matched: the fractional Zener solid relaxes as E_a(-(t/tau)^a), summed by mpmath."""
+    """The fractional Zener solid relaxes as E_a(-(t/tau)^a), summed by mpmath. The conversion did not use these
+    times.
+    """
     f = next(f for f in fractional_fits["fractional_zener"] if f.kind.name == "fractional_zener")
     e, m, tau, a = TRUTHS["fractional_zener"]
 
@@ -107,7 +110,9 @@ def test_converted_modes_relax_as_the_mittag_leffler_function(fractional_fits):
 
 
 def scipy_best(s: Sweep, name: str, count: int, seed: int = 0) -> float:
-    """Lowest cost of SciPy's least squares from random starts, with the formula of the literature."""
+    """Return the lowest cost of SciPy's least squares from random starting points, with the formula of the
+    literature.
+    """
     rng, scales = np.random.default_rng(seed), np.concatenate(s.deviations)
     size, best = np.log(s.storage.max()), np.inf
     exponents = np.array(["exponent" in n for n in CASES[name].names])
@@ -126,7 +131,7 @@ def scipy_best(s: Sweep, name: str, count: int, seed: int = 0) -> float:
         for k, n in enumerate(CASES[name].names):
             if n == "relaxation_time":
                 q[k] = middle + rng.uniform(-spread, spread)
-            elif "springpot" in n:  # a pot as stiff as the data somewhere in the band
+            elif "springpot" in n:  # a springpot that equals the data somewhere in the band
                 alpha = 1 / (1 + np.exp(-q[k + 1]))
                 q[k] += alpha * (middle + rng.uniform(-spread, spread))
         try:
@@ -144,7 +149,7 @@ def test_no_fractional_fit_is_worse_than_scipy_from_random_starts(data):
     s = read_sweep(ROOT / "data" / GIVEN[data])
     with np.errstate(all="ignore"):
         for f in models.fractional(s):
-            # The exchange of the two pots is no other model: SciPy may take the larger exponent for either.
+            # The exchange of the two springpots gives the same model, so SciPy may give the larger exponent to either.
             assert float(f.solution.cost) <= scipy_best(s, f.kind.name, 20) * (1 + 1e-6), f.kind.name
 
 
@@ -163,7 +168,9 @@ def test_every_given_sweep_is_fitted_no_worse_than_by_scipy_from_100_starts():
 
 
 def box_spectrum(omega: np.ndarray, low: float, high: float, noise: float = 0.0) -> Sweep:
-    """H = 100 Pa an e-fold between two times, and 50 Pa that stay: moduli known exactly (Tobolsky's box)."""
+    """H = 100 Pa per e-fold between two times, and an equilibrium modulus of 50 Pa. The moduli are exact (Tobolsky's
+    box).
+    """
     storage = 50 + 50 * np.log((1 + (omega * high) ** 2) / (1 + (omega * low) ** 2))
     loss = 100 * (np.arctan(omega * high) - np.arctan(omega * low))
     factor = 1 + noise * np.random.default_rng(0).standard_normal((2, len(omega)))
@@ -176,7 +183,7 @@ def test_a_box_spectrum_is_found_inside_the_box():
     step = np.log(10) / found.per_decade
     inside = (found.times > 0.1) & (found.times < 10)
     assert inside.sum() >= 2 * found.per_decade - 1
-    # 1 % noise in moduli, and smoothing over two steps of the grid: the level of 100 Pa to a tenth.
+    # With 1 % of noise, and smoothing over two steps of the grid, the level of 100 Pa is found to a tenth.
     assert np.allclose(found.strengths[inside], 100 * step, rtol=0.1)
     assert found.strengths[(found.times > 1e3) | (found.times < 1e-3)].sum() < 0.05 * found.strengths.sum()
     assert 3 < found.decades <= 6 and found.effective < len(s.storage) / 2
@@ -184,9 +191,9 @@ def test_a_box_spectrum_is_found_inside_the_box():
 
 @pytest.mark.parametrize(("longest", "told"), [(1e4, True), (30.0, False), (1.0, False)])
 def test_a_spectrum_says_that_more_may_relax_after_the_test(longest, told):
-    """Relaxation goes on for four decades below the band, or ends two decades inside it."""
+    """Relaxation continues for four decades below the band, or ends two decades inside it."""
     fit = models.spectrum_fit(box_spectrum(np.geomspace(1e-2, 1e2, 31), 1e-3, longest, 0.01))
-    assert any("nothing tells how much of it relaxes later" in w for w in fit.warnings) == told
+    assert any("is unknown how much of this modulus relaxes later" in w for w in fit.warnings) == told
 
 
 @pytest.mark.parametrize("sd", [None, 0.01, 0.15])
@@ -194,7 +201,7 @@ def test_relaxation_after_the_test_is_told_whatever_the_weights(sd):
     s = box_spectrum(np.geomspace(1e-2, 1e2, 31), 1e-3, 1e4, 0.01)
     if sd:
         s = s._replace(storage_sd=sd * s.storage, loss_sd=sd * s.loss)
-    assert any("nothing tells how much of it relaxes later" in w for w in models.spectrum_fit(s).warnings)
+    assert any("is unknown how much of this modulus relaxes later" in w for w in models.spectrum_fit(s).warnings)
 
 
 def test_no_start_of_scipy_is_below_the_spectrum():
@@ -205,7 +212,7 @@ def test_no_start_of_scipy_is_below_the_spectrum():
     A, b = np.vstack([A, found.prior]), np.concatenate([data / scales, np.zeros(len(found.prior))])
     ours = 0.5 * np.sum((A @ np.concatenate([[found.equilibrium], found.strengths]) - b) ** 2)
     rng = np.random.default_rng(0)
-    for _ in range(10):  # from anywhere, to the same minimum: the problem is convex
+    for _ in range(10):  # from anywhere to the same minimum, because the problem is convex
         start = rng.uniform(0, 2 * s.storage.max(), A.shape[1])
         bounded = scipy.optimize.least_squares(
             lambda x: A @ x - b, start, lambda x: A, bounds=(0, np.inf), x_scale="jac"
@@ -220,7 +227,9 @@ def test_a_spectrum_has_as_many_parameters_as_the_data_give_it():
 
 
 def test_evidence_is_the_restricted_likelihood():
-    """Against Patterson and Thompson (1971, Biometrika 58): strengths as random effects, their straight line fixed."""
+    """Compare with Patterson and Thompson (1971, Biometrika 58): strengths are random effects, their straight line is
+    fixed.
+    """
     rng = np.random.default_rng(0)
     times, m = np.logspace(2, -2, 9), 30
     A = rng.normal(size=(m, 10))
@@ -232,7 +241,7 @@ def test_evidence_is_the_restricted_likelihood():
         grid = relaxation_spectrum.GridOfTimes(times, np.ones(10), 2, weight)
         found.append(relaxation_spectrum.described(x, A, A @ x - y, grid).evidence)
         line = np.column_stack([np.eye(10)[:, 0], np.r_[0, np.ones(9)], np.r_[0, np.arange(9.0)]])
-        X, Z = A @ line, A @ np.linalg.pinv(L)  # what the prior leaves free, and effects of unit variance
+        X, Z = A @ line, A @ np.linalg.pinv(L)  # directions without a prior, and effects of unit variance
         V = np.eye(m) + Z @ Z.T
         inner = X.T @ np.linalg.solve(V, X)
         left = y - X @ np.linalg.solve(inner, X.T @ np.linalg.solve(V, y))
@@ -242,14 +251,14 @@ def test_evidence_is_the_restricted_likelihood():
 
 
 def test_intervals_have_the_degrees_of_freedom_of_the_numbers_that_are_fitted():
-    """Not of the Prony modes that stand for them. Quantiles are those of tables of Student's t."""
+    """The number of Prony modes that replace the model does not count. Quantiles are those of tables of Student's t."""
     s = fractional_sweep("springpot", 0.01, omega=OMEGA[::2])
     (fit,) = (f for f in models.fractional(s) if f.kind.name == "springpot")
-    assert len(s.storage) == 8 and fit.modes > 7  # 16 moduli less 2 numbers
+    assert len(s.storage) == 8 and fit.modes > 7  # 16 moduli minus 2 parameters
     assert fit.uncertainty.quantile == fit.parameters.quantile == pytest.approx(2.1448, abs=1e-4)
     fluid = maxwell_fluid(0.01)
     found = models.fluid(fluid, generalised_maxwell.spectrum(fluid))
-    assert found.modes == 2 and found.uncertainty.quantile == pytest.approx(2.0017, abs=1e-4)  # 62 less 4, not 5
+    assert found.modes == 2 and found.uncertainty.quantile == pytest.approx(2.0017, abs=1e-4)  # 62 minus 4, not 5
 
 
 def maxwell_fluid(noise: float) -> Sweep:
@@ -266,7 +275,7 @@ def test_a_fluid_is_recovered_without_an_equilibrium_modulus():
     truth = np.array([1000, 0.4, 0.6, 5, 0.05])
     assert np.all(np.abs(f.uncertainty.values - truth) < 3 * f.uncertainty.standard_errors)
     assert not any("equilibrium" in w for w in f.warnings)
-    # The table said "G_inf 2.2e-13 ± inf Pa".
+    # The table once said "G_inf 2.2e-13 ± inf Pa".
     rounded = f._replace(model=f.model._replace(ratios=f.model.ratios * (1 - 1e-15)))
     assert sweep_report.summary(rounded, s)["equilibrium_modulus"] == 0.0
     assert not any("inf Pa" in row or "nan" in row for row in sweep_report._lines(f))
@@ -274,14 +283,14 @@ def test_a_fluid_is_recovered_without_an_equilibrium_modulus():
 
 
 def test_times_far_apart_do_not_overflow():
-    """Of a fit that runs away: NumPy's warning on an exponential meant nothing to a reader."""
+    """If a fit diverges, NumPy's warning on an exponential means nothing to a user."""
     with np.errstate(over="raise"):
         model = generalised_maxwell.natural(np.array([0.0, 0.0, 0.0, 0.0, 900.0]))
     assert model.relaxation_times[1] == 0.0
 
 
 def test_one_mode_of_a_fluid_leaves_nothing_free():
-    """Its only ratio is 1 by definition; it had an infinite error, and the fluid was never chosen."""
+    """The only ratio is 1 by definition. It had an infinite error, and the fluid was never chosen."""
     omega = np.geomspace(0.1, 100, 31)
     factor = 1 + 0.01 * np.random.default_rng(1).standard_normal((2, len(omega)))
     G = 100 * 0.3j * omega / (1 + 0.3j * omega)
@@ -293,7 +302,7 @@ def test_one_mode_of_a_fluid_leaves_nothing_free():
 
 
 def test_two_frequencies_are_too_few_for_four_numbers():
-    """Four numbers follow four data exactly, and had errors of 1e-12."""
+    """Four parameters fit four data exactly, and had errors of 1e-12."""
     found = models.fractional(fractional_sweep("fractional_zener", omega=np.array([0.6, 6.0])))
     assert [f.kind.name for f in found] == ["springpot", "fractional_kelvin_voigt"]
 
@@ -345,7 +354,7 @@ def test_a_fractional_model_goes_through_the_torsion_simulation():
     s = fractional_sweep("fractional_zener", omega=np.geomspace(0.5, 30, 7))
     closed = next(f for f in models.fractional(s) if f.kind.name == "fractional_zener")
     f = simulated_rheometer.through_torsion(s, closed, simulated_rheometer.Simulation(cell_size=0.004))
-    # Of the fit: the conversion (below 1 %) and 50 steps a cycle (0.15 %).
+    # Errors of the fit: the conversion (below 1 %) and 50 steps per cycle (0.15 %).
     assert f.converged and np.allclose(f.parameters.values, TRUTHS["fractional_zener"], rtol=0.05)
     assert np.max(f.relative_errors(s)) < 0.01
 
@@ -378,14 +387,14 @@ def test_no_start_of_scipy_is_below_the_fluid():
 
 
 def curve_of_20_decades(relaxing):
-    """81 frequencies with 2 % noise; `relaxing` gives the part above the plateau from i omega."""
+    """A sweep of 81 frequencies with 2 % of noise; `relaxing` gives the part above the plateau from i omega."""
     omega = 2 * np.pi * np.logspace(-10, 10, 81)
     G, factor = 1e3 + relaxing(1j * omega), 1 + 0.02 * np.random.default_rng(1).standard_normal((2, 81))
     return Sweep(omega, G.real * factor[0], G.imag * factor[1])
 
 
 def test_few_modes_converge_on_a_wide_curve():
-    """They miss it by half, so Gauss-Newton converges slowly: more than 200 iterations."""
+    """The modes have a misfit of a half, so Gauss-Newton converges slowly: more than 200 iterations."""
     s = curve_of_20_decades(lambda x: 1e6 * x**0.3 / (1 + x**0.3))
     f = viscoelastic.closed_form(s, 3)
     assert f.converged and f.details["iterations"] > 200 and viscoelastic.identifiable(f, s)
@@ -393,20 +402,24 @@ def test_few_modes_converge_on_a_wide_curve():
 
 @pytest.mark.slow
 def test_as_many_modes_are_found_as_a_wide_curve_has():
-    """A time per decade: fewer modes miss by 73, 62, 53, … %, and the criterion falls with each."""
+    """There is one time per decade. Fewer modes have misfits of 73, 62, 53, … %, and the criterion falls with each
+    mode.
+    """
     times = np.logspace(-9, 9, 20)
     s = curve_of_20_decades(lambda x: sum(5e3 * x * t / (1 + x * t) for t in times))
     f, tried = viscoelastic.choose_modes(s, generalised_maxwell.refuse_impossible(s))
     assert f.modes == 20 and f.converged and all(viscoelastic.identifiable(t, s) for t in tried[:20])
     assert np.mean(f.relative_errors(s)) < 0.02
-    # Each time within four standard errors.
+    # Each time is within four standard errors.
     errors = f.uncertainty.standard_errors[21:] / times[::-1]
     assert np.all(np.abs(np.log(f.model.relaxation_times / times[::-1])) < 4 * errors)
 
 
 @pytest.mark.slow
 def test_a_master_curve_of_26_decades_is_followed_by_the_spectrum():
-    """Synthetic: two broad fractional steps and a plateau, 2 % noise; 8 or 9 free modes stop at 30 % here."""
+    """The data are synthetic: two broad fractional steps and a plateau, 2 % of noise. 8 or 9 free modes leave 30 %
+    here.
+    """
     omega = np.geomspace(1e-12, 1e14, 160)
     slow, fast = (1j * omega * 1e8) ** 0.8, (1j * omega * 1e-5) ** 0.45
     G = 2e3 + 1e6 * slow / (1 + slow) + 1e9 * fast / (1 + fast)
@@ -415,7 +428,7 @@ def test_a_master_curve_of_26_decades_is_followed_by_the_spectrum():
     f = models.spectrum_fit(s)
     assert np.mean(f.relative_errors(s)) < 0.02 and f.details["conversion"]["largest_relative_error"] < 0.01
     exact = np.concatenate([G.real, G.imag])
-    # The noise of 2 % is averaged over about seven moduli a parameter.
+    # The noise of 2 % is averaged over about seven moduli per parameter.
     assert np.mean(np.abs(np.concatenate([f.storage, f.loss]) / exact - 1)) < 0.012
     assert f.details["spectrum"]["decades_carried"] > 20
 
@@ -424,7 +437,9 @@ def test_a_master_curve_of_26_decades_is_followed_by_the_spectrum():
     ("name", "limits"), [("fractional_zener", (1200.0, 300.0)), ("fractional_kelvin_voigt", (None, 300.0))]
 )
 def test_limits_of_prony_modes_have_the_error_of_their_band(name, limits):
-    """The modes follow the model within the band only: their limits were 13 and 22 of their standard errors off."""
+    """The modes follow the model only within the band. Their limits were wrong by 13 and 22 of their standard
+    errors.
+    """
     s = fractional_sweep(name, 0.01, omega=np.geomspace(0.1, 100, 30))
     (fit,) = (f for f in models.fractional(s) if f.kind.name == name)
     content = sweep_report.summary(fit, s)
@@ -444,7 +459,9 @@ def test_an_exponent_at_its_bound_is_told():
 
 
 def test_a_small_exponent_that_is_known_is_at_no_bound_and_has_modes():
-    """An elastic solid with a loss of a thousandth: the exponent is 2/pi atan(1e-3), and the modes need a rest."""
+    """For an elastic solid with a loss of a thousandth, the exponent is 2/pi atan(1e-3). The modes need an equilibrium
+    modulus.
+    """
     noise = 1 + 0.01 * np.random.default_rng(0).standard_normal((2, 16))
     fits = models.fractional(Sweep(OMEGA, 1000 * noise[0], 1.0 * noise[1]))
     (fit,) = (f for f in fits if f.kind.name == "springpot")

@@ -1,4 +1,4 @@
-"""Errors of fitted moduli: those of repeated measurements, and the choice of the model among them."""
+"""Errors of fitted moduli: those of repeated measurements, including the choice of the model."""
 
 import json
 
@@ -21,7 +21,7 @@ MODE = Maxwell(np.float64(700.0), np.array([0.5]), np.array([0.3]))
 
 
 def measured(G: np.ndarray, seed: int) -> Sweep:
-    """Complex moduli with noise, which the file does not state."""
+    """A sweep with complex moduli and noise, without stated deviations."""
     halves = np.stack([G.real, G.imag])
     return Sweep(OMEGA, *(halves * (1 + NOISE * np.random.default_rng(seed).standard_normal(halves.shape))))
 
@@ -33,17 +33,17 @@ def one_mode(seed: int) -> Sweep:
 
 @pytest.mark.slow
 def test_of_one_model_they_are_those_of_repeated_measurements():
-    at, repeats = np.array([0.1, 3.0, 300.0]), 80  # the last is beyond the band
+    at, repeats = np.array([0.1, 3.0, 300.0]), 80  # the last frequency is beyond the band
     found = [moduli_errors.fitted_moduli(viscoelastic.closed_form(one_mode(k), 1), at, False) for k in range(repeats)]
     spread = np.std([f.values for f in found], axis=0, ddof=1)
     stated = np.mean([f.standard_errors for f in found], axis=0)
-    # A deviation from 80 draws is good to 1 in sqrt(2 * 79): four times that.
+    # A deviation from 80 draws has an error of 1 / sqrt(2 * 79). Four times this is allowed.
     assert np.all(np.abs(spread / stated - 1) < 4 / np.sqrt(2 * (repeats - 1)))
 
 
 @pytest.fixture(scope="module")
 def chosen() -> viscoelastic.Fit:
-    """A solid whose equilibrium modulus is too small for the noise; a fluid and a spectrum follow the data, too."""
+    """A solid whose equilibrium modulus is too small for the noise. A fluid and a spectrum fit the data, too."""
     model = Maxwell(np.float64(700.0), np.array([0.999]), np.array([3.0]))
     storage, loss = generalised_maxwell.moduli(model, OMEGA)
     sweep = measured(storage + 1j * loss, 3)
@@ -53,7 +53,7 @@ def chosen() -> viscoelastic.Fit:
 
 
 def test_the_choice_of_the_model_is_among_them(chosen):
-    """Buckland's formula by hand: variances and squared differences by weight."""
+    """Compute Buckland's formula by hand: weighted variances and squared differences."""
     weights = moduli_errors.model_weights(chosen)
     assert len(weights) > 1 and sum(weights.values()) == pytest.approx(1, abs=1e-3)
     assert next(iter(weights)) == chosen.kind.name and all(0 < w < 1 for w in weights.values())
@@ -64,7 +64,7 @@ def test_the_choice_of_the_model_is_among_them(chosen):
     found = moduli_errors.fitted_moduli(chosen, OMEGA, False)
     np.testing.assert_array_equal(found.values, values)
     np.testing.assert_allclose(found.standard_errors, np.sqrt(variance), rtol=1e-10)
-    # Corrected for few data, from sums of squares alone.
+    # The criterion is corrected for few data, and uses sums of squares alone.
     rss = [np.sum(np.asarray(f.solution.residuals)[:62] ** 2) for f in alone.values()]
     k = [len(f.solution.u) if f.kind.effective is None else f.kind.effective for f in alone.values()]
     aicc = np.array([62 * np.log(s / 62) + 2 * n + 2 * n * (n + 1) / (62 - n - 1) for s, n in zip(rss, k, strict=True)])
@@ -80,7 +80,7 @@ def test_the_error_of_the_gap_is_in_all_of_them(chosen):
 
 
 def test_errors_of_the_instrument_are_those_of_the_modes():
-    """An error that moves all modes at once moves the moduli by as much as modes moved by it have them moved."""
+    """A systematic error shifts all modes at once. The moduli change by as much as the shifted modes change them."""
     fit, move = viscoelastic.closed_form(one_mode(0), 1), np.array([7.0, 0.01, -0.02])
     wide = fit._replace(uncertainty=wider(fit.uncertainty, move))
     a, b = (moduli_errors.fitted_moduli(f, OMEGA, False).standard_errors for f in (fit, wide))
@@ -88,7 +88,7 @@ def test_errors_of_the_instrument_are_those_of_the_modes():
         np.concatenate(generalised_maxwell.moduli(Maxwell(p[0], p[1:2], p[2:]), OMEGA))
         for p in (fit.uncertainty.values + sign * 1e-4 * move for sign in (1, -1))
     ]
-    # Central differences: an error of the step squared, 1e-8, and of roundoff over the step.
+    # Central differences have an error of the step squared, 1e-8, and of rounding over the step.
     np.testing.assert_allclose(np.sqrt(b**2 - a**2), np.abs(ends[0] - ends[1]) / 2e-4, rtol=1e-6, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""Factorisation by nested dissection: against dense solutions, in both precisions, and kept for derivatives."""
+"""Factorisation by nested dissection: compared with dense solutions, in both precisions, and kept for derivatives."""
 
 import os
 import subprocess
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.quick_to_compile
 
 
 def system(kind: type) -> tuple[scipy.sparse.csr_array, list[multifrontal.Front]]:
-    """A symmetric matrix of two unknowns a node, neither definite nor well scaled, and its fronts."""
+    """Return a symmetric matrix with two unknowns per node, neither definite nor well scaled, and its fronts."""
     rng = np.random.default_rng(1)
     box = lj.shapes.box((1.0, 1.0, 2.0), (5, 5, 10))
     tets, points = np.asarray(box.tetrahedra).T, np.asarray(box.points)
@@ -54,7 +54,7 @@ def neighbours(tets: np.ndarray) -> scipy.sparse.csr_array:
 )
 @pytest.mark.parametrize("together", [512, 7])
 def test_against_a_dense_solution(kind, single, small, together, monkeypatch):
-    """With groups eliminated at once, and by seven unknowns at a time."""
+    """Groups are eliminated at once, or by seven unknowns at a time."""
     monkeypatch.setattr(multifrontal, "PIVOTS", together)
     monkeypatch.setattr(multifrontal, "TILE", 2 * together)
     A, plan = system(kind)
@@ -63,13 +63,13 @@ def test_against_a_dense_solution(kind, single, small, together, monkeypatch):
     found, error = multifrontal.refined_solution(multifrontal.factorised(A, plan, single, small), A @ known)
     assert error < 1e-15
     dense = np.linalg.solve(A.toarray(), A @ known)
-    # As far from the truth as a dense solution may be.
+    # The error may be as large as that of a dense solution.
     assert np.linalg.norm(found - known) < 10 * np.linalg.norm(dense - known) + 1e-12 * np.linalg.norm(known)
 
 
 @pytest.mark.parametrize("single", [False, True])
 def test_groups_whose_nodes_are_all_held(single, monkeypatch):
-    """They have no unknown of their own, and some no border: LAPACK refuses a matrix of no lines."""
+    """These groups have no unknowns, and some have no border. LAPACK raises an error for a matrix without rows."""
     monkeypatch.setattr(dissection, "LEAF", 8)
     A, _ = system(complex)
     box = lj.shapes.box((1.0, 1.0, 2.0), (5, 5, 10))
@@ -131,7 +131,7 @@ def test_derivatives_take_the_factors_of_the_values(monkeypatch):
     )
     slope(3100.0)
     assert made == [(False, False)] * 2
-    # Two factors that only fit in 16 bits.
+    # Two factors that fit only in 16 bits.
     monkeypatch.setattr(multifrontal, "SINGLE_FROM", 0)
     monkeypatch.setattr(dissection, "LEAF", 8)
     sparse._factors.clear()
@@ -149,7 +149,7 @@ def test_derivatives_take_the_factors_of_the_values(monkeypatch):
 
 
 def test_other_ways_where_the_first_fails(monkeypatch):
-    """Single precision, double precision and pivots in the whole matrix have the same answer."""
+    """Single precision, double precision and pivots in the whole matrix give the same result."""
     monkeypatch.setattr(sparse, "KEPT", 0.0)
     sparse._factors.clear()
     double = lj.harmonic(scene(), [40.0]).displacement
@@ -163,7 +163,7 @@ def test_other_ways_where_the_first_fails(monkeypatch):
 
 
 def test_a_factor_that_does_not_fit_in_memory_is_told(monkeypatch):
-    """The system ended the process without a word."""
+    """Before, the system ended the process without a message."""
     monkeypatch.setattr(sparse, "KEPT", 0.0)
     whole = lj.harmonic(scene(), [40.0]).displacement
     monkeypatch.setattr(multifrontal, "SINGLE_FROM", 0)
@@ -175,7 +175,7 @@ def test_a_factor_that_does_not_fit_in_memory_is_told(monkeypatch):
     assert 0 < np.linalg.norm(rounded - whole) < 1e-11 * np.linalg.norm(whole)
     monkeypatch.setattr(sparse, "free_memory", lambda: small)
     with pytest.warns(
-        UserWarning, match="equations of harmonic motion need at least .* GB of memory, and .* free: use"
+        UserWarning, match="equations of harmonic motion need at least .* GB of memory, but only .* free: use"
     ):
         lost = lj.harmonic(scene(), [40.0])
     assert np.all(np.isnan(lost.residual))
@@ -190,7 +190,7 @@ def test_memory_of_an_elimination_is_foretold(monkeypatch):
     multifrontal.factorised(A, plan, False)
     used = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    # More is used: the matrix itself, and upper triangles that are never touched.
+    # More memory is used: the matrix itself. Less is used: upper triangles are never touched.
     assert 0.5 * used < multifrontal.needed_bytes(plan, A.dtype, False, False) < used
 
 
@@ -200,7 +200,7 @@ def test_free_memory_is_below_that_of_the_machine():
 
 @pytest.mark.slow
 def test_a_hundred_thousand_unknowns(verified):
-    """A cube of 16 quadratic cells a side at 60 Hz: one factor of 1 GB, in single precision and refined."""
+    """A cube with 16 quadratic cells per side at 60 Hz: one factor of 1 GB, in single precision with refinement."""
     mesh = lj.quadratic(lj.shapes.box((0.08, 0.08, 0.08), (16, 16, 16)))
     body = lj.Scene(
         mesh=mesh,
@@ -230,7 +230,7 @@ print([float(solve(jnp.ones(3_000_000) + k)) for k in range(40)][-1])
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no cores to choose")
 def test_a_solve_on_the_host_does_not_wait_for_itself_on_one_core():
-    """JAX has one thread there: it runs the solve and would have to copy what the solve waits for."""
+    """On one core JAX has one thread. It runs the solve, and would have to copy the data that the solve waits for."""
     env = {k: v for k, v in os.environ.items() if k != "NPROC"}
     done = subprocess.run([sys.executable, "-c", ONE_CORE], env=env, capture_output=True, text=True, timeout=60)
     assert float(done.stdout) == 3_000_000 * (2 * 40 + 41), done.stderr

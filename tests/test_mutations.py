@@ -1,4 +1,6 @@
-"""Five hundred spoiled files: refused in one sentence or read as what they say, never a traceback, never a hang."""
+"""Five hundred spoiled files: each gives a one-line message or is read correctly, without a traceback or
+endless loop.
+"""
 
 import random
 import re
@@ -55,13 +57,13 @@ tolerance = 1e-6
 SWEEP = Path(__file__).parent.parent / "data" / "lions_mane_frequency_sweep.csv"
 ROWS = "law.c10,body.density\n" + "".join(f"{300 + k},{1000 + k}\n" for k in range(6))
 WORDS = ("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", "1e-320", '"text"', "true", "[]", "[1.0]", "{}", "''", "")
-#: One sentence: what is wrong, then what to do.
+#: One line: what is wrong, then what to do.
 SENTENCE = re.compile(r"\S[^\n]+[:;,(][^\n]+\S")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scene, its mesh, a table of rows and a rheometer's sweep."""
+    """A folder with a scene, its mesh, a table of parameter sets and a rheometer's sweep."""
     made = tmp_path_factory.mktemp("sound")
     mesh = shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
     meshio.Mesh(np.asarray(mesh.points), [("tetra", np.asarray(mesh.tetrahedra))]).write(
@@ -73,7 +75,7 @@ def folder(tmp_path_factory):
 
 
 def spoiled(text: str, rng: random.Random) -> bytes:
-    """One change: a number, a word, a line, a cut, swapped lines, random bytes."""
+    """Change one thing: a number, a word, a line, a cut, swapped lines, or random bytes."""
     lines, kind = text.split("\n"), rng.randrange(8)
     k = rng.randrange(len(lines))
     if kind <= 2:  # a number becomes something else
@@ -98,7 +100,7 @@ def spoiled(text: str, rng: random.Random) -> bytes:
 
 
 def sound(scene: lj.Scene) -> None:
-    """What was read is finite and within what a body may be."""
+    """Check that all values are finite and in the range of a body."""
     for value in (scene.mesh.points, scene.mesh.volumes, scene.law.c10, scene.law.c01):
         assert np.isfinite(value).all()
     assert (np.asarray(scene.mesh.volumes) > 0).all()
@@ -110,10 +112,10 @@ def sound(scene: lj.Scene) -> None:
 
 
 def refused_or(read, check, what: bytes) -> bool:
-    """Whether `read` refused, in one sentence; anything but a refusal or a sound result fails the test."""
+    """Return whether `read` raised a one-line message. Anything but a message or a sound result fails the test."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # large numbers warn
+            warnings.simplefilter("ignore")  # large numbers cause warnings
             found = read()
     except lj.InputError as error:
         said = str(error)

@@ -1,4 +1,4 @@
-"""Runs in motion from given positions: the first acceleration has all forces, and the stress there begins to relax."""
+"""Transient runs from given positions: the first acceleration contains all forces, and the initial stress relaxes."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.quick_to_compile
 
 
 def _let_go(**changes) -> lj.Scene:
-    """A body of six elements, held below, by Newmark's method."""
+    """A body of six elements, fixed at its bottom, with Newmark's method."""
     mesh = box(1)
     solve = lj.Solve(kind="dynamic", dt=0.01, integrator="newmark", tolerance=1e-10)
     return lj.Scene(mesh=mesh, law=LAW, body=lj.Body(density=1060.0), fixed=(bottom(mesh),), solve=solve, **changes)
@@ -33,7 +33,7 @@ def _stretched(scene: lj.Scene, by: float | jax.Array) -> jax.Array:
 
 @pytest.mark.slow
 def test_newmark_keeps_its_order_from_a_stretched_start():
-    """Stretched by 2 % and let go. Without the law's force in the first acceleration the differences halve: order 1."""
+    """The body is stretched by 2 % and released. Without the law's force in the first acceleration, the order was 1."""
     scene = _let_go()
     start = _stretched(scene, 0.02)
     x = [np.asarray(state.x[-1]) for state, _ in march(scene, (10, 20, 40), 0.05, start)]
@@ -42,7 +42,7 @@ def test_newmark_keeps_its_order_from_a_stretched_start():
 
 
 def test_an_obstacle_on_its_way_does_not_push_at_the_start():
-    """Its place is that of time 0 there: the force of the first step's end was taken off."""
+    """The obstacle begins at its position at time 0. The force at the end of the first step was once used instead."""
     scene = _let_go()
     top = jnp.asarray(boundary.boundary_triangles(scene.mesh, scene.mesh.node_sets["z_max"]))
     place, by = jnp.array([0.0, 0.0, float(scene.mesh.points[:, 2].max())]), jnp.array([0.0, 0.0, -0.01])
@@ -53,7 +53,7 @@ def test_an_obstacle_on_its_way_does_not_push_at_the_start():
 
 
 def test_a_pressed_plate_begins_with_the_acceleration_of_its_force():
-    """Its force acts from time 0 on. Without it in the first acceleration the first step is half as long: order 1."""
+    """The force acts from time 0 on. Without it in the first acceleration, the first displacement was half as large."""
     side = 0.01
     held = [{"where": {"z_max": 0.0}}, {"where": {"z_min": 0.0}, "axes": "xy"}]
     common = {
@@ -68,13 +68,13 @@ def test_a_pressed_plate_begins_with_the_acceleration_of_its_force():
     scene = scene_from(common | {"obstacle": [plate]})
     (motion,) = (m for m in initial_state(scene).memories if isinstance(m, Motion))
     mass = 1000.0 * np.asarray(nodal_volumes(scene.mesh))
-    # The force is balanced to the rounding of positions times the plate's stiffness.
+    # The force is balanced up to the rounding of positions times the plate's stiffness.
     assert np.isclose(mass @ np.asarray(motion.acceleration)[:, 2], -5e-3, rtol=1e-6)
 
 
 @pytest.mark.slow
 def test_a_step_too_short_for_the_digits_is_told_as_roundoff():
-    """4 m/dt^2 times the rounding of positions is above the tolerance; each step was cut in vain 12 times."""
+    """4 m/dt^2 times the rounding of positions is above the tolerance. Each step was cut 12 times without success."""
     mesh = box(1)
     body, solve = lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -9.81])), lj.Solve(kind="dynamic", dt=1e-6)
     solve = replace(solve, steps=2, integrator="newmark")
@@ -98,7 +98,9 @@ def test_derivatives_by_a_stretched_start():
 
 
 def test_the_first_acceleration_has_all_forces_at_the_start():
-    """Mass times acceleration: minus the law's force, and the push of a sponge's pressure, P0 a third of the area."""
+    """Mass times acceleration is minus the law's force, plus the fluid pressure of a porous body, P0 on a third of the
+    area.
+    """
 
     def push(scene: lj.Scene, start: jax.Array | None = None) -> np.ndarray:
         state = initial_state(scene, start)
@@ -112,7 +114,7 @@ def test_the_first_acceleration_has_all_forces_at_the_start():
     expected = np.where(free, -np.asarray(mjed.internal_force(scene.mesh, LAW, start)), 0.0)
     assert np.allclose(push(scene, start), expected, rtol=1e-10, atol=1e-12 * np.abs(expected).max())
     mixed = replace(scene, solve=replace(scene.solve, volumetric="mixed"))
-    # A uniform state: the pressures that are unknown are those of the law.
+    # In a uniform state, the unknown pressures are those of the law.
     assert np.allclose(push(mixed, start), expected, rtol=1e-8, atol=1e-10 * np.abs(expected).max())
     wet = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-9, initial_pressure=50.0)
     surface = (lj.Traction(triangles=jnp.asarray(boundary.boundary_triangles(scene.mesh)), pressure=-50.0),)
@@ -126,7 +128,9 @@ def test_the_first_acceleration_has_all_forces_at_the_start():
     [pytest.param(*c, marks=pytest.mark.slow) for c in ((1, "isochoric", 0.1), (2, "all", [[0.1] * 6]))],
 )
 def test_the_stress_at_the_start_relaxes_from_its_first_moment(order, part, tau):
-    """Held where it begins: the elastic force times 1 - g (1 - exp(-t/tau)), exact for a constant stress."""
+    """With constant positions, the force is the elastic one times 1 - g (1 - exp(-t/tau)), exact for a constant
+    stress.
+    """
     mesh = box(1) if order == 1 else lj.quadratic(box(1))
     by = 0.05 * mesh.points * jnp.array([[0.0, 0.0, 1.0]])
     everywhere = jnp.arange(mesh.number_of_nodes)

@@ -34,7 +34,7 @@ def test_the_page_holds_it_all(more):
 
 
 def test_no_line_is_wider_than_the_page():
-    """The lines of a compressed sample were cut off at the edge."""
+    """The lines for a compressed sample were cut off at the edge."""
     sweep = rheometer.read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
     fit = viscoelastic.closed_form(sweep, 3)
     fit.details["precompression"] = instrument.compression_numbers(fit, Simulation(precompression=0.1))

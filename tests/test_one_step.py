@@ -1,4 +1,4 @@
-"""One linear solve a step, the chapter's scheme: `newton = "one_step"`."""
+"""One linear solve per step, the chapter's scheme: `newton = "one_step"`."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -50,16 +50,18 @@ def test_one_step_of_newton_says_when_its_residual_is_above_the_tolerance():
 
 
 def test_one_step_of_newton_solves_to_the_tolerance_asked_for():
-    """Under a weight of a millionth the body is linear: what is left is the linear solve's error alone."""
+    """With a millionth of the weight the body is linear, so only the error of the linear solve remains."""
     scene = hanging(steps=1, newton="one_step", tolerance=1e-9)
     light = replace(scene, body=replace(scene.body, gravity=1e-9 * scene.body.gravity))
-    # Residual of a linear solve to 0.3 of the tolerance, and what is quadratic in the motion (1e-9 of 1e-1).
+    # The linear solve has a residual of 0.3 of the tolerance. Quadratic terms of the motion are 1e-9 of 1e-1.
     assert float(lj.simulate(light).statistics.residual[0]) < 1e-9
 
 
 @pytest.mark.slow
 def test_one_step_of_newton_takes_the_regularised_stiffness():
-    """The chapter's own scheme (4.1.2 iii), against a sparse solve with the assembled matrix, from a pressed start."""
+    """The chapter's own scheme (4.1.2 iii) is compared with a sparse solve of the assembled matrix, from a compressed
+    state.
+    """
     scene = hanging(steps=1, newton="one_step", robust="regularised", tolerance=1e-9)
     mesh, law = scene.mesh, scene.law
     x = np.array(mesh.points) * np.array([1.0, 1.0, 0.7])
@@ -71,7 +73,7 @@ def test_one_step_of_newton_takes_the_regularised_stiffness():
     expected = x.copy()
     expected[free] += scipy.sparse.linalg.spsolve(K[degrees][:, degrees].tocsc(), load[free].ravel()).reshape(-1, 3)
     found = lj.simulate(scene, start=jnp.array(x)).positions[0]
-    # Held nodes are held where the reference has them, as the bottom is in both.
+    # Fixed nodes are at their reference positions, as the bottom is in both.
     assert np.abs(np.asarray(found) - expected).max() < 1e-7 * np.abs(expected - x).max()
     plain = lj.simulate(replace(scene, solve=replace(scene.solve, robust="off")), start=jnp.array(x)).positions[0]
     assert np.abs(np.asarray(plain) - expected).max() > 1e-3 * np.abs(expected - x).max()

@@ -1,4 +1,4 @@
-"""Trajectories and equilibria of other programs, node by node; their files are not part of the project."""
+"""Trajectories and equilibria of other programs, compared at each node. Their files are not part of the project."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +18,7 @@ def _file(*parts: str):
 
 @pytest.mark.slow
 def test_a_hundred_steps_of_sofa(verified):
-    """SOFA 26.12: implicit Euler, one linear solve a step, the same mass at every node."""
+    """SOFA 26.12: implicit Euler, one linear solve per step, the same mass at every node."""
     points, tets = (np.loadtxt(_file("febio", name), delimiter=",") for name in ("cube3_nodes.csv", "cube3_tets.csv"))
     rows = np.loadtxt(_file("sofa", "dyn3_NeoHookean_n100_out.csv"), delimiter=",")
     assert np.allclose(rows[:, :3], points[:, -3:], atol=1e-12)
@@ -36,13 +36,13 @@ def test_a_hundred_steps_of_sofa(verified):
     )
     x = np.asarray(lj.simulate(scene).positions[-1])
     moved, difference = np.abs(rows[:, 3:6] - rows[:, :3]).max(), np.abs(x - rows[:, 3:6]).max()
-    # A hundred steps, each to roundoff of the positions; rounding grows no faster than the number of steps.
+    # A hundred steps, each exact to rounding of the positions. The error grows at most with the number of steps.
     assert moved > 0.3 and difference < 100 * 2.2e-16 * 2
     verified("cube thrown by its weight, 100 steps", "SOFA", difference / moved, 1e-13)
 
 
 def authors_cantilever() -> tuple[lj.Scene, np.ndarray]:
-    """The silicone cantilever of Mazier et al. 2021 on the mesh of its authors, and where their program left it."""
+    """The silicone cantilever of Mazier et al. 2021 on its authors' mesh, and the final positions of their program."""
     mesh = lj.read_mesh(_file("mjed_authors", "cylinder_7675.vtk"))
     held = np.flatnonzero(np.abs(np.asarray(mesh.points)[:, 2]) < 1e-9)
     scene = lj.Scene(
@@ -61,14 +61,14 @@ def test_the_cantilever_of_the_authors_node_by_node(verified):
     result = lj.simulate(scene).check()
     moved = np.linalg.norm(theirs - np.asarray(scene.mesh.points), axis=1).max()
     difference = np.linalg.norm(np.asarray(result.positions[-1]) - theirs, axis=1).max()
-    # Their file prints six digits of positions up to 0.18 m: 5e-7 m along each axis.
+    # Their file has six digits of positions up to 0.18 m: 5e-7 m along each axis.
     assert moved > 0.1 and difference < np.sqrt(3) * 5e-7
     verified("silicone cantilever, 7,675 linear elements", "MJED of the authors, in SOFA", difference / moved, 1e-5)
 
 
 @pytest.mark.slow
 def test_quadratic_elements_on_the_authors_mesh_bend_further():
-    """Linear elements leave the tip at 111 mm where 116 mm are measured (Mazier et al. 2021)."""
+    """With linear elements the tip is at 111 mm; measured are 116 mm (Mazier et al. 2021)."""
     scene, theirs = authors_cantilever()
     X = np.asarray(scene.mesh.points)
     tip = np.flatnonzero(X[:, 2] > X[:, 2].max() - 1e-9)

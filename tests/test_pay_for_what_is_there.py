@@ -1,4 +1,4 @@
-"""Every physics of the registry alone: its equations are in the program of a scene that has it, and in no other."""
+"""Each physics object of the registry alone: its equations are in the program of a scene with it, and in no other."""
 
 import inspect
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ PLAIN = {
 }
 PLANE = {"shape": "plane", "position": [0, 0, 0.11], "axis": [0, 0, -1], "by": [0, 0, -0.02]}
 LINE = [[0.02, 0.03, 0.01], [0.06, 0.05, 0.09]]
-#: A table of each; a physics that is new in the registry needs one here.
+#: One table for each physics object. A new object in the registry needs a table here.
 TABLES: dict[str, dict[str, Any]] = {
     "ElasticSupport": {"support": [TOP | {"normal": 1e4}]},
     "SlidingSupport": {"support": [TOP | {"sliding": True}]},
@@ -37,7 +37,7 @@ TABLES: dict[str, dict[str, Any]] = {
     "RoughObstacle": {"obstacle": [PLANE | {"friction": 0.3}]},
     "PressedObstacle": {"obstacle": [{k: PLANE[k] for k in ("shape", "position", "axis")} | {"force": [0, 0, -1.0]}]},
 }
-#: The same of the physics that are in no registry: a table that has it, and the file of its equations.
+#: The same for physics objects outside the registry: a table that has the object, and the file of its equations.
 SOLVE = {"kind": "static", "dt": 0.05, "steps": 2}
 FLUID = {"bulk": 1600.0, "limit_bulk": 2200.0, "fluid_fraction": 0.5, "permeability": 2e-5}
 OTHERS: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -54,7 +54,7 @@ OTHERS: dict[str, tuple[Any, dict[str, Any]]] = {
         {"traction": [TOP | {"value": [0, 0, 1.0], "history": [[0.0, 0.0], [1.0, 1.0]]}], "solve": SOLVE},
     ),
 }
-#: Those that one scene can have, so that few are traced; no two of a scene share a file.
+#: Objects that one scene can have together, so that few are traced. No two objects of a scene share a file.
 TOGETHER = (
     ("viscosity", "inertia"),
     ("sponge", "flow", "traction"),
@@ -68,13 +68,13 @@ def scene_of(order: int, table: dict[str, Any]) -> lj.Scene:
 
 
 def traced(scene: lj.Scene) -> Any:
-    """The program of a scene."""
-    jax.clear_caches()  # what two scenes share would show the place where the first one traced it
+    """Return the program of a scene."""
+    jax.clear_caches()  # equations that two scenes share would show the source line of the first one
     return jax.make_jaxpr(lj.simulate)(scene)
 
 
 def files(jaxpr: Any) -> Iterator[str]:
-    """Source files behind the equations of a program, with those of the programs inside it."""
+    """Return the source files of the equations of a program, including those of inner programs."""
     for equation in jaxpr.eqns:
         yield from (frame.file_name for frame in equation.source_info.traceback.frames)
         for value in jax.tree.leaves(list(equation.params.values()), is_leaf=_inner):
@@ -88,7 +88,7 @@ def _inner(value: Any) -> bool:
 
 @cache
 def files_of_plain(order: int) -> frozenset[str]:
-    """Source files of the scene that has nothing."""
+    """Return the source files of the scene without physics objects."""
     return frozenset(files(traced(scene_of(order, {})).jaxpr))
 
 
@@ -113,12 +113,12 @@ def test_what_has_no_registry_is_in_no_other_program(order):
         solve = {key: value for table in tables for key, value in table.get("solve", {}).items()}
         scene = scene_of(order, {key: table[key] for table in tables for key in table} | {"solve": solve})
         found, theirs = set(files(traced(scene).jaxpr)) & set(own.values()), {own[name] for name in names}
-        assert theirs <= found <= theirs | {loads.__file__}, names  # what has a history is a load
+        assert theirs <= found <= theirs | {loads.__file__}, names  # an object with a history counts as a load
 
 
 @pytest.mark.parametrize("kind", registry.NAMED, ids=lambda kind: kind.__name__)
 def test_a_table_adds_its_physics_and_nothing_else(kind):
-    """Two scenes of one structure, static numbers and shapes have one program."""
+    """Two scenes with the same structure, static values and shapes have the same program."""
     plain, scene = scene_of(1, {}), scene_of(1, TABLES[kind.__name__])
     assert [type(p) for p in scene.physics] == [kind]
     assert shapes_of(replace(scene, physics=())) == shapes_of(plain) != shapes_of(scene)

@@ -1,4 +1,4 @@
-"""The installed JAX computes element loops correctly, and the package sets what it says it sets."""
+"""The installed JAX computes element loops correctly, and the package sets the documented options."""
 
 import importlib.util
 import os
@@ -27,14 +27,15 @@ for dtype, n in ((jnp.float64, 16385), (jnp.float32, 32769)):
 
 @pytest.mark.core
 def test_known_miscompilation_is_absent():
-    # jax issue 39103: 0.10.2 answers 267911424 for 268435456 in the last row. Compiled as for users, not as in tests.
+    # jax issue 39103: 0.10.2 returns 267911424 instead of 268435456 in the last row. Compiled as for users, not for
+    # tests.
     plain = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS" and not k.startswith("JAX_")}
     run = subprocess.run([sys.executable, "-c", MISCOMPILED], cwd=ROOT, env=plain, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
 
 
 def _import_again():
-    """Run the package's file once more, under another name."""
+    """Run the package's file once more under another name."""
     spec = importlib.util.spec_from_file_location("again", ROOT / "liverjax" / "__init__.py")
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
 
@@ -61,7 +62,7 @@ def test_import_turns_on_64_bits_and_whole_products_unless_the_user_chose(monkey
 
 @pytest.mark.skipif("JAX_DEFAULT_MATMUL_PRECISION" in os.environ, reason="chosen by the environment")
 def test_float32_is_multiplied_whole():
-    """A GPU takes 11 of its 24 bits by default."""
+    """By default, a GPU uses 11 of the 24 bits."""
     mesh = lj.quadratic(lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1)))
     given = mesh, lj.laws.typical("neo_hookean"), mesh.points
     single = jax.tree.map(lambda a: np.float32(a) if np.asarray(a).dtype == float else a, given)
@@ -71,7 +72,7 @@ def test_float32_is_multiplied_whole():
 
 
 def test_the_import_sets_64_bits_and_no_cache():
-    """In a process of its own, as a user has it."""
+    """The test runs in a separate process, as for a user."""
     told = "import liverjax, fitting, jax; print(jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir)"
     unset = ("JAX_COMPILATION", "JAX_ENABLE_X64", program_cache.SWITCH)
     plain = {k: v for k, v in os.environ.items() if not k.startswith(unset)}
@@ -91,7 +92,7 @@ def test_code_is_formatted_and_linted():
 
 
 def _two_numbers(k):
-    """A new class of two fields; all are alike but for what `value` computes."""
+    """Return a new class with two fields. All such classes differ only in what `value` computes."""
 
     @lj.struct
     class Law:
@@ -105,14 +106,14 @@ def _two_numbers(k):
 
 
 def test_one_law_never_runs_the_program_of_another():
-    # With `register_dataclass`, jax 0.10.0 and 0.10.1 give 35 to 61 wrong answers of 300 here.
+    # With `register_dataclass`, jax 0.10.0 and 0.10.1 give 35 to 61 wrong results of 300 here.
     value = jax.jit(lambda thing: thing.value())
     answers = [float(value(_two_numbers(k)(a=2.0, b=0.5))) for k in range(300)]
     assert answers == [2.0 * k + 0.5 for k in range(300)]
 
 
 def test_structures_differ_by_class():
-    # A class defined again, as in a notebook, has the same name and fields and still is another class.
+    # A class that is defined again, as in a notebook, has the same name and fields, but it is another class.
     things = [_two_numbers(k)(a=1.0, b=1.0) for k in range(2)]
     things += [jax.tree.map(lambda _: 1.0, lj.laws.typical(name)) for name in LAWS]
     structures = [jax.tree.structure(thing) for thing in things]
@@ -123,7 +124,7 @@ def test_structures_differ_by_class():
 
 
 def _aligned(values):
-    """The same numbers at an address that jnp.asarray takes over without a copy."""
+    """Return the same numbers at an address that jnp.asarray uses without a copy."""
     room = np.empty(values.nbytes + 64, np.uint8)
     start = -room.ctypes.data % 64
     place = room[start : start + values.nbytes].view(values.dtype).reshape(values.shape)

@@ -1,4 +1,4 @@
-"""A body in the browser: steps under a pull, the server's answers, the command."""
+"""A body in the browser: time steps under a pull by the user, responses of the server, the command."""
 
 import http.client
 import json
@@ -34,7 +34,7 @@ def cube(**solve):
     )
 
 
-#: A node that every still body has moved up by 4 mm, before anyone pulls, and one that is pulled.
+#: A node that is moved up by 4 mm in every body at rest, before the user pulls, and a node that is pulled.
 RAISED, CORNER = 20, 26
 
 
@@ -55,7 +55,7 @@ def moving():
 
 @pytest.mark.slow
 def test_a_pulled_body_rests_where_a_ligament_holds_it(still):
-    """The same spring as part of a scene that `simulate` runs."""
+    """The pull equals a spring that is part of a scene, run with `simulate`."""
     to = still.positions[CORNER] + np.array([0.004, 0.002, 0.003])
     found = still
     for _ in range(2):
@@ -81,7 +81,7 @@ def test_a_body_that_is_let_go_swings_and_the_time_goes_on(moving):
     assert found.time == pytest.approx(0.05) and pulled > moving.positions[CORNER, 0] + 1e-3
     after = pulling.pulled(found)
     assert after.positions[CORNER, 0] != pulled
-    # A spring that ends where the node is has no direction and does no harm.
+    # A spring of zero length has no direction and no effect.
     none = pulling.pulled(moving, CORNER, moving.positions[CORNER], 5.0)
     assert none.code == status.CONVERGED
     np.testing.assert_allclose(none.positions, moving.positions, atol=1e-9)
@@ -98,18 +98,18 @@ def test_a_step_that_fails_leaves_the_body_as_it_was(still):
 def test_loads_act_before_anyone_pulls(still, monkeypatch):
     rest = np.asarray(still.scene.mesh.points)
     np.testing.assert_allclose(still.positions[RAISED] - rest[RAISED], [0, 0, 0.004], atol=1e-12)
-    with pytest.raises(InputError, match="has no time"):
+    with pytest.raises(InputError, match="cannot be used here"):
         pulling.at_rest(cube(kind="harmonic", frequencies=jnp.array([10.0])))
     failed = SimpleNamespace(status=np.array([status.CONVERGED, status.INDEFINITE]))
     monkeypatch.setattr(pulling, "compiled", lambda *_: lambda *_: (failed, None))
-    with pytest.raises(InputError, match="load step 2 of 2, before anyone pulls: the stiffness"):
+    with pytest.raises(InputError, match="load step 2 of 2 failed before the first pull: the stiffness"):
         pulling.at_rest(raised())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_motions_end_where_a_run_ends_and_stay_there(precision):
-    """A plane that presses and nodes that move within 2 steps of time: as in the run, then at rest."""
+    """A plane presses and nodes move within two time steps. The body moves as in the run, and then stays at rest."""
     content = {
         "mesh": {"shape": "box", "size": [0.02, 0.02, 0.02], "cells": [2, 2, 2]},
         "law": {"name": "neo_hookean", "mu": 1000.0, "bulk": 3000.0},
@@ -122,7 +122,7 @@ def test_motions_end_where_a_run_ends_and_stay_there(precision):
     assert np.ptp(expected[1][:, 2]) < 0.0185
     for k in range(3):
         playing = pulling.pulled(playing)
-        # Newton's tolerance, and the spring that does not pull; a float32 has 1e-9 of the 2 cm.
+        # The errors are Newton's tolerance and the inactive spring. In float32, rounding is 1e-9 of the 2 cm.
         atol = 1e-8 if precision == "float64" else 2e-6
         np.testing.assert_allclose(playing.positions, expected[min(k, 1)], atol=atol)
         assert playing.code in (status.CONVERGED, status.ONE_STEP)
@@ -148,7 +148,8 @@ def served(moving):
 
 def test_the_page_gets_a_surface_and_a_step_for_every_picture(served, moving):
     page = served("GET", "/")[1].decode()
-    assert "<canvas" in page and 'fetch("/surface")' in page and "http" not in page  # nothing from elsewhere
+    # nothing is loaded from other servers
+    assert "<canvas" in page and 'fetch("/surface")' in page and "http" not in page
     surface = json.loads(served("GET", "/surface")[1])
     assert surface["nodes"] == moving.nodes.tolist() and len(surface["triangles"]) == 3 * 6 * 2 * 4
     assert max(surface["triangles"]) == len(surface["nodes"]) - 1 and surface["timed"]
@@ -203,8 +204,8 @@ def test_the_command_pulls_without_a_page_and_refuses_in_a_sentence(tmp_path, ca
     scene.write_text(SCENE)
     assert main(["play", str(scene), "--steps", "5"]) == 0
     said = capsys.readouterr().out
-    assert "27 nodes, 5 steps" in said and "a second" in said and "failed" not in said
-    # A node that the scene moves cannot be pulled.
+    assert "27 nodes, 5 steps" in said and "per second" in said and "failed" not in said
+    # A node with a prescribed motion cannot be pulled.
     driven = SCENE.replace("[solve]", "[[displaced]]\nset = 'z_max'\nby = [0, 0, 0.001]\n[solve]")
     scene.write_text(driven)
     assert main(["play", str(scene), "--steps", "1"]) == 0

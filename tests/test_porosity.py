@@ -1,4 +1,4 @@
-"""The sponge and its fluid: the stress of section 4.3, consolidation, limits, stability of the two schemes."""
+"""The porous body and its fluid: stress of section 4.3, consolidation, limits, stability of the two schemes."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from liverjax.waves.cautions import cautions_of_waves
 
 pytestmark = pytest.mark.quick_to_compile
 
-#: Table 2 with the permeability read in mm^2/(Pa s).
+#: Table 2 with the permeability interpreted in mm^2/(Pa s).
 SPONGE = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
 SHEAR, HEIGHT, LOAD = 300.0, 0.1, -0.4
 MODULUS = 400.0 + 4 / 3 * SHEAR
@@ -25,7 +25,7 @@ DIFFUSION_TIME = HEIGHT**2 * (MODULUS + 2200.0) / (2e-5 * MODULUS * 2200.0)
 
 
 def test_volumetric_stress_and_its_tangent_line():
-    J0 = 1 - 0.5 + 0.5 * 400 / 2200  # 0.5909: the factor r_w that the chapter's print lacks
+    J0 = 1 - 0.5 + 0.5 * 400 / 2200  # 0.5909: the factor r_w that is missing in the printed chapter
     J = jnp.linspace(-0.5, 2.0, 2001)
     stress = np.asarray(porosity.volumetric_stress(SPONGE, J))
     above = np.asarray(J) > J0
@@ -63,9 +63,10 @@ def column(layers: int, steps: int, duration: float, scheme: str = "implicit", *
 
 
 def _terzaghi(steps: int) -> np.ndarray:
-    """Settlement [1] and pressure at the base [1] after each of so many implicit Euler steps of one diffusion time.
+    """Return settlement [1] and pressure at the base [1] after each implicit Euler step; all steps take one diffusion
+    time.
 
-    Terzaghi's series, whose terms exp(-M^2 t) become those of the steps, (1 + M^2 dt)^-n.
+    Terzaghi's series is used with the terms of the steps, (1 + M^2 dt)^-n, in place of exp(-M^2 t).
     """
     M = np.pi / 2 * (2 * np.arange(200) + 1)
     left = (1 + M**2 / steps) ** -np.arange(1.0, steps + 1)[:, None]
@@ -74,9 +75,10 @@ def _terzaghi(steps: int) -> np.ndarray:
 
 @pytest.mark.slow
 def test_consolidation_in_few_steps():
-    """The series has the error of the steps. That of layers is left: 0.0105, 0.0075 and 0.0043 with 6, 12 and 24.
+    """The series contains the error of the steps. The error of the layers remains: 0.0105, 0.0075 and 0.0043 with 6, 12
+    and 24 layers.
 
-    It is largest in the first step, of first order in the layer that is open to the top.
+    It is largest in the first step, and of first order in the thickness of the drained layer.
     """
     steps, layers = 20, 12
     result = lj.simulate(column(layers, steps, 1.0)).check()
@@ -104,25 +106,26 @@ def test_terzaghis_consolidation(verified):
     order, source = np.log2(errors[0] / errors[1]), "Terzaghi's series, six times"
     verified("consolidation: settlement and pressure, 500 steps", source, errors[1], 0.01, order)
     assert errors[1] < 0.01
-    assert errors[0] / errors[1] > 1.6  # first order in the step, which is halved with the layers
+    assert errors[0] / errors[1] > 1.6  # first order in the step, which is halved together with the layers
 
 
 @pytest.mark.slow
 def test_the_implicit_scheme_is_stable_at_any_step():
-    # Twenty steps of 5e-5 to 500 diffusion times, by the program of the test of consolidation.
+    # Twenty steps of 5e-5 to 500 diffusion times, with the program of the consolidation test.
     at_once, at_last = LOAD / (MODULUS + 2200) * HEIGHT, LOAD / MODULUS * HEIGHT
     for duration in (1e-3, 1.0, 1e4):
         result = lj.simulate(column(12, 20, duration)).check()
         top = float(jnp.max(result.positions[-1, :, 2])) - HEIGHT
         assert np.isfinite(np.asarray(result.pressure)).all()
-        # From the undrained settlement (to the order of the load) to the drained one.
+        # From the undrained settlement (up to the order of the load) to the drained one.
         assert top / at_once > 0.99 and top / at_last < 1.01
     assert np.isclose(top, at_last, rtol=1e-2)
 
 
 @pytest.mark.slow
 def test_the_chapters_scheme_is_not():
-    # Nothing flows in a step: the explicit volume change overshoots where K_lim exceeds the sponge's stiffness.
+    # Without flow in a step, the explicit volume change overshoots where K_lim exceeds the stiffness of the porous
+    # body.
     short = lj.simulate(column(8, 40, 0.004, "chapter"))
     assert np.abs(np.asarray(short.pressure)[-1]).max() > 10 * np.abs(LOAD)
     long = lj.simulate(column(8, 40, 40.0, "chapter")).check()
@@ -138,7 +141,7 @@ def test_bulk_is_not_counted_twice():
 
 
 def test_no_summand_keeps_a_volumetric_energy_of_its_own():
-    """Swollen by 1 % along every axis a law has but the energy that it holds in one with its shear."""
+    """With a swelling of 1 % along every axis, a law keeps only the energy that cannot be separated from shear."""
     F, e = 1.01 * jnp.eye(3), 0.5 * (1.01**2 - 1)
     fluid = lj.laws.Volumetric(bulk=5e4)
     rubber = lj.laws.NeoHookean(mu=770.0, bulk=5e4)
@@ -157,17 +160,19 @@ def test_no_summand_keeps_a_volumetric_energy_of_its_own():
         assert np.allclose(acts.first_piola(F), jax.grad(acts.energy)(F), rtol=1e-8)
         assert acts.bulk_modulus() < 1e3 < law.bulk_modulus()
         said = porosity.bulk_in_force(SPONGE, law)
-        assert f"the part of {named} that is not separate from shear; the separate volumetric energy is off" in said
+        assert (
+            f"the part of {named} that is not separate from shear; the separate volumetric energy is not used" in said
+        )
     assert porosity.law_in_force(SPONGE, fluid).energy(F) == 0.0
     assert porosity.bulk_in_force(SPONGE, kirchhoff).endswith(
         "the part of SaintVenantKirchhoff that is not separate from shear"
     )
-    assert porosity.bulk_in_force(SPONGE, rubber).endswith("; the law's own volumetric energy is off")
+    assert porosity.bulk_in_force(SPONGE, rubber).endswith("; the volumetric energy of the law is not used")
 
 
 @pytest.mark.slow
 def test_sealed_and_tight_keeps_all_fluid():
-    # Sealed: the pressure's mean follows the mean change of volume, P = -K_lim (J - 1) to first order.
+    # The body is sealed. The mean pressure follows the mean volume change, P = -K_lim (J - 1) to first order.
     scene = column(4, 5, 1e-3)
     sealed = replace(scene, porosity=SPONGE)
     result = lj.simulate(sealed).check()
@@ -196,7 +201,7 @@ def test_two_porous_platens_are_a_list_of_places():
     both, sets = [{"z_max": 0.0}, {"z_min": HEIGHT}], column(2, 1, 1.0).mesh.node_sets
     ends = [np.asarray(sets[name]).tolist() for name in ("z_min", "z_max")]
     assert drained(both) == sorted([*ends[0], *ends[1]])
-    assert drained([{"set": "z_min"}, both[1], both[1]]) == drained(both)  # a node may lie in two places
+    assert drained([{"set": "z_min"}, both[1], both[1]]) == drained(both)  # a node may lie in two regions
     assert drained(both[:1]) == drained(both[0]) == drained({"set": "z_min"}) == ends[0]
 
 
@@ -214,9 +219,9 @@ def test_only_a_porous_scene_has_pressure():
         ({"fluid_fraction": 1.5}, r"porosity\.fluid_fraction = 1.5 must be at most 1"),
         ({"permeability": -1.0}, r"porosity\.permeability = -1.0 must be at least 0 m\^4"),
         ({"scheme": "explicit"}, "use implicit or lagged"),
-        ({"drained": {"z_min": 1.0}}, "meets no node"),
-        ({"drained": [{"z_max": 0.0}, {"z_min": 1.0}]}, r"porosity\.drained\.1.*meets no node"),
-        ({"drained": []}, "drained = \\[\\].*leave it out"),
+        ({"drained": {"z_min": 1.0}}, "selects no node"),
+        ({"drained": [{"z_max": 0.0}, {"z_min": 1.0}]}, r"porosity\.drained\.1.*selects no node"),
+        ({"drained": []}, "drained = \\[\\].*remove drained"),
         ({"drained": [0, 1]}, r"drained\.0 where = 0 must be a table"),
         ({"keep_bulk": 1}, "true or false"),
     ],
@@ -261,7 +266,7 @@ def test_confined_compression_of_febio(febio, verified):
     area = np.prod((high - low)[:2])
     ours = -np.asarray(result.reactions)[:, top, 2].sum(axis=1) / area
     base = np.asarray(result.pressure)[:, np.flatnonzero(nodes[:, 2] < low[2] + 1e-9)].mean(axis=1)
-    # Same elements and steps; what differs is their storage (none) and their integration of the permeability.
+    # Elements and steps are equal. The programs differ in storage (FEBio has none) and integration of the permeability.
     stress, pressure = theirs[1:101, 3], theirs[1:101, 5]
     off = np.abs(ours - stress).max() / stress.max(), np.abs(base - pressure).max() / pressure.max()
     verified("confined compression of a sponge: stress", "FEBio, biphasic", off[0], 0.01)
@@ -271,7 +276,9 @@ def test_confined_compression_of_febio(febio, verified):
 
 @pytest.mark.slow
 def test_pressure_in_float32_where_storage_is_lost_beside_what_flows():
-    """Sealed, at a step of 1e7 diffusion times of an element: the mean is that of volumes, in either precision."""
+    """The body is sealed, and the step is 1e7 diffusion times of an element. The mean pressure follows the volumes in
+    both precisions.
+    """
     scene = column(6, 1, 1.0)
     sponge = replace(scene.porosity, drained=None)
     smaller = 1 - 0.01 * jnp.linspace(0.0, 2.0, scene.mesh.number_of_elements)  # 1 % on average
@@ -280,12 +287,14 @@ def test_pressure_in_float32_where_storage_is_lost_beside_what_flows():
         fluid = porosity.initial_fluid(own, mesh)
         flow = darcy.flow(own, mesh, fluid.J, deformation_gradient(mesh, mesh.points), dtype(1e4), 1e-6)
         P = porosity.pressure(own, mesh, fluid, flow, smaller.astype(dtype))
-        assert np.allclose(P, 2200 * 0.01, rtol=1e-5)  # 4e-6 has still to flow
+        assert np.allclose(P, 2200 * 0.01, rtol=1e-5)  # 4e-6 of it has still to flow
 
 
 @pytest.mark.slow
 def test_sealed_fluid_in_float32_at_steps_far_beyond_diffusion():
-    """Storage is 1e-4 to 1e-7 of what flows between neighbours: lost in float32 were they added before differences."""
+    """Storage is 1e-4 to 1e-7 of the exchange between neighbours. If added before the differences, it is lost in
+    float32.
+    """
     scene = replace(column(6, 3, 1.0), traction=())
     scene = replace(scene, porosity=replace(scene.porosity, drained=None))
     weight = lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -9.81]))
@@ -294,7 +303,7 @@ def test_sealed_fluid_in_float32_at_steps_far_beyond_diffusion():
         exact = lj.simulate(replace(scene, body=weight, solve=solve)).check()
         single = lj.simulate(replace(scene, body=weight, solve=replace(solve, precision="float32"))).check()
         off = np.abs(np.asarray(single.pressure, float) - exact.pressure).max() / np.abs(exact.pressure).max()
-        assert off < 1e-3  # ten times the tolerance of Newton
+        assert off < 1e-3  # ten times Newton's tolerance
 
 
 def test_a_drained_layer_of_harmonic_motion_is_told():
@@ -309,21 +318,23 @@ def test_a_drained_layer_of_harmonic_motion_is_told():
 
 @pytest.mark.slow
 def test_a_drained_layer_thinner_than_the_elements_is_told():
-    """Without flow nothing leaves the column; its drained element of six loses its fluid all the same."""
+    """Without flow nothing leaves the column. But its drained element, one of six, loses its fluid."""
     scene = column(6, 3, 1e-9 * DIFFUSION_TIME)
     result = lj.simulate(scene)
     (said,) = [s for s in cautions_of_run(scene, result) if "the fluid leaves a layer" in s]
-    assert f"the elements there are {HEIGHT / 6:.2g} m high" in said and "the mesh error says by how much" in said
+    assert f"the elements there are {HEIGHT / 6:.2g} m thick" in said and "the mesh error shows by how much" in said
     moves = np.asarray(result.positions[-1] - scene.mesh.points)[:, 2].min()
     undrained = LOAD * HEIGHT / (400.0 + 4 / 3 * SHEAR + 2200.0)
-    assert 1.04 < moves / undrained < 1.2  # what the caution is about
+    assert 1.04 < moves / undrained < 1.2  # the effect that the warning is about
     slow = column(6, 3, 1.0)
     assert not any("the fluid leaves a layer" in s for s in cautions_of_run(slow, lj.simulate(slow)))
 
 
 @pytest.mark.parametrize(("part", "told"), [(0.3, True), (2.0, False)])
 def test_a_pressure_that_overshoots_beside_the_drained_face_is_told(part, told):
-    """The load gives P = 1 at most. Steps of h^2/(4 kappa M) and more do not exceed it, shorter ones do by a third."""
+    """The load causes P = 1 at most. Steps of at least h^2/(4 kappa M) do not exceed this; shorter steps do by
+    a third.
+    """
     layers, M = 6, 400.0 + 4 / 3 * SHEAR
     step = part * (HEIGHT / layers) ** 2 / (4 * 2e-5 * M)
     scene = column(layers, 3, 3 * step / DIFFUSION_TIME)
@@ -333,5 +344,5 @@ def test_a_pressure_that_overshoots_beside_the_drained_face_is_told(part, told):
     (said,) = [s for s in cautions_of_run(scene, result) if "overshoots" in s] or [""]
     assert bool(said) == told
     if told:
-        advised = float(said.split("take a dt of ")[1].split(" s")[0])
+        advised = float(said.split("use a dt of ")[1].split(" s")[0])
         assert advised == pytest.approx(0.4 * (HEIGHT / layers) ** 2 / (2e-5 * M), rel=0.06)

@@ -1,4 +1,4 @@
-"""The error of porous runs by the mesh: with that of the fluid's pressures, against closed forms and finer meshes."""
+"""The mesh error of porous runs, including the fluid pressures, against closed forms and finer meshes."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from liverjax.simulation.run import prepared
 pytestmark = pytest.mark.quick_to_compile
 
 HEIGHT, SHEAR, BULK, LIMIT, FLOW, LOAD = 0.01, 1000.0, 2000.0, 1e6, 1e-11, 1.0
-#: Longitudinal modulus [Pa] of the sponge, and storage [1/Pa] of the fluid.
+#: Longitudinal modulus [Pa] of the porous body, and storage [1/Pa] of the fluid.
 M = BULK + 4 / 3 * SHEAR
 STORE = 1 / LIMIT + 1 / M
 #: Time [s] in which the fluid leaves the column.
@@ -29,7 +29,7 @@ LONG = STORE * HEIGHT**2 / FLOW
 
 
 def column(cells, order, **solve):
-    """A column between smooth walls, loaded and drained above (Terzaghi)."""
+    """A column between smooth walls, loaded and drained at the top (Terzaghi)."""
     mesh = lj.shapes.box((HEIGHT / cells, HEIGHT / cells, HEIGHT), (1, 1, cells))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     top = mesh.node_sets["z_max"]
@@ -48,7 +48,7 @@ def column(cells, order, **solve):
 
 
 def swinging(z, omega):
-    """Displacement and pressure at heights z of the column under a load of 1 exp(i omega t), in closed form."""
+    """Return displacement and pressure at heights z of the column under a load of exp(i omega t), in closed form."""
     wave, pressure = np.sqrt(1j * omega * STORE / FLOW), LOAD / (M * STORE)
     P = pressure * (1 - np.cosh(wave * z) / np.cosh(wave * HEIGHT))
     return (pressure * (z - np.sinh(wave * z) / (wave * np.cosh(wave * HEIGHT))) - LOAD * z) / M, P
@@ -62,7 +62,7 @@ def swinging(z, omega):
     ],
 )
 def test_harmonic_error_against_the_closed_form(order, omega, verified):
-    """From a layer as high as the column to one that is a twentieth of an element."""
+    """The thickness of the draining layer goes from the height of the column to a twentieth of an element."""
     scene = column(12, order)
     hertz = omega / LONG / (2 * np.pi)
     found = lj.harmonic(scene, [hertz]).check()
@@ -89,12 +89,12 @@ def test_error_of_a_run_against_twice_refined_meshes(order, time):
     for name, value in (("positions", found.positions), ("pressure", found.pressure)):
         truth = np.asarray(getattr(fine, name))[-1, :nodes] - np.asarray(value)[-1]
         assert 0.5 < np.linalg.norm(getattr(found.mesh_error, name)[-1]) / np.linalg.norm(truth) < 2
-    assert "; pressures up to" in mesh_sentence(scene, found)
+    assert "; pressures are wrong by up to" in mesh_sentence(scene, found)
 
 
 @pytest.mark.slow
 def test_a_vessel_leaves_the_pressures_out_of_the_error():
-    """Its elements have no counterpart on the refined mesh; the sentence says what is missing."""
+    """A vessel's elements have no counterpart on the refined mesh. The message says what is missing."""
     scene = column(3, 1, dt=1.0)
     line = np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.8]]) * HEIGHT + HEIGHT / 12
     own = vessel.along(scene.mesh, line, 1e-4, lj.laws.NeoHookean(mu=SHEAR, bulk=BULK))
@@ -155,7 +155,7 @@ def test_a_scene_on_the_refined_mesh_has_its_regions_places_and_loads(order):
     assert np.allclose(fine.displaced[0].by, 1e-3 * np.asarray(fine.mesh.points)[nodes], atol=1e-16)
     for load in (fine.traction[0], fine.porosity.inlet[0]):
         assert np.allclose(areas(fine.mesh.points, load.triangles).sum(axis=0), [1e-4, 0, 0])
-    # The prepared scene has one law for each kind of element: the same forces as of the scene with regions.
+    # The prepared scene has one law for each kind of element. Its forces are those of the scene with regions.
     ready = on_refined_mesh(prepared(scene))[0]
     x = fine.mesh.points * jnp.array([[1.1, 0.95, 1.0]])
     assert np.allclose(volume_ratios(ready.mesh, x), 1.1 * 0.95)
@@ -175,7 +175,9 @@ def test_the_parts_of_triangles_and_element_sets():
 
 @pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_places_that_meet_at_an_edge_keep_their_size(order):
-    """In one set, the triangle at their corner and faces inside had all vertices in the set: they were drained too."""
+    """In one set of nodes, some inner faces and the triangle at a corner had all vertices in the set, and were drained
+    too.
+    """
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     x = np.asarray(mesh.points)
@@ -195,7 +197,9 @@ def test_places_that_meet_at_an_edge_keep_their_size(order):
 
 
 def test_only_numbers_by_element_are_given_to_the_parts():
-    """As many triangles as elements were taken for numbers by element: the inflow was eight times too large."""
+    """If there are as many triangles as elements, they were taken for values per element. The inflow was eight times
+    too large.
+    """
     mesh = lj.shapes.box((0.1, 0.1, 0.025), (4, 4, 1))
     whole = boundary_triangles(mesh)
     assert len(whole) == mesh.number_of_elements

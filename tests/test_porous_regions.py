@@ -1,4 +1,4 @@
-"""Regions with a porosity of their own: flow through two layers by hand, whole bodies of either, refusals."""
+"""Regions with separate porosity: flow through two layers by hand, whole bodies of each kind, invalid input."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ SCAR = {"bulk": 4000.0, "limit_bulk": 9000.0, "fluid_fraction": 0.4, "permeabili
 
 
 def column(order=1, sponge=LIVER, region=(), scheme="implicit", **changes):
-    """A column of 2 cm, drained at the top, pressed at the top."""
+    """A column of 2 cm, drained and compressed at its top."""
     mesh = lj.shapes.box((0.01, 0.01, 0.02), (2, 2, 4))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     given = {
@@ -62,7 +62,7 @@ def test_a_region_of_all_elements_is_the_body(order, scheme):
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_flow_through_two_layers(order, verified):
-    """Between two pressures the same flux passes both layers: slopes are as the inverse permeabilities."""
+    """Between two pressures the same flux passes both layers, so the gradients are inverse to the permeabilities."""
     mesh = column(order).mesh
     inlet = Inlet(nodes=mesh.node_sets["z_min"], pressure=1.0)
     held = (lj.Fixed(nodes=jnp.arange(mesh.number_of_nodes)),)
@@ -150,7 +150,7 @@ def test_a_porosity_that_no_region_can_have_gets_a_sentence(porosity, words):
 
 def test_scenes_without_porosity_refuse_it():
     region = lj.Region(elements=jnp.array([0]), porosity={"permeability": 1e-9})
-    with pytest.raises(lj.InputError, match=r"needs a \[porosity\] in the scene"):
+    with pytest.raises(lj.InputError, match=r"needs \[porosity\] in the scene"):
         check_region_porosity(None, region, "region.0")
     several = lj.Region(elements=jnp.array([0]), porosity={"permeability": jnp.array([1e-9, 1e-9])})
     with pytest.raises(lj.InputError, match="has 2 numbers: give one"):

@@ -1,4 +1,4 @@
-"""Samples of the posterior: of densities that are known, of a fit against quadrature, and calibrated by simulation."""
+"""Samples of the posterior: of known densities, of a fit against quadrature, and calibrated by simulation."""
 
 import json
 import types
@@ -28,7 +28,7 @@ OMEGA = np.geomspace(0.1, 100, 11)
 
 
 def two_peaks(u: np.ndarray) -> np.ndarray:
-    """Three tenths of the mass around (-4, …), seven tenths around (4, …), a hundred times narrower than the prior."""
+    """A density with 0.3 of its mass around (-4, …) and 0.7 around (4, …), a hundred times narrower than the prior."""
     narrow = [-0.5 * np.sum((u - c) ** 2, axis=-1) / 0.1**2 - 2 * np.log(0.1 * np.sqrt(2 * np.pi)) for c in (-4, 4)]
     return np.logaddexp(np.log(0.3) + narrow[0], np.log(0.7) + narrow[1])
 
@@ -41,14 +41,14 @@ def test_two_far_peaks_keep_their_masses_and_the_evidence_is_known():
     )
     found = tempering.run(flat, 1000)
     right = found.draws[..., 0] > 0
-    # 4000 draws of 0.7, resampled some five times: 0.02 is what the mass may be off by.
+    # 4000 draws with mass 0.7, resampled about five times: the standard error of the mass is 0.02.
     assert right.mean() == pytest.approx(0.7, abs=0.06)
     assert found.log_evidence.mean() == pytest.approx(-2 * np.log(20), abs=0.15)
     assert found.draws[right].mean() == pytest.approx(4, abs=0.01)
     assert found.draws[right].std() == pytest.approx(0.1, rel=0.05)
 
 
-#: arviz_stats 0.8.0, rhat(method="rank"), of the draws below.
+#: Results of arviz_stats 0.8.0, rhat(method="rank"), for the draws below.
 ARVIZ = (1.04440297, 1.03997086)
 
 
@@ -60,7 +60,7 @@ def test_r_hat_is_that_of_arviz():
 
 
 def test_a_given_size_of_errors_is_only_ever_enlarged():
-    """The closed form of the integral over the size of the errors against quadrature."""
+    """The integral over the size of the errors has a closed form. It is compared with quadrature."""
     for m, square in ((20, 3.0), (20, 25.0), (62, 300.0)):
         grids = [np.linspace(low, 6, 400001) for low in (-3, 0)]
         free, above = (np.trapezoid(np.exp(-m * t - 0.5 * square * np.exp(-2 * t)), t) for t in grids)
@@ -95,15 +95,16 @@ def test_the_draws_of_one_mode_have_the_moments_of_quadrature():
     sd = np.sqrt(weight @ (numbers - mean) ** 2)
     flat = found.draws.reshape(-1, 4)
     assert found.names == ("shear_modulus", "equilibrium_modulus", "ratios[0]", "relaxation_times[0]")
-    assert np.all(np.abs(flat.mean(axis=0) - mean) < 0.08 * sd)  # 4000 draws: 0.016, and five resamplings
+    assert np.all(np.abs(flat.mean(axis=0) - mean) < 0.08 * sd)  # 4000 draws: 0.016, times five resamplings
     assert np.allclose(flat.std(axis=0), sd, rtol=0.1)
     assert found.r_hat.max() < 1.01
 
 
 def test_the_error_of_the_inertia_is_drawn_with_its_prior():
-    """Moments of five numbers against quadrature of the density, which is written out here."""
+    """Moments of five numbers are compared with quadrature of the density, which is written out here."""
     s = one_mode(0.1, 1)
-    share, off = 40 * OMEGA, 0.6  # of a deviation of the prior, by which 120 Pa are wrong at the end
+    # in units of a standard deviation of the prior, which changes the last modulus by 120 Pa
+    share, off = 40 * OMEGA, 0.6
     s = s._replace(storage=s.storage - off * 0.03 * share, inertia=share)
     fit, better = instrument.without_error_of_inertia(viscoelastic.closed_form(s, 1), s)
     found = posterior.of_sweep(fit, better, 1000)
@@ -121,7 +122,7 @@ def test_the_error_of_the_inertia_is_drawn_with_its_prior():
         ],
         axis=1,
     )
-    rest = 1 / (1 + np.exp(grid[:, 1]))  # uniform ratio: the slope of the logit
+    rest = 1 / (1 + np.exp(grid[:, 1]))  # uniform ratio: the derivative of the logit
     weight = square**-11 * np.exp(-0.5 * errors**2) * (rest * (1 - rest))[:, None]
     weight /= weight.sum()
     numbers = posterior._sweep_target(fit.kind, s, None).prior.numbers(grid)
@@ -148,7 +149,7 @@ def test_the_error_of_the_gap_is_a_factor_of_all_moduli(springpot):
     moduli = ["modulus" in name or name.startswith("springpot") for name in alone.names]
     assert any(moduli) and not all(moduli)
     assert np.allclose(factor, np.where(moduli, gap, 1.0), rtol=1e-12)
-    # Of 2000 draws: 2.2 % of a deviation and 1.6 %, four times.
+    # 2000 draws have standard errors of 2.2 % of a deviation for the mean and 1.6 % for the deviation. Four of these.
     assert abs(gap.mean() - 1) < 0.09 * 0.05 and gap.std() == pytest.approx(0.05, rel=0.07)
     assert "5 %" in wide.prior and wide.r_hat.max() < 1.02
 
@@ -161,7 +162,10 @@ def test_data_without_noise_have_a_narrow_posterior_and_no_warning():
 
 
 def calibration(modes: int, count: int, noise: float, monkeypatch) -> np.ndarray:
-    """Chances of ranks of the truth among its draws (K,), were they uniform; truths are drawn from the prior."""
+    """Return p-values (K,) of a uniform distribution of the true values' ranks among their draws.
+
+    The true values are drawn from the prior.
+    """
     monkeypatch.setattr(tempering, "CHAINS", 1)
     monkeypatch.setattr(tempering, "FEWEST", 100)
     prior = posterior.Modes(False, (np.log(100.0), np.log(10000.0)), (np.log(0.003), np.log(30.0)))
@@ -192,7 +196,7 @@ def test_ranks_of_the_truth_are_uniform_of_two_modes(monkeypatch):
 
 @pytest.mark.slow
 def test_a_prior_without_its_slopes_is_found_out(monkeypatch):
-    """The mistake that the calibration is there to see: a flat density of logits and gaps."""
+    """The calibration must detect this mistake: a flat density of logits and gaps."""
     right = posterior.Modes.log_prior
     flat = lambda self, u: np.where(np.isfinite(right(self, u)), 0.0, -np.inf)  # noqa: E731
     monkeypatch.setattr(posterior.Modes, "log_prior", flat)
@@ -214,7 +218,7 @@ def test_the_command_writes_draws_and_their_summary(tmp_path, capsys):
 
 
 def test_a_springpot_has_the_errors_of_its_curvature():
-    """Two numbers with little noise: the posterior is normal, and its spread that of the linearised fit."""
+    """There are two parameters and little noise, so the posterior is normal, with the spread of the linearised fit."""
     rng = np.random.default_rng(5)
     G = 700 * (1j * OMEGA) ** 0.3 * np.exp(0.01 * (rng.standard_normal(11) + 1j * rng.standard_normal(11)))
     sweep = Sweep(OMEGA, G.real, G.imag)
@@ -235,7 +239,7 @@ def test_a_springpot_has_the_errors_of_its_curvature():
     flat = draws.draws.reshape(-1, 2)
     assert draws.names == p.names and "exponents uniform" in draws.prior
     assert np.all(np.abs(flat.mean(axis=0) - p.values) < 0.1 * p.standard_errors)
-    # The size of 22 errors is not known: Student's t of 20 degrees of freedom is wider by 5 %.
+    # The size of 22 errors is unknown. Student's t with 20 degrees of freedom is 5 % wider.
     assert np.allclose(flat.std(axis=0), p.standard_errors * np.sqrt(20 / 18), rtol=0.1)
 
 
@@ -277,7 +281,7 @@ def test_the_posterior_through_the_simulation_is_checked_by_simulating(tmp_path)
         < fit.uncertainty.standard_errors
     )
     lost = found._replace(simulated={"draws": 12.0, "largest_difference": 2.0})
-    assert "log density is off by up to 2" in lost.warnings()[0]
+    assert "log density is wrong by up to 2" in lost.warnings()[0]
 
 
 @pytest.mark.parametrize(
@@ -300,10 +304,14 @@ def test_chains_that_do_not_agree_are_named():
 
 
 def test_a_posterior_that_the_prior_cuts_is_told():
-    """A mode of 8 s, which frequencies from 0.3 Hz on do not tell from longer ones; the prior ends at 5 s."""
+    """The mode has 8 s. Frequencies from 0.3 Hz on do not distinguish it from longer ones, and the prior ends
+    at 5 s.
+    """
     omega = 2 * np.pi * np.geomspace(0.316, 31.6, 25)
     G = sum(1000 * 1j * omega * tau / (1 + 1j * omega * tau) for tau in (8.0, 0.05))
     noise = 1 + 0.01 * np.random.default_rng(0).standard_normal((2, 25))
     s = Sweep(omega, G.real * noise[0], G.imag * noise[1])
     told = posterior.of_sweep(viscoelastic.closed_form(s, 2), s, 100).warnings()
-    assert any("the prior cuts the posterior of relaxation_times[0]" in w and "its end of 5.04 s" in w for w in told)
+    assert any(
+        "the prior truncates the posterior of relaxation_times[0]" in w and "the bound of 5.04 s" in w for w in told
+    )

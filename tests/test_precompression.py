@@ -1,4 +1,4 @@
-"""A sample that the plates compress before they turn it: closed form, simulation, the fit, and what is refused."""
+"""A sample that the plates compress before torsion: closed form, simulation, the fit, and invalid input."""
 
 import json
 
@@ -30,21 +30,21 @@ def law():
 
 @pytest.mark.parametrize("strain", [0.05, 0.3])
 def test_factors_of_an_incompressible_law_are_those_of_rivlin(strain):
-    """Rivlin 1949: an incompressible Mooney-Rivlin cylinder of stretch l has a torque of 2 (W1 + W2 / l) theta / l.
+    """Rivlin 1949: the torque of an incompressible Mooney-Rivlin cylinder with stretch l is 2 (W1 + W2 / l) theta / l.
 
-    What relaxes and what stands of it: the part of the stress that stands turns with the sample.
+    The relaxing part is compared with the part that remains: the remaining stress turns with the sample.
     """
     G, part, stretch = 1000.0, 0.3, 1 - strain
     law = lj.laws.MooneyRivlin(c10=0.5 * G * (1 - part), c01=0.5 * G * part, bulk=1e6 * G)
     both = (1 - part) + part / stretch
     found = compression.shares(law, strain)
-    # The compressibility that is left is G / K = 1e-6, times factors of order one.
+    # The remaining compressibility is G / K = 1e-6, times factors of order one.
     assert found.equilibrium == pytest.approx(both, rel=2e-5)
     assert found.relaxing == pytest.approx(both / stretch**3, rel=2e-5)
 
 
 def test_a_law_s_small_compression_changes_nothing(law):
-    """The factors tend to one, by as much as the strain."""
+    """For a small compression the factors tend to one, with a difference of the size of the strain."""
     far, near = (compression.shares(law, strain) for strain in (1e-3, 1e-4))
     for a, b in zip(far, near, strict=True):
         assert (a - 1) / (b - 1) == pytest.approx(10, rel=0.02)
@@ -59,7 +59,7 @@ def test_weights_are_taken_back(law):
 
 @pytest.mark.slow
 def test_smooth_plates_converge_to_the_closed_form(law):
-    """A mesh of a cylinder that stayed one, too slow and too fast to relax: second order to the closed form."""
+    """Smooth plates, a very slow and a very fast motion: the mesh converges to the closed form with second order."""
     shares, sizes, errors = compression.shares(law, STRAIN), [], []
     exact = np.array([0.5 * shares.equilibrium, 0.5 * shares.equilibrium + 0.5 * shares.relaxing])
     prony = lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([1.0]))
@@ -74,7 +74,9 @@ def test_smooth_plates_converge_to_the_closed_form(law):
 
 @pytest.mark.slow
 def test_glued_torque_is_that_of_a_sample_compressed_and_then_turned(law):
-    """Elastic: against nodes of the plate moved by hand in `lj.simulate`, torque from the nodal forces."""
+    """An elastic sample is compared with a plate whose nodes are moved by hand in `lj.simulate`, with the torque of its
+    nodal forces.
+    """
     rig = rig_of(Simulation(precompression=STRAIN))
     small = 1e-4
     n = rig.mesh.number_of_nodes
@@ -97,12 +99,12 @@ def test_glued_torque_is_that_of_a_sample_compressed_and_then_turned(law):
     relaxing, standing = torsion.about_held(rig, law)
     by_hand = (torques[0] - torques[1]) / small
     stiffness = 1 / jnp.linalg.inv(relaxing + standing)[-1, -1] * rig.radius**2
-    assert by_hand == pytest.approx(float(stiffness), rel=1e-3)  # what is left is the twist's square and its product
+    assert by_hand == pytest.approx(float(stiffness), rel=1e-3)  # the rest is the square of the twist and its product
 
 
 @pytest.mark.slow
 def test_simulated_moduli_are_those_of_the_linear_rig(law):
-    """The run in time about the held state, where what is left is of the order of the strain."""
+    """A transient run about the compressed state has an error of the order of the strain."""
     rig = rig_of(Simulation(precompression=STRAIN, cell_size=0.004))
     prony = lj.Prony(ratios=jnp.asarray(REST.ratios), relaxation_times=jnp.asarray(REST.relaxation_times))
     omega, drive = jnp.array([1.0, 10.0]), torsion.Drive(steps=20)
@@ -131,10 +133,10 @@ def test_the_closed_form_tells_the_material_from_its_compression(tmp_path, law, 
     np.testing.assert_allclose(content["ratios"], REST.ratios, rtol=1e-5)
     assert content["mean_relative_error"] < 1e-6
     told = content["details"]["precompression"]
-    force = compression.smooth_force(law, 0.1, 0.01) / float(law.shear_modulus())  # of a modulus of 1 Pa
+    force = compression.smooth_force(law, 0.1, 0.01) / float(law.shear_modulus())  # for a modulus of 1 Pa
     assert told["axial_force_N"] == pytest.approx(force * 500, rel=1e-4)
     assert told["plates"] == "smooth" and told["height_at_rest_m"] == pytest.approx(0.004 / 0.9)
-    # Both parts of what was measured stay; each is divided by its own factor. The one of what relaxes changes more.
+    # Both measured parts stay, and each is divided by its own factor. The factor of the relaxing part changes more.
     factors, kept = compression.shares(law, STRAIN), compression.incompressible(law, STRAIN)
     changed = 0.5 * factors.relaxing / kept.relaxing + 0.5 * factors.equilibrium / kept.equilibrium
     assert told["modulus_if_incompressible"] == pytest.approx(changed, rel=1e-5)
@@ -142,7 +144,9 @@ def test_the_closed_form_tells_the_material_from_its_compression(tmp_path, law, 
 
 
 def _whole_cylinder(law, prony, hertz) -> tuple[np.ndarray, float]:
-    """Moduli and relaxed force of a glued sample by even quadratic elements, turned harmonically at each frequency."""
+    """Return moduli and relaxed force of a glued sample on even quadratic elements, turned harmonically at each
+    frequency.
+    """
     rig = glued.tension(0.01, 0.004 / (1 - STRAIN), 1.0, [-STRAIN / 2, -STRAIN], glued.Cells(size=0.0014))
     scene = replace(rig.scene, law=law, solve=replace(rig.scene.solve, volumetric="element"))
     pressed, top = lj.simulate(scene).check(), np.asarray(rig.nodes)
@@ -156,15 +160,16 @@ def _whole_cylinder(law, prony, hertz) -> tuple[np.ndarray, float]:
     on_plate = np.asarray(lj.harmonic(wave, hertz, about=x, motion=turn).check().reactions)[:, top]
     torque = (x[top, 0] * on_plate[..., 1] - x[top, 1] * on_plate[..., 0]).sum(axis=1)
     stands = 1 - float(np.sum(prony.ratios))
-    torque = torque - stands * np.sum(x[top, :2] * force[:, :2])  # the plate's force does not turn with it
+    torque = torque - stands * np.sum(x[top, :2] * force[:, :2])  # the plate's force does not turn with the plate
     return 2 * 0.004 / (np.pi * 0.01**4) * torque, -stands * float(force[:, 2].sum())
 
 
 @pytest.mark.slow
 def test_the_simulation_tells_the_material_from_a_glued_and_compressed_sample(tmp_path, law, verified):
-    """Data of another mesh, of continuous time and of no split into factors.
+    """The data come from another mesh, in continuous time, and without a division into factors.
 
-    The even mesh of the data is 1.3 % too stiff in what relaxes (by cells of 2, 1.4 and 1 mm), and more in the force.
+    The even mesh of the data is 1.3 % too stiff in the relaxing part (from cells of 2, 1.4 and 1 mm), and more in the
+    force.
     """
     hertz = np.geomspace(0.02, 20, 13)
     prony = lj.Prony(ratios=jnp.asarray(REST.ratios), relaxation_times=jnp.asarray(REST.relaxation_times))
@@ -187,13 +192,13 @@ def test_the_simulation_tells_the_material_from_a_glued_and_compressed_sample(tm
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "gap"), [("neo_hookean", 0.004), ("mooney_rivlin", 0.001), ("fung_demiray", 0.01)])
 def test_factors_of_glued_plates_are_known_within_their_stated_error(name, gap):
-    """Against cells at the rims that are less than half as long; a small compression changes little."""
+    """Compare with cells at the rims of less than half the size. A small compression changes little."""
     law = lj.laws.typical(name)
     found, missed = glued_compression.glued(0.01, gap, law, STRAIN)
     mesh = glued_compression._quarter(0.01, gap / (1 - STRAIN), 0.04, 1.0)
     fine = glued_compression._on_mesh(mesh, 0.01, law, STRAIN)
     for a, b, error in zip(found, fine, missed, strict=True):
-        # Cells of 0.04 in place of 0.1 miss half of what those miss: 0.4 to the power of 0.75.
+        # Cells of 0.04 instead of 0.1 have half of the error: 0.4 to the power of 0.75.
         assert abs(a - 0.5 * error - b) < 0.25 * abs(error)
     near, _ = glued_compression.glued(0.01, gap, law, 1e-3)
     assert near.relaxing + near.standing == pytest.approx(1, abs=2e-3)
@@ -201,7 +206,7 @@ def test_factors_of_glued_plates_are_known_within_their_stated_error(name, gap):
 
 @pytest.mark.slow
 def test_glued_plates_that_fold_the_sample_are_refused(law):
-    with pytest.raises(InputError, match="could not be compressed so far; give less"):
+    with pytest.raises(InputError, match="did not converge at this compression; give a smaller value"):
         glued_compression.glued(0.01, 0.01, law, 0.5)
 
 
@@ -226,7 +231,7 @@ def test_what_is_refused_is_refused_in_a_sentence(tmp_path, options, words, caps
 
 @pytest.mark.parametrize("model", ["fractional", "spectrum"])
 def test_other_models_of_a_compressed_sample_give_its_numbers_at_rest(tmp_path, law, model):
-    """A spring beside a springpot: the spring is seen with the one factor, the springpot with the other."""
+    """A spring in parallel with a springpot: each is measured with its own factor."""
     factors, hertz = compression.shares(law, STRAIN), np.geomspace(0.02, 20, 25)
     G = 400.0 * factors.equilibrium + factors.relaxing * 150.0 * (2j * np.pi * hertz) ** 0.4
     path = sweep_file(tmp_path, (G.real, G.imag), hertz)
@@ -247,7 +252,7 @@ def test_other_models_of_a_compressed_sample_give_its_numbers_at_rest(tmp_path, 
 
 
 def test_the_inertia_of_a_compressed_sample_is_that_of_its_mass(tmp_path, law):
-    """Its moment of inertia is m (a r)^2 / 2. With the density alone, up to 11 % of the inertia would be left."""
+    """The moment of inertia is m (a r)^2 / 2. With the density alone, up to 11 % of the inertia would remain."""
     radius, gap, density, hertz = 0.01, 0.008, 1060.0, np.geomspace(0.02, 12, 25)
     omega = 2 * np.pi * hertz
     storage, loss = generalised_maxwell.moduli(weighed(REST, *compression.shares(law, STRAIN)), omega)
@@ -268,11 +273,12 @@ def test_the_inertia_of_a_compressed_sample_is_that_of_its_mass(tmp_path, law):
 
 @pytest.mark.slow
 def test_a_tall_compressed_sample_with_inertia_goes_through_the_simulation(tmp_path):
-    """The simulated inertia was divided by the stiffness of the mesh: G0 came out 3 % too low, and the plates were
-    named as the cause."""
+    """The simulated inertia was divided by the stiffness of the mesh. G0 was 3 % too low, and the message named the
+    plates.
+    """
     radius, gap, density, strain = 0.004, 0.012, 1000.0, 0.06
     omega, axial = 2 * np.pi * np.array([0.5, 3.0, 8.0, 18.0]), 1 - strain
-    # Rivlin's incompressible cylinder of 3000 Pa, one mode (0.4, 0.05 s), as a rod with its own inertia.
+    # Rivlin's incompressible cylinder of 3000 Pa with one mode (0.4, 0.05 s), as a rod with its inertia.
     relaxing = 1 - 0.4 / (1 + 0.05j * omega)
     seen = 3000 / axial**2 * (axial**2 - 1 / axial) * (relaxing / axial / (axial**2 - 1 / axial) + 0.6)
     kh = omega * gap * np.sqrt(density / axial**2 / seen)
@@ -281,7 +287,7 @@ def test_a_tall_compressed_sample_with_inertia_goes_through_the_simulation(tmp_p
     ask = [str(path), "--precompression", "0.06", "--height", str(gap), "--radius", str(radius), "--modes", "1"]
     assert command.main([*ask, "--density", str(density), "--out", str(tmp_path)]) == 0
     content = json.loads((tmp_path / "fit.json").read_text())
-    # The law of the simulation keeps its volume less than the data, and its plates are glued: 0.3 % each.
+    # The law of the simulation is more compressible than the data, and its plates are glued: 0.3 % each.
     assert content["shear_modulus"] == pytest.approx(3000, rel=0.006)
     assert content["ratios"] == pytest.approx([0.4], rel=0.005)
     assert content["mesh_bias"] is not None and content["details"]["density_kg_m3"] == density
@@ -289,7 +295,7 @@ def test_a_tall_compressed_sample_with_inertia_goes_through_the_simulation(tmp_p
 
 @pytest.mark.slow
 def test_a_compressed_sample_with_inertia_turns_as_a_rod_of_its_mass():
-    """Smooth plates: a uniform cylinder, D / h kh / tan(kh) with (kh)^2 = omega^2 J h / D and J = m (a r)^2 / 2."""
+    """With smooth plates, a uniform cylinder has D / h kh / tan(kh), (kh)^2 = omega^2 J h / D and J = m (a r)^2 / 2."""
     radius, tall, density, law = 0.01, 0.01, 1000.0, lj.laws.typical("neo_hookean")
     rig = torsion.make_rig(radius, tall, 0.003, density=density)
     omega, shares, expected = None, [], []
@@ -306,8 +312,8 @@ def test_a_compressed_sample_with_inertia_turns_as_a_rod_of_its_mass():
         shares.append(1 - float(moving.storage[0] / still.storage[0]))
         kh = omega * np.sqrt(inertia)
         expected.append(1 - kh / np.tan(kh))
-    # The mesh, a polygon that is too stiff, is some percent off in both, and less in their ratio. A mass that is not
-    # where the sample is would be 11 % off: the radius grows by 5 %, and the inertia by its square.
+    # The mesh, a polygon that is too stiff, causes errors of some percent in both, and less in their ratio. With the
+    # mass at the wrong radius, the error would be 11 %: the radius grows by 5 %, and the inertia by its square.
     assert shares[0] == pytest.approx(expected[0], rel=0.1)
     assert shares[1] / shares[0] == pytest.approx(expected[1] / expected[0], rel=0.03)
 
@@ -327,7 +333,9 @@ def test_no_compression_is_no_change(law):
     "name", ["neo_hookean", "mooney_rivlin", pytest.param("ogden", marks=pytest.mark.slow), "fung_demiray"]
 )
 def test_a_sample_that_keeps_its_volume_is_the_limit_of_a_large_bulk_modulus(name):
-    """The law assumed has K / G = 10: the moduli of an incompressible sample came out 1.3 % too large, unsaid."""
+    """The assumed law has K / G = 10. The moduli of an incompressible sample were 1.3 % too large, without a
+    message.
+    """
     law = lj.laws.typical(name)
     stiff = replace(law, bulk=1e4 * law.bulk)
     exact, limit = compression.incompressible(law, 0.1), compression.shares(stiff, 0.1)

@@ -1,4 +1,4 @@
-"""Tests that a fit predicts without having seen them."""
+"""Tests that a fit predicts although they were not used in the fit."""
 
 import numpy as np
 import pytest
@@ -35,20 +35,22 @@ def relaxation(factor: float = 1.0) -> TimeTest:
 
 @pytest.mark.slow
 def test_errors_of_the_prediction_cover_the_truth():
-    """Relaxation without noise of its own, predicted from 20 sweeps with 2 %: 95 % of the points lie within."""
+    """A relaxation test without noise is predicted from 20 sweeps with 2 %. The intervals contain 95 % of the
+    points.
+    """
     covered = []
     for seed in range(20):
         s = sweep(0.02, seed)
         found = prediction.predict(viscoelastic.closed_form(s, 2), s.resolved, relaxation())
         assert found.inside.sum() == np.sum((TIME >= 0.01) & (TIME <= 20.0))
         covered.append(found.covered)
-    # The points of a sweep go together: 20 sweeps count, not 500 points.
+    # The points of a sweep are correlated: 20 sweeps count, not 500 points.
     assert 0.8 < np.mean(covered) <= 1.0
     assert found.relative_errors[found.inside].mean() < 0.02
 
 
 def test_errors_of_a_sweep_with_deviations_are_relative_to_its_moduli():
-    """Beside 2 % of deviations an error of 10 % is 10 %, not 5."""
+    """With stated deviations of 2 %, an error of 10 % is 10 %, not 5."""
     G = np.concatenate(generalised_maxwell.moduli(TRUTH, OMEGA))
     storage, loss = np.split(1.1 * G, 2)
     stiffer = Sweep(OMEGA, storage, loss, 0.02 * storage, 0.02 * loss)
@@ -71,7 +73,9 @@ def test_a_stiffer_sample_is_a_factor_and_waves_are_predicted_too():
 
 @pytest.mark.slow
 def test_polystyrene_relaxes_and_creeps_alike_and_softer_than_it_swings(capsys, tmp_path):
-    """Of one material from one laboratory: two tests in time agree with each other, not with the sweep."""
+    """The tests are of one material from one laboratory. Relaxation and creep agree with each other, but not with the
+    sweep.
+    """
     folder = SHARED / "data" / "rheology" / "pyrheo"
     if not folder.is_dir():
         pytest.skip("measured data are not here")

@@ -1,4 +1,4 @@
-"""Obstacles under a force: a bar by hand, the same body moved by the travel that was found, unloading, derivatives."""
+"""Obstacles under a force: a bar by hand, the body under the displacement that was found, unloading, derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ def sphere(kind, top, **numbers):
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_plate_on_a_held_bar(order, verified):
-    """No motion to the side: stress F/A at one stretch, and the plate as deep in the surface as its stiffness says."""
+    """Without lateral motion, the stress is F/A at one stretch. The plate's penetration follows from its stiffness."""
     F, hardness = 0.05, 1e8
     scene = cube(lambda top: plane(top, force=jnp.array([0.0, 0.0, -F]), stiffness=hardness), order, (1, 1, 2))
     nodes = jnp.arange(scene.mesh.number_of_nodes)
@@ -65,7 +65,7 @@ def test_a_plate_on_a_held_bar(order, verified):
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_ball_pressed_is_the_ball_moved_as_far(order):
-    """Beginning 1 mm above the body: the travel that a force finds has that force."""
+    """The ball starts 1 mm above the body. The displacement found for a force gives this force."""
     force = jnp.array([0.0, 0.002, -0.02])
     pressed = cube(lambda top: sphere(PressedObstacle, top, force=force), order)
     at_rest = lj.simulate(pressed).check()
@@ -98,7 +98,9 @@ def test_a_load_that_goes_lets_the_body_back():
 
 @pytest.mark.slow
 def test_the_travel_has_derivatives():
-    """All points touch, so that no quotient sees one open; the bulk modulus is not 3 mu, where hardness has a kink."""
+    """All points touch, so no difference quotient opens a point. The bulk modulus is not 3 mu, where the default
+    stiffness has a kink.
+    """
     tilted = {"axis": jnp.array([0.0, np.sin(0.02), -np.cos(0.02)]), "position": jnp.array([0.0, 0.0, SIDE])}
     scene = cube(lambda top: plane(top, force=jnp.array([0.0, 0.0, -0.05]), **tilted), cells=(1, 1, 1))
 
@@ -109,7 +111,7 @@ def test_the_travel_has_derivatives():
     value, slope = jax.jvp(travel, (800.0,), (1.0,))
     errors = [abs(float(travel(800.0 + h) - travel(800.0 - h)) / (2 * h) / slope - 1) for h in (20.0, 2.0)]
     assert errors[0] < 1e-2 and errors[1] < 0.02 * errors[0]
-    assert slope > 0 > value  # stiffer: less deep
+    assert slope > 0 > value  # a stiffer contact is less deep
 
 
 @pytest.mark.slow
@@ -127,7 +129,7 @@ def test_gradients_through_a_pressed_obstacle():
 
 @pytest.mark.slow
 def test_a_body_on_which_a_plate_lies_with_inertia():
-    """A plate without mass on a body that falls back: its force is the given one at every step."""
+    """A plate without mass lies on a body that falls back. Its force is the given one at every step."""
     scene = cube(
         lambda top: plane(top, force=jnp.array([0.0, 0.0, -0.02])),
         cells=(1, 1, 1),
@@ -155,13 +157,13 @@ def test_scene_files_press_an_obstacle():
 @pytest.mark.parametrize(
     "change, words",
     [
-        ({"force": [0, 0, 1.0]}, "presses it past the body"),
+        ({"force": [0, 0, 1.0]}, "presses the obstacle past the body"),
         ({"force": [0, 0, 0]}, "not all 0"),
         ({"force": [0, 1]}, "must be three numbers"),
-        ({"force": [0, 0, -1], "by": [0, 0, 1]}, "obstacle.0 has force together with by: leave one"),
-        ({"force": [0, 0, -1], "friction": 0.5}, "obstacle.0 has force together with friction: leave one"),
+        ({"force": [0, 0, -1], "by": [0, 0, 1]}, "obstacle.0 has force together with by: remove one"),
+        ({"force": [0, 0, -1], "friction": 0.5}, "obstacle.0 has force together with friction: remove one"),
         ({"history": [[0, 0, 0, 1]]}, "history"),
-        ({"history": [[0, 1], [1, -0.5]]}, "factor -0.5: a force presses"),
+        ({"history": [[0, 1], [1, -0.5]]}, "factor -0.5: the force can only press"),
     ],
 )
 def test_obstacles_that_cannot_be_pressed_get_one_sentence(change, words):
@@ -172,7 +174,9 @@ def test_obstacles_that_cannot_be_pressed_get_one_sentence(change, words):
 
 @pytest.mark.slow
 def test_a_ball_between_the_contact_points_is_told():
-    """Its force is right, and its place is not: of a travel of 4.7 mm, 3.6 mm were inside of the body, unsaid."""
+    """The force is right, but the position is not. Of a displacement of 4.7 mm, 3.6 mm were inside the body, without a
+    warning.
+    """
     table = {
         "mesh": {"shape": "box", "size": [0.1, 0.1, 0.1], "cells": [2, 2, 2]},
         "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
@@ -185,25 +189,27 @@ def test_a_ball_between_the_contact_points_is_told():
     small = {"shape": "sphere", "radius": 0.006, "position": [0.0333, 0.0333, 0.106], "force": [0, 0, -0.02]}
     with pytest.raises(lj.InputError, match="passes between the points at which contact is tested"):
         scene_from(table | {"obstacle": [small]})
-    with pytest.raises(lj.InputError, match="presses it past the body"):
+    with pytest.raises(lj.InputError, match="presses the obstacle past the body"):
         scene_from(table | {"obstacle": [small | {"position": [0.2, 0.2, 0.2]}]})
 
 
 @pytest.mark.slow
 def test_a_light_force_is_balanced_to_the_roundoff_of_positions():
-    """Its travel was not found where 16 digits of the force were asked for, and every step failed."""
+    """When 16 digits of the force were required, no displacement was found, and every step failed."""
     scene = cube(lambda top: sphere(PressedObstacle, top, force=jnp.array([0.0, 0.0, -1.0])))
     run = jax.jit(lj.simulate)
     for force in (1e-2, 1e-3, 1e-4, 1e-5, 1e-7):
         own = lj.with_parameters(scene, {"obstacle.0.force": jnp.array([0.0, 0.0, -force])})
         result = run(own).check()
         found = lj.obstacle_forces(own, result).force[0, -1, 2]
-        # Hardness times the roundoff of positions: some 1e4 N/m and 2e-18 m here.
+        # Contact stiffness times the rounding of positions: about 1e4 N/m and 2e-18 m here.
         assert abs(float(found) / force - 1) < 1e-6
 
 
 def test_derivatives_where_a_surface_just_touches():
-    """A minimum has half the derivative at 0, all or none where the distance is rounded: 45 times too large."""
+    """A minimum has half of the derivative at 0, and all or none of it if the distance is rounded. The derivative was
+    45 times too large.
+    """
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (2, 2, 2))
     top = jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_max"]))
     place = {"position": jnp.array([0.0, 0.0, SIDE]), "axis": jnp.array([0.0, 0.0, -1.0])}
@@ -225,7 +231,9 @@ def test_derivatives_where_a_surface_just_touches():
 
 @pytest.mark.parametrize("shape", ["plane", "sphere"])
 def test_the_travel_of_a_pressed_obstacle_has_second_derivatives(shape):
-    """One Newton step from the place gives first derivatives only; the second were 12 times too large for a sphere."""
+    """One Newton step from the solution gives first derivatives only. The second ones were 12 times too large for a
+    sphere.
+    """
     scene = cube(
         lambda top: (
             plane(top, force=jnp.array([0.0, 0.0, -0.1]), stiffness=1e6)
@@ -244,7 +252,7 @@ def test_the_travel_of_a_pressed_obstacle_has_second_derivatives(shape):
     first, second = jax.jit(jax.jacfwd(travel)), jax.jit(jax.jacfwd(jax.jacfwd(travel)))
     away = [float(first(v + k * h)) for k in (-2, -1, 1, 2)]
     exact = (8 * (away[2] - away[1]) - (away[3] - away[0])) / (12 * h)
-    # Fourth order in h / v, and the roundoff of the first derivative over h.
+    # Fourth order in h / v, and rounding of the first derivative over h.
     assert float(second(v)) == pytest.approx(exact, rel=1e-5, abs=1e-9 * abs(away[0]) / h)
-    if shape == "plane":  # at no load the plane just touches: 1 / (sum of the stiffness of its points)
+    if shape == "plane":  # without a load the plane just touches: 1 / (sum of the stiffness of its points)
         assert float(first(0.0)) == pytest.approx(away[0], rel=1e-9)

@@ -1,4 +1,4 @@
-"""Compiled programs kept on disk: who has them, the same bits, broken entries, the bound on the size."""
+"""Compiled programs kept on disk: which runs use them, equal bits, broken entries, limit of the size."""
 
 import argparse
 import importlib
@@ -23,7 +23,7 @@ from liverjax.core.compiled import _found, compiled
 from liverjax.core.struct import replace
 from liverjax.elements import mjed
 
-#: A program that takes longer to compile than to find, in a process as a command has it; its numbers are printed.
+#: A program that takes longer to compile than to find, in a process like that of a command. It prints its results.
 WORK = """
 import jax, jax.numpy as jnp
 import liverjax
@@ -37,7 +37,7 @@ with kept_on_disk():
 
 @pytest.fixture
 def switched(monkeypatch, tmp_path) -> Path:
-    """The folder that `LIVERJAX_CACHE` names; what JAX was told before comes back afterwards."""
+    """Set the folder that `LIVERJAX_CACHE` names. JAX's earlier settings are restored afterwards."""
     before = {name: getattr(jax.config, name) for name in CONFIGURED}
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     monkeypatch.setenv(program_cache.SWITCH, str(tmp_path / "kept"))
@@ -50,7 +50,7 @@ CONFIGURED = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_tim
 
 
 def _started(command: list[str], cache: str | Path) -> subprocess.Popen:
-    """A process of its own, without the folder that these tests give to JAX."""
+    """Start a separate process, without the cache folder that these tests give to JAX."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_COMPILATION", "JAX_PERSISTENT"))}
     return subprocess.Popen(
         [sys.executable, "-W", "error", *command],
@@ -63,7 +63,7 @@ def _started(command: list[str], cache: str | Path) -> subprocess.Popen:
 
 
 def _ended(process: subprocess.Popen) -> str:
-    """What a process printed, if it ended well and without a word on standard error."""
+    """Return what a process printed, after a check of its exit code and of an empty standard error."""
     out, said = process.communicate()
     assert process.returncode == 0 and said == "", said
     return out
@@ -74,17 +74,17 @@ def _entries(cache: Path) -> list[Path]:
 
 
 def test_a_second_process_finds_the_programs_and_the_same_bits(tmp_path):
-    """Two that compile at once, one that reads, one that finds every entry spoilt; no word on standard error."""
+    """Two processes compile at once, one reads, and one finds every entry spoiled. None writes to standard error."""
     cache = tmp_path / "kept"
     both = [_started(["-c", WORK], cache) for _ in range(2)]
     compiled, other = (_ended(process) for process in both)
     before = {entry: (entry.stat().st_mtime_ns, entry.read_bytes()) for entry in _entries(cache)}
     assert compiled == other and any("jit_work" in entry.name for entry in before)
     assert _ended(_started(["-c", WORK], cache)) == compiled
-    # A busy machine may keep a small program more, that took long.
+    # A busy machine may keep one more small program, because its compilation took long.
     assert before == {entry: (entry.stat().st_mtime_ns, entry.read_bytes()) for entry in before}
     for entry in before:
-        entry.write_bytes(before[entry][1][:40])  # as a kill in the middle of writing leaves it
+        entry.write_bytes(before[entry][1][:40])  # as a kill during writing leaves it
     assert _ended(_started(["-c", WORK], cache)) == compiled
     work = next(entry for entry in before if "jit_work" in entry.name)
     assert len(work.read_bytes()) > 0.9 * len(before[work][1])  # replaced: the next process finds it
@@ -162,7 +162,7 @@ def test_what_was_longest_not_used_goes_first(tmp_path):
         folders[k % 2].mkdir(exist_ok=True)
         entry = folders[k % 2] / f"jit_f-{k}-cache"
         entry.write_bytes(bytes(100))
-        os.utime(entry, (1000 - k, 500))  # the first was read last
+        os.utime(entry, (1000 - k, 500))  # the first entry was read last
     mine = tmp_path / "old" / "notes.txt"
     mine.write_text("mine")
     program_cache.bound(tmp_path, 350)
@@ -174,7 +174,7 @@ def test_what_was_longest_not_used_goes_first(tmp_path):
 
 @pytest.fixture
 def cube():
-    """A mesh, a law and positions."""
+    """Return a mesh, a law and positions."""
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
     return mesh, lj.laws.typical("neo_hookean"), 1.1 * mesh.points
 
@@ -200,10 +200,10 @@ def test_a_whole_program_is_found_without_being_traced(processor, switched, cube
         harder = replace(law, mu=2 * law.mu)
         expected = mjed.energy(mesh, harder, x)
         assert np.isclose(compiled(mjed.energy, mesh, harder, x)(mesh, harder, x), expected, rtol=1e-14)
-        assert _whole(switched) == [file]  # other numbers: the same program
+        assert _whole(switched) == [file]  # other values use the same program
         file.write_bytes(content[:100])
         assert compiled(mjed.energy, mesh, law, x)(mesh, law, x).tobytes() == first.tobytes()
-        assert len(file.read_bytes()) > 0.9 * len(content)  # replaced
+        assert len(file.read_bytes()) > 0.9 * len(content)  # the entry is replaced
     assert program_cache.folder() is None
 
 
@@ -218,7 +218,7 @@ def test_what_decides_a_program_is_in_its_name(switched, cube, monkeypatch):
     names.append(compiled_module._key(partial(mjed.energy, terms="chapter"), (mesh, law, x)))
     names += [compiled_module._key(partial(mjed.energy, one=f), (mesh, law, x)) for f in (mjed.energy, exit_code)]
     names.append(compiled_module._key(mjed.energy, (mesh, law, x), {"xla_cpu_use_fusion_emitters": False}))
-    with pytest.raises(compiled_module._Unknown):  # what a function made in another holds, no source tells
+    with pytest.raises(compiled_module._Unknown):  # the values in a closure are not visible in its source
         compiled_module._key(partial(mjed.energy, one=lambda: mesh), (mesh, law, x))
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
     names.append(compiled_module._key(mjed.energy, (mesh, law, x)))
@@ -227,7 +227,7 @@ def test_what_decides_a_program_is_in_its_name(switched, cube, monkeypatch):
 
 @lj.struct
 class Mine(lj.Law):
-    """W = mu/2 (Ibar1 - 3), in a file that no digest holds."""
+    """W = mu/2 (Ibar1 - 3), in a file that no digest contains."""
 
     mu: float = lj.param("Pa")
     bulk: float = lj.param("Pa")
@@ -246,7 +246,7 @@ def test_a_law_of_ones_own_is_compiled_as_it_is_now(switched, cube):
         assert not _whole(switched)
 
 
-#: A program that calls LAPACK, whose addresses JAX gives to XLA when it lowers a factorisation.
+#: A program that calls LAPACK. JAX gives LAPACK's addresses to XLA when it lowers a factorisation.
 FACTORISES = """
 import jax.numpy as jnp, liverjax
 from fitting.methods.least_squares import accept, begin

@@ -1,4 +1,4 @@
-"""Quadratic tetrahedra: the same physics at their points, exact where they must be, of the order they promise."""
+"""Quadratic tetrahedra: the same physics at their points, exact cases, and orders of convergence."""
 
 import itertools
 from math import factorial
@@ -34,7 +34,7 @@ LAW = lj.laws.NeoHookean(mu=800.0, bulk=4000.0)
 
 
 def crooked(cells=(2, 1, 1), size=(0.02, 0.01, 0.01)) -> lj.TetMesh:
-    """A box whose inner nodes stand askew."""
+    """A box with displaced inner nodes."""
     box = lj.shapes.box(size, cells)
     inside = np.setdiff1d(np.arange(box.number_of_nodes), lj.boundary.boundary_triangles(box))
     shift = np.zeros(box.points.shape)
@@ -70,13 +70,13 @@ def test_terms_at_points_are_derivatives_of_the_energy(name):
 
 
 def test_terms_of_stretches_at_points_are_differences_of_the_energy():
-    """The quick form of the former for a law of principal stretches, whose second derivatives take long to compile."""
+    """A fast variant of the test before, for a law of principal stretches, whose second derivatives compile slowly."""
     law = lj.laws.typical("ogden")
     v, h = np.random.default_rng(4).standard_normal(X.shape), 1e-7
     ends = [X + h * v, X - h * v]
     energies, forces = ([f(MESH, law, x) for x in ends] for f in (lj.mjed.energy, lj.mjed.internal_force))
     force, K = lj.mjed.internal_force(MESH, law, X), lj.mjed.stiffness_matrix(MESH, law, X)
-    # Strains of 1e-5: truncation is their square, roundoff 1e-16 over them.
+    # With strains of 1e-5, truncation is their square, and rounding is 1e-16 over them.
     assert abs((energies[0] - energies[1]) / (2 * h) / jnp.vdot(force, v) - 1) < 1e-7
     slope = (forces[0] - forces[1]).ravel() / (2 * h)
     assert np.abs(K @ v.ravel() - slope).max() < 1e-7 * np.abs(slope).max()
@@ -123,7 +123,7 @@ def test_an_affine_motion_of_the_surface_moves_the_inside_alike():
 def test_shares_of_mass_and_weight():
     assert np.isclose(nodal_volumes(MESH).sum(), MESH.volumes.sum(), rtol=1e-14) and nodal_volumes(MESH).min() > 0
     assert np.isclose(load_volumes(MESH).sum(), MESH.volumes.sum(), rtol=1e-14)
-    # Centre of gravity: exact for functions of degree 2.
+    # The centre of gravity is exact for functions of degree 2.
     one = lj.quadratic(lj.tet_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]]))
     assert np.allclose(load_volumes(one) @ one.points, 1 / 24, rtol=1e-14)
     assert np.allclose(load_volumes(one) @ one.points**2, 1 / 60, rtol=1e-14)
@@ -135,14 +135,16 @@ def test_pressure_on_a_closed_surface_holds_itself():
     force = lj.boundary.follower_forces(load, X, MESH)
     assert np.abs(force.sum(axis=0)).max() < 1e-12 * np.abs(force).sum()
     assert np.abs(jnp.cross(X, force).sum(axis=0)).max() < 1e-12 * np.abs(force).sum()
-    # The virtual work of a swelling x -> (1 + t) x is 3 p V of the moved body, whose surface is curved.
+    # The virtual work of a swelling x -> (1 + t) x is 3 p V of the deformed body, whose surface is curved.
     J = determinant(deformation_gradient(lj.quadratic(crooked()), X))
     swelling = -float(jnp.vdot(force, X)) / 3.0
     assert abs(swelling / (3 * float(jnp.sum(MESH.weights * J))) - 1) < 2e-3
 
 
 def harmonic(points: np.ndarray) -> np.ndarray:
-    """grad of exp(a x) sin(a y) + z (x^2 - y^2) a^2: no divergence, no curl, so in balance for every linear solid."""
+    """Return grad of exp(a x) sin(a y) + z (x^2 - y^2) a^2. It has no divergence and no curl, so every linear solid is
+    in equilibrium.
+    """
     a, (x, y, z) = 100.0, points.T
     return 1e-7 * np.stack(
         [
@@ -155,7 +157,7 @@ def harmonic(points: np.ndarray) -> np.ndarray:
 
 
 def _errors(order: int, n: int) -> tuple[float, float]:
-    """Root mean squares, over the points of a fine rule, of the error of displacements [m] and of F."""
+    """Return root mean square errors of displacements [m] and of F at the points of a fine integration rule."""
     box = lj.shapes.box((0.01, 0.01, 0.01), (n, n, n))
     mesh = lj.quadratic(box) if order == 2 else box
     X = np.asarray(mesh.points)
@@ -193,7 +195,7 @@ def _harmonic(p):
 def test_observed_orders_of_a_smooth_solution(order, cells, verified):
     (u1, F1), (u2, F2) = (_errors(order, n) for n in cells)
     displacement, strain = np.log2(u1 / u2), np.log2(F1 / F2)
-    # One order more of displacements than of strains and stresses; coarse meshes are a tenth or two off.
+    # Displacements have one order more than strains and stresses. On coarse meshes the order differs by 0.1 or 0.2.
     assert abs(displacement - (order + 1)) < 0.25 and abs(strain - order) < 0.25
     verified(f"smooth field, order {order}", "analytic", u2, u1, order=displacement)
 
@@ -220,7 +222,9 @@ def test_a_curved_file_is_made_straight_and_said(tmp_path):
 
 
 def test_middles_in_another_order_are_refused(tmp_path):
-    """Gmsh numbers the last two edges the other way round than VTK: 48 "curved" middles were reported."""
+    """Gmsh and VTK number the last two edges in opposite order. Without a check, 48 "curved" middle nodes were
+    reported.
+    """
     lj.write_mesh(tmp_path / "body.vtu", MESH)
     data = meshio.read(tmp_path / "body.vtu")
     data.cells[0].data[:, [8, 9]] = data.cells[0].data[:, [9, 8]]
@@ -237,7 +241,7 @@ def test_a_scene_file_asks_for_the_order(tmp_path):
     with pytest.raises(lj.InputError, match=r"\[mesh\] order = 3 is not known: use 1"):
         lj.scenes.scene_file.scene_from(content | {"mesh": table | {"order": 3}})
     lj.write_mesh(tmp_path / "body.vtu", MESH)
-    with pytest.raises(lj.InputError, match="order = 1, but the file holds quadratic"):
+    with pytest.raises(lj.InputError, match="order = 1, but the file contains quadratic"):
         lj.scenes.scene_file.scene_from(content | {"mesh": {"file": str(tmp_path / "body.vtu"), "order": 1}})
 
 
@@ -250,7 +254,7 @@ def test_held_faces_hold_the_middles_of_their_edges_and_pairs_do_not():
 
 @pytest.mark.parametrize("cells", [(2, 2, 2), (2, 3, 5), (3, 2, 1)])
 def test_middles_of_several_held_sides_lie_on_these_sides(cells):
-    """Between two sides that meet there are faces with a vertex on each: they were held too."""
+    """Where two sides meet there are faces with a vertex on each. Their middle nodes were fixed too."""
     box = lj.shapes.box((1.0, 2.0, 3.0), cells)
     points = np.asarray(lj.quadratic(box).points)
     sides = {name: (k // 2, (0.0, (1.0, 2.0, 3.0)[k // 2])[k % 2]) for k, name in enumerate(box.node_sets)}
@@ -261,7 +265,7 @@ def test_middles_of_several_held_sides_lie_on_these_sides(cells):
             on_sides = [points[:, axis] == place for axis, place in (sides[name] for name in names)]
             expected = set(np.flatnonzero(np.any(on_sides, axis=0)))
             found = set(promotion.of_faces(box, held))
-            if 1 in cells:  # no vertex is inside: it may be a held part of the body
+            if 1 in cells:  # without inner vertices, this may be a fixed part of the body
                 assert expected <= found
             else:
                 assert found == expected, names
@@ -270,7 +274,7 @@ def test_middles_of_several_held_sides_lie_on_these_sides(cells):
 @pytest.mark.parametrize("cells", [(4, 4, 1), (4, 4, 2)])
 @pytest.mark.parametrize("thick", [False, True])
 def test_a_held_part_of_a_plate_holds_the_middles_within_it(cells, thick):
-    """In a plate one element thick, no vertex tells a plane inside the body from two held sides."""
+    """In a plate one element thick, vertices cannot distinguish an inner plane from two fixed sides."""
     plate = lj.shapes.box((0.1, 0.1, 0.02), cells)
     points = np.asarray(lj.quadratic(plate).points)
 
@@ -282,7 +286,7 @@ def test_a_held_part_of_a_plate_holds_the_middles_within_it(cells, thick):
 
 
 def test_all_faces_of_a_coarse_surface_are_held():
-    """No two of the faces of an octahedron have nearly the same direction."""
+    """No two faces of an octahedron have nearly the same direction."""
     corners = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     faces = [[1, 2, 3], [2, 4, 3], [4, 5, 3], [5, 1, 3], [2, 1, 6], [4, 2, 6], [5, 4, 6], [1, 5, 6]]
     octahedron = lj.tet_mesh(corners, np.array([[0, *face] for face in faces]))
@@ -362,7 +366,7 @@ FEATURES = (
 @pytest.mark.slow
 @pytest.mark.parametrize("feature", sorted(FEATURES))
 def test_every_feature_runs_on_both_orders(feature):
-    """Both converge, and what they show differs by less than the linear mesh's error."""
+    """Both orders converge, and their results differ by less than the mesh error of linear elements."""
     linear = crooked()
     shown = []
     for mesh in (linear, lj.quadratic(linear)):
@@ -400,7 +404,7 @@ def test_the_tangent_is_the_derivative_of_the_forces(feature):
         return tangent.product(e, K, exactly=True)(v), jax.jvp(lambda q: residual(e, q, one)[0], (q,), (v,))[1]
 
     product, exact = both(q, v)
-    # A sponge's pressure is solved for to a hundredth of the tolerance.
+    # The pressure of a porous body is solved to a hundredth of the tolerance.
     allowed = 1e-8 if feature == "porous" else 1e-12
     assert np.abs(product - exact).max() < allowed * np.abs(exact).max()
 
@@ -451,7 +455,7 @@ def test_runs_in_parts_batches_and_inverted_starts():
     first, state = simulate_part(scene, initial_state(scene), 1.0, 2)
     second, _ = simulate_part(scene, state, 3.0, 2)
     parts = np.concatenate([first.positions, second.positions])
-    # Each part begins with a tangent of its own: the same to the tolerance of a step, 1e-8 of the forces.
+    # Each part begins with a new tangent. The results agree up to the tolerance of a step, 1e-8 of the forces.
     assert np.abs(parts - whole.positions).max() < 1e-6 * np.abs(whole.positions - mesh.points[None]).max()
     batch = lj.simulate_batch(scene, {"law.mu": jnp.array([800.0, 900.0])})
     assert np.abs(batch.result.positions[0] - whole.positions).max() < 1e-6 * 0.01

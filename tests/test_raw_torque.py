@@ -1,4 +1,4 @@
-"""The instrument's inertia from raw torque: synthetic instruments, and measured files whose inertia is known."""
+"""The instrument's inertia from the raw torque: synthetic instruments, and measured files with known inertia."""
 
 import re
 
@@ -16,7 +16,9 @@ G = 5000 * (1j * OMEGA) ** 0.1
 
 
 def export(path, inertia=INERTIA, sample=True, phase=True, theta=1e-3):
-    """A synthetic export as TRIOS writes it; the equation of motion of a plate is the witness."""
+    """Write a synthetic export in the format of TRIOS. Its raw torque follows from the equation of motion of a
+    plate.
+    """
     M = (K * G - inertia * OMEGA**2) * theta
     columns = {
         ("Angular frequency", "rad/s"): OMEGA,
@@ -63,12 +65,12 @@ def test_an_empty_cell_takes_one_point_away_and_not_the_column(lines, tmp_path):
         without_inertia(s, RADIUS, HEIGHT) for s in (export(tmp_path / "e.txt", sample=False), read_sweep(path))
     )
     assert f"{len(lines)} of 20 points have an empty cell in the raw columns" in kept.notes[0]
-    assert "the raw torque shows" in kept.notes[0]  # not the phase alone
+    assert "the raw torque shows" in kept.notes[0]  # not only the phase
     assert np.allclose(kept.inertia, whole.inertia, rtol=1e-6) and len(kept.grey) == len(whole.grey)
 
 
 def test_the_phase_alone_tells_the_share_of_the_instrument(tmp_path):
-    """Neither torque nor size: I omega^2 / K = G' - G'' / tan(phase)."""
+    """Torque and displacement are not needed: I omega^2 / K = G' - G'' / tan(phase)."""
     s = export(tmp_path / "p.txt", sample=False)
     only = s._replace(raw={"phase": s.raw["phase"]})
     for given in (s, only):
@@ -76,7 +78,7 @@ def test_the_phase_alone_tells_the_share_of_the_instrument(tmp_path):
         lost = np.abs(G) < 0.03 * INERTIA * OMEGA**2 / K
         assert np.allclose(kept.angular_frequency, OMEGA[~lost]) and "raw phase shows" in kept.notes[0]
         assert np.allclose(kept.inertia, INERTIA * OMEGA[~lost] ** 2 / K, rtol=1e-6)
-    # A phase that is that of the sample says that nothing was subtracted.
+    # If the phase is that of the sample, nothing was subtracted.
     plain = only._replace(raw={"phase": np.angle(G)})
     assert without_inertia(plain) is plain
 
@@ -92,7 +94,7 @@ def test_what_is_not_told_changes_nothing(tmp_path):
 def test_phases_written_as_lags_are_turned(tmp_path):
     s = export(tmp_path / "l.txt", sample=False)
     turned = without_inertia(s._replace(raw={"phase": -s.raw["phase"]}))
-    assert "their sign is turned" in turned.notes[0]
+    assert "their sign is changed" in turned.notes[0]
     assert np.allclose(turned.inertia, without_inertia(s).inertia, rtol=1e-9)
 
 
@@ -119,7 +121,7 @@ def test_ten_measured_sweeps_have_one_inertia():
     for file in files:
         gap = float(re.search(r"gap after preload ([\d.]+) um", file.read_text())[1]) * 1e-6
         s = without_inertia(read_sweep(file), 0.004, gap)
-        # 22.47 uN m s^2 in all ten, and 2 to 5 points of 31 that are the instrument's
+        # 22.47 uN m s^2 in all ten files, and 2 to 5 of 31 points are affected by the instrument
         assert float(re.search(r"inertia of ([\d.]+) uN", s.notes[0])[1]) == pytest.approx(22.47, abs=0.02)
         assert 2 <= len(s.grey) <= 5
 

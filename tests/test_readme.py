@@ -1,4 +1,4 @@
-"""What the front page and the guides print is what the code does."""
+"""The examples and outputs on the front page and in the guides agree with the code."""
 
 import argparse
 import importlib.util
@@ -24,7 +24,7 @@ from liverjax.scenes.scene_file import scene_from
 pytestmark = pytest.mark.quick_to_compile
 
 GUIDES = {name: ROOT / name for name in ("README.md", "fitting/README.md", "liverjax/README.md")}
-#: What the pieces of scene files in the guides are pieces of.
+#: The rest of the scene, for scene fragments in the guides.
 BODY = """
 [mesh]
 shape = "box"
@@ -47,9 +47,9 @@ by = [0.002, 0.0, 0.0]
 
 
 def blocks(language: str) -> list:
-    """Examples of the three pages in one language, by page and number."""
+    """Return the examples of the three pages in one language, by page and number."""
     fence = re.compile(rf"^```{language}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-    # Other tests have quicker cases of the same.
+    # Other tests have faster cases of these functions.
     long = ("joint.fit", "lj.reduce_scene", "lj.separate", "lj.value_and_gradient")
     found = [
         pytest.param(block, id=f"{name}-{k}", marks=[pytest.mark.slow] if any(one in block for one in long) else [])
@@ -73,7 +73,9 @@ def test_numbers_come_from_the_experiments(page):
 
 
 def test_what_the_claim_on_porosity_takes_is_told_from_both_sides():
-    """K0 from 800 Pa, a permeability of 1e-6 or less; neither K_lim nor the rate at any value tried."""
+    """The claim holds for K0 from 800 Pa, or a permeability of 1e-6 or less. It fails for all tested K_lim and
+    rates.
+    """
     varied = {"bulk": {800.0: 0.9, 1600.0: 0.8}, "limit_bulk": {8800.0: 1.1}, "permeability": {0.0: 0.7, 1e-6: 0.9}}
     varied |= {"ramp_s": {3.0: 1.2}, "keep_bulk": {True: 1.0}, "Table 2": {None: 1.1}}
     rows = [{"varied": n, "value": v, "ratio": r} for n, found in varied.items() for v, r in found.items()]
@@ -91,7 +93,9 @@ def test_what_the_claim_on_porosity_takes_is_told_from_both_sides():
 
 @pytest.mark.parametrize("block", blocks("python"))
 def test_examples_run_as_printed(block, monkeypatch, capsys):
-    """With nothing but their own imports, as users have them; here, for a process of its own imports JAX anew."""
+    """Each example runs with its own imports only, as for users. It runs in this process, because a new one imports JAX
+    again.
+    """
     monkeypatch.chdir(ROOT)
     with warnings.catch_warnings(), jax.numpy_rank_promotion("allow"):
         warnings.simplefilter("default")
@@ -134,12 +138,12 @@ def test_scene_files_run_as_printed(block):
 
 
 class Parsed(Exception):
-    """The parser took the line."""
+    """Raised when the parser has accepted the command line."""
 
 
 @pytest.mark.parametrize("block", blocks("sh"))
 def test_command_lines_are_parsed(block, monkeypatch):
-    """Options and choices are known; files that are not in capitals exist."""
+    """Options and choices are known, and files whose names are not in capitals exist."""
     parse = argparse.ArgumentParser.parse_args
 
     def stop(self, arguments=None, namespace=None):

@@ -1,4 +1,4 @@
-"""Reduced models: the full model in other coordinates, their structure, their error, and what they refuse."""
+"""Reduced models: the full model in other coordinates, their structure, their error, and unsupported scenes."""
 
 import h5py
 import jax
@@ -23,7 +23,7 @@ MOVING = lj.Solve(kind="dynamic", integrator="newmark", dt=0.05, steps=3)
 
 
 def _bar(cells: tuple, order: int = 1, **changes) -> lj.Scene:
-    """A bar of 3 x 1 x 1 cm held at x = 0 under its weight."""
+    """A bar of 3 x 1 x 1 cm fixed at x = 0 under its weight."""
     mesh = lj.shapes.box([0.03, 0.01, 0.01], list(cells))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     held = jnp.asarray(lj.boundary.select(mesh, {"x_max": 0.0}, None, "fixed"))
@@ -35,7 +35,7 @@ def _bar(cells: tuple, order: int = 1, **changes) -> lj.Scene:
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_all_motions_and_all_points_are_the_full_model(order):
-    # Another path to the same numbers: Newton's method on dense matrices, memory and inertia of coordinates.
+    # The reduced model computes the same numbers in another way: dense matrices, memory and inertia of coordinates.
     scene = _bar((1, 1, 1), order, viscosity=PRONY, solve=MOVING)
     moves_as_full(scene)
 
@@ -53,7 +53,7 @@ def test_prescribed_motion_and_histories_are_those_of_the_full_model():
 
 @pytest.mark.slow
 def test_a_body_that_is_only_moved_converges():
-    # No load: at the solution the forces of the points cancel, and their sum is no size to compare with.
+    # Without a load the forces of the points cancel at the solution, so their sum is no scale for a comparison.
     scene = replace(_bar((2, 1, 1)), body=None)
     end = jnp.asarray(lj.boundary.select(scene.mesh, {"x_min": 0.03}, None, "displaced"))
     scene = replace(scene, displaced=(lj.Displaced(nodes=end, by=jnp.array([0.003, 0.0, 0.002])),))
@@ -64,19 +64,19 @@ def test_a_body_that_is_only_moved_converges():
     assert np.abs(x - lj.simulate(scene).check().positions).max() < 1e-5 * 0.003
 
 
-#: Numbers between and beyond those of the training.
+#: Values between and beyond those of the training.
 UNSEEN = {"law.mu": [850.0, 640.0], "body.gravity": [[0.5, -1.0, -4.0], [0.0, 3.0, 2.0]]}
 
 
 @pytest.fixture(scope="module")
 def trained() -> tuple:
-    """A viscous bar in motion, its reduced model of few rows, and positions of full runs with other numbers."""
+    """A viscous bar in motion, its reduced model of few runs, and positions of full runs with other values."""
     scene = _bar((4, 1, 1), viscosity=PRONY, solve=MOVING)
     rng = np.random.default_rng(1)
     down = rng.uniform(-5.0, -2.0, 8)
     gravity = np.stack([rng.uniform(-2, 2, 8), rng.uniform(-2, 2, 8), down], axis=1)
     rows = {"law.mu": rng.uniform(700.0, 1000.0, 8), "body.gravity": gravity}
-    # Full runs with other numbers are of the training's batch: they share its program.
+    # Full runs with other values are in the batch of the training, so they share its program.
     numbers = {name: np.concatenate([value, UNSEEN[name]]) for name, value in rows.items()}
     batch = lj.simulate_batch(scene, numbers)
     with pytest.MonkeyPatch.context() as patch:
@@ -89,19 +89,19 @@ def trained() -> tuple:
 
 @pytest.mark.parametrize("runs", [1, 8, MOST_STATES // 2 + 1, 3 * MOST_STATES])
 def test_states_of_all_times_are_sampled(runs):
-    """With many runs each gives few states: they are of all times, not of the first step."""
+    """With many runs each gives few states. These are from all times, not only from the first step."""
     found = states_of(runs, 24)
     times = np.concatenate([times for _, times in found])
     assert len(times) <= MOST_STATES and times.min() >= 0 and times.max() < 24
     assert len({r for r, _ in found}) == min(runs, MOST_STATES)
     thirds = np.bincount(times // 8, minlength=3) / len(times)
-    assert np.all(thirds > 0.25)  # a third each, but for the few that the ends cut
+    assert np.all(thirds > 0.25)  # a third each, apart from a few at the ends
 
 
 def test_the_reduced_force_is_the_gradient_of_the_reduced_energy(trained):
     scene, model, *_ = trained
     assert np.all(np.asarray(model.weights) > 0) and len(model.points) < scene.mesh.weights.size
-    # Volume is kept by a row of the least squares.
+    # One row of the least squares keeps the volume.
     assert float(model.weights.sum()) == pytest.approx(float(scene.mesh.volumes.sum()), rel=1e-6)
     law = solid_at_points(model, scene).law
     rest = jnp.eye(3).reshape(9, 1)
@@ -110,7 +110,7 @@ def test_the_reduced_force_is_the_gradient_of_the_reduced_energy(trained):
         F = as_matrix(rest + model.slopes @ q)
         return jnp.sum(model.weights * law.strain_energy(law.measures(F)))
 
-    # A static step with no load but this force ends at q: the force of the run is the derivative of this energy.
+    # A static step with only this force ends at q, so the force of the run is the derivative of this energy.
     static = replace(scene, viscosity=None, solve=lj.Solve())
     own = replace(model, identity=lj.reduced_identity(static))
     q = lj.simulate_reduced(own, static).coordinates[-1]
@@ -138,7 +138,8 @@ def test_an_inverse_follows_the_forces_and_stays_symmetric_and_positive():
     inverse, stiffness = np.eye(6), half @ half.T + np.eye(6)
     change = stiffness @ moved
     found = np.asarray(_updated(jnp.asarray(inverse), jnp.asarray(moved), jnp.asarray(change)))
-    # The secant condition, to roundoff; Dennis, Schnabel 1983, theorem 9.2.1: positive where work is.
+    # The secant condition holds up to rounding. The update is positive for positive work (Dennis, Schnabel 1983,
+    # theorem 9.2.1).
     assert np.allclose(found @ change, moved, rtol=0, atol=1e-12 * np.abs(moved).max())
     assert np.array_equal(found, found.T) and np.linalg.eigvalsh(found)[0] > 0
     assert np.array_equal(_updated(jnp.asarray(inverse), jnp.asarray(moved), -jnp.asarray(change)), inverse)
@@ -147,7 +148,7 @@ def test_an_inverse_follows_the_forces_and_stays_symmetric_and_positive():
 
 @pytest.mark.parametrize("small", [1e-1, 1e-9])
 def test_solves_are_exact_though_the_inverse_is_near(small):
-    """Also where the matrix has so small an eigenvalue that single precision loses it."""
+    """This holds also if single precision loses a small eigenvalue of the matrix."""
     rng, n, S = np.random.default_rng(2), 8, 20
     half, slopes = rng.normal(size=(9, 9, S)), rng.normal(size=(9, S, n))
     slopes[..., -1] = slopes[..., 0] + np.sqrt(small) * slopes[..., -1]
@@ -160,7 +161,7 @@ def test_solves_are_exact_though_the_inverse_is_near(small):
 
     (x, K), (change, _) = jax.jit(lambda one: jax.jvp(both, (one,), (one,)))(jnp.ones(()))
     exact = np.linalg.solve(K, b)
-    # Roundoff times the condition number, some thousands over the small number.
+    # Rounding times the condition number, which is some thousands over the small number.
     limit = 1e-12 / small * np.abs(exact).max()
     assert np.allclose(x, exact, rtol=0, atol=limit)
     assert np.allclose(change, -exact, rtol=0, atol=limit)
@@ -170,7 +171,7 @@ def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained)
     scene, model, *_ = trained
     whole, mu = with_all_points(scene, model.modes), 800.0
     q = lj.simulate_reduced(model, scene).coordinates
-    # Mirrored elements, of which this law has no force, and a body that has not moved.
+    # Mirrored elements, for which this law has no force, and a body that has not moved.
     bad = jnp.stack([jnp.zeros_like(q[0]), -1e3 * q[1], 1e3 * q[2]])
     alone = sampled(whole, scene, {"law.mu": np.array([mu])}, Coordinates(q[None], None), 1e-3)
     both = Coordinates(jnp.stack([q, bad]), None)
@@ -188,14 +189,15 @@ def test_the_error_is_stated(trained):
             found = lj.simulate_reduced(m, own)
             error = lj.reduced_error(m, own, found).error
             true = np.linalg.norm(lj.reduced_positions(m, own, found) - full, axis=-1).max(axis=1)
-            assert true.max() > 1e-6  # five modes are not the answer: there is an error to state
+            assert true.max() > 1e-6  # five modes are not exact, so there is an error
             assert np.all(true < 2 * error)
-            # The second row is far beyond the training, where a correction leads astray: its error may be overstated.
+            # The second run is far outside the training range, where the correction is wrong. Its error may be
+            # overestimated.
             assert np.all(error < (2 if m is bare or mu == 850.0 else 5) * true)
 
 
 def _missing(q: np.ndarray, fields: np.ndarray) -> np.ndarray:
-    """A polynomial of degree two in coordinates and their rates, dt = 0.1."""
+    """Return a polynomial of degree two in coordinates and their rates, dt = 0.1."""
     rates = np.diff(q, axis=1, prepend=0.0) / 0.1
     parts = np.stack([0.3 * q[..., 0] - 0.1 * q[..., 2], 2.0 * q[..., 0] * q[..., 1] - 0.01 * rates[..., 1]], axis=-1)
     return np.tensordot(parts, fields, axes=1)
@@ -209,11 +211,11 @@ def test_a_polynomial_of_the_coordinates_is_learnt():
     found = learnt_correction(Learnt(q, _missing(q, fields), moved, volumes, 0.1))
     assert found is not None and found.products > 0
     for own, exact in zip(new, _missing(new, fields), strict=True):
-        # The ridge of 1e-6 leaves out about as much.
+        # The ridge of 1e-6 causes an error of about this size.
         assert np.abs(correction_at(found, jnp.asarray(own), 0.1) - exact).max() < 1e-4 * np.abs(exact).max()
         assert float(stated_at(found, jnp.asarray(own), jnp.asarray(exact), 0.1).max()) < 1e-3 * np.abs(exact).max()
     noise = rng.normal(size=(40, 6, 7, 3))
-    # What no coordinate tells is not corrected, nor what few runs show.
+    # Noise that does not depend on the coordinates is not corrected, nor what only a few runs show.
     assert learnt_correction(Learnt(q, noise, moved, volumes, 0.1)) is None
     assert learnt_correction(Learnt(q[:5], _missing(q[:5], fields), moved[:5], volumes, 0.1)) is None
 
@@ -224,12 +226,12 @@ def test_differences_count_in_proportion_to_the_motion_of_their_run():
     factors, _ = _least_squares(A, parts, moved, np.arange(20) % 4).without()
     by_motion = moved[:, None, None]
     exact = np.linalg.lstsq((A / by_motion).reshape(100, 4), (parts / by_motion).reshape(100, 3), rcond=None)[0]
-    # The ridge of 1e-6 leaves out about as much.
+    # The ridge of 1e-6 causes an error of about this size.
     assert np.allclose(factors, exact, rtol=0, atol=1e-4 * np.abs(exact).max())
 
 
 def test_stated_errors_are_right_as_often_as_those_of_runs_left_out():
-    """A cubic term, which no polynomial of degree two has, leaves an error to state; runs are of unlike sizes."""
+    """A cubic term is not in a polynomial of degree two, so an error remains. The runs have different amplitudes."""
     rng = np.random.default_rng(4)
     volumes, fields = np.ones(7), rng.normal(size=(1, 7, 3))
     q, new = (rng.uniform(-1.0, 1.0, (n, 6, 2)) * rng.uniform(0.5, 1.0, (n, 1, 1)) for n in (80, 200))
@@ -242,7 +244,7 @@ def test_stated_errors_are_right_as_often_as_those_of_runs_left_out():
     within = lambda ratios: float(np.mean(np.abs(np.log(ratios)) < np.log(2)))  # noqa: E731
     told, seen = within(np.asarray(found.ratios)), within(np.asarray(stated)[:, -1] / true)
     assert told > 0.5
-    # Binomial: of 80 runs left out and of 200 new ones, three standard deviations of both.
+    # Binomial: three standard deviations of both, for 80 runs left out and 200 new ones.
     spread = told * (1 - told) * (1 / 80 + 1 / 200)
     assert abs(seen - told) < 3 * np.sqrt(spread) + 1 / 80
 
@@ -251,7 +253,7 @@ def test_a_body_at_rest_converges_and_has_no_error_to_state(trained):
     scene, model, *_ = trained
     still = lj.with_parameters(scene, {"body.gravity": jnp.zeros(3)})
     found = lj.simulate_reduced(model, still)
-    # Without loads roundoff is all that is left of the forces.
+    # Without loads, only rounding of the forces remains.
     assert not np.any(found.status) and np.all(found.iterations < 5)
     rng = np.random.default_rng(6)
     q, fields = rng.normal(size=(20, 4, 3)), rng.normal(size=(2, 7, 3))
@@ -265,7 +267,9 @@ def test_a_body_at_rest_converges_and_has_no_error_to_state(trained):
 
 @pytest.mark.slow
 def test_rows_of_the_largest_stated_errors_are_run():
-    """Rows drawn near each other, and others far away: those are taken, and what they show is known then."""
+    """Some parameter sets are close to each other, others are far away. The far ones are run, so their range is
+    known.
+    """
     scene = _bar((3, 1, 1), solve=lj.Solve(steps=2))
     rng = np.random.default_rng(5)
     near = np.stack([np.zeros(20), np.zeros(20), rng.uniform(-1.0, -0.5, 20)], axis=1)
@@ -278,7 +282,9 @@ def test_rows_of_the_largest_stated_errors_are_run():
 
 @pytest.mark.slow
 def test_the_bias_of_identified_numbers_is_stated(trained):
-    """Data of a full run with known numbers; the reduced model fits them, and one more full run states how far off."""
+    """The data are a full run with known parameters. The reduced model fits them, and one more full run gives
+    the bias.
+    """
     scene, model, *_ = trained
     model, true = replace(model, correction=None), np.array([800.0, 0.35])
     names = ("law.mu", "viscosity.ratios.0")
@@ -295,7 +301,7 @@ def test_the_bias_of_identified_numbers_is_stated(trained):
         p = p - jnp.linalg.lstsq(J.reshape(-1, 2) * jnp.asarray(true)[None], jnp.ravel(x - data))[0] * true
     bias = lj.reduced_bias(model, scene, dict(zip(names, p, strict=True)), lambda x: x)
     off = np.asarray(p) - true
-    assert np.all(np.abs(off) > 1e-3 * true)  # five modes are too stiff: there is a bias
+    assert np.all(np.abs(off) > 1e-3 * true)  # five modes are too stiff, so there is a bias
     assert np.all(np.abs(off - [float(bias[name]) for name in names]) < 0.2 * np.abs(off))
 
 
@@ -319,7 +325,7 @@ def test_derivatives_and_lanes(trained):
 
 
 def test_errors_are_not_stated_for_numbers_that_no_row_has_shown(trained, tmp_path):
-    """Under a load along another axis the stated error was a hundredth of the true one."""
+    """Under a load along another axis, the stated error was a hundredth of the true one."""
     scene, model, *_ = trained
     q, V = np.random.default_rng(6).normal(size=(12, 6, 3)), len(scene.mesh.points)
     fields = np.ones((2, V, 3)) * np.arange(2)[:, None, None]
@@ -336,21 +342,21 @@ def test_errors_are_not_stated_for_numbers_that_no_row_has_shown(trained, tmp_pa
             lj.stated_error(model, lj.with_parameters(scene, inside | numbers), None)
 
     for value in (high + 0.6 * (high - low), low - 0.6 * (high - low)):
-        refused({"law.mu": value}, "law.mu = .* is far out of its range .* take lj.reduced_error")
-    refused({"body.gravity": np.array([0.0, 9.0, -3.0])}, "body.gravity = .* is far out of its range")
-    refused({"body.density": 2000.0}, "body.density is not that of the model's rows")
-    refused({"viscosity.relaxation_times": 0.1 + PRONY.relaxation_times}, "relaxation_times is not that of the model's")
+        refused({"law.mu": value}, "law.mu = .* is far outside the training range .* use lj.reduced_error")
+    refused({"body.gravity": np.array([0.0, 9.0, -3.0])}, "body.gravity = .* is far outside the training range")
+    refused({"body.density": 2000.0}, "body.density differs from the training")
+    refused({"viscosity.relaxation_times": 0.1 + PRONY.relaxation_times}, "relaxation_times differs from the training")
     own = lj.with_parameters(scene, inside)
     for changed, sentence in (
-        ({"integrator": "euler"}, "solve.integrator = euler and the model's rows have newmark"),
-        ({"steps": 2 * scene.solve.steps}, "solve.dt x solve.steps = .* so nothing is known of the error"),
+        ({"integrator": "euler"}, "solve.integrator = euler, but the reduced model was trained with newmark"),
+        ({"steps": 2 * scene.solve.steps}, "solve.dt x solve.steps = .* so its error is unknown"),
     ):
         with pytest.raises(lj.InputError, match=sentence):
             lj.stated_error(model, replace(own, solve=replace(own.solve, **changed)), None)
     refuse_unseen_numbers(model, replace(own, solve=replace(own.solve, dt=0.5 * own.solve.dt)))
-    with pytest.raises(lj.InputError, match="leave the column solve"):
+    with pytest.raises(lj.InputError, match="remove the column solve"):
         lj.reduce_scene(scene, {"solve.dt": [0.01, 0.02]})
-    # Traced numbers are not known.
+    # Traced values are unknown.
     jax.eval_shape(lambda dt: refuse_unseen_numbers(model, replace(own, solve=replace(own.solve, dt=dt))), own.solve.dt)
     jax.eval_shape(lambda density: refuse_unseen_numbers(model, _heavier(scene, density)), 2000.0)
 
@@ -360,7 +366,7 @@ def _heavier(scene, density):
 
 
 def test_without_the_correction_its_size_is_the_stated_error(trained):
-    """If the correction is right, it is the error of the motion without it."""
+    """If the correction is right, it is the error of the motion without correction."""
     scene, model, *_ = trained
     found, V = lj.simulate_reduced(model, scene), len(scene.mesh.points)
     rng = np.random.default_rng(6)
@@ -394,9 +400,9 @@ def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
     with pytest.raises(lj.InputError, match="was made for scene"):
         porous = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
         lj.simulate_reduced(again, replace(scene, porosity=porous))
-    with pytest.raises(lj.InputError, match="newton = 'one_step' is not for reduced models"):
+    with pytest.raises(lj.InputError, match="newton = 'one_step' does not work in reduced models"):
         lj.simulate_reduced(again, replace(scene, solve=replace(scene.solve, newton="one_step")))
-    with pytest.raises(lj.InputError, match="there is no such reduced model"):
+    with pytest.raises(lj.InputError, match="this file does not exist: make a reduced model"):
         lj.load_reduced(tmp_path / "none.h5")
     with pytest.raises(lj.InputError, match="between 0 and 1"):
         lj.reduce_scene(scene, {"law.mu": [800.0]}, tolerance=2.0)
@@ -430,7 +436,7 @@ def test_foreign_and_damaged_files_are_one_sentence(trained, tmp_path):
         lj.save_reduced(spoiled, tmp_path / "spoiled.h5")
         with pytest.raises(lj.InputError, match=rf"spoiled.h5 is damaged: {sentence}"):
             lj.load_reduced(tmp_path / "spoiled.h5")
-    # A part of a file, as a copy that broke off leaves it.
+    # A part of a file, as an interrupted copy leaves it.
     (tmp_path / "short.h5").write_bytes((tmp_path / "whole.h5").read_bytes()[:3000])
     with pytest.raises(lj.InputError, match="is not a reduced model"):
         lj.load_reduced(tmp_path / "short.h5")
@@ -438,7 +444,7 @@ def test_foreign_and_damaged_files_are_one_sentence(trained, tmp_path):
 
 @pytest.mark.slow
 def test_a_stiff_lesion_is_identified_through_a_reduced_model():
-    """The modulus of a region, from data of a full run: as far off as one more full run states."""
+    """The modulus of a region is identified from a full run. One more full run gives the bias of the result."""
     scene = _bar((4, 2, 2), solve=lj.Solve(steps=2))
     middle = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)].mean(axis=1)
     inside = jnp.asarray(np.flatnonzero(np.abs(middle[:, 0] - 0.01) < 0.005))

@@ -1,4 +1,4 @@
-"""The command that makes and uses a reduced model; refusals in one sentence."""
+"""The command that trains and uses a reduced model; one-line messages for invalid input."""
 
 import argparse
 import inspect
@@ -41,7 +41,7 @@ def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, ca
     (tmp_path / "rows.csv").write_text("law.mu,body.gravity.2\n700,-1.2\n900,-0.8\n800,-0.4\n800,-1.0\n")
     model = ["--out", str(tmp_path / "model.h5")]
     assert main(["reduce", str(tmp_path / "scene.toml"), str(tmp_path / "rows.csv"), *model, "--modes", "3"]) == 0
-    assert "3 modes" in (said := capsys.readouterr().out) and "no correction: too few rows" in said
+    assert "3 modes" in (said := capsys.readouterr().out) and "no correction: too few training runs" in said
     found = {}
     for name, lines in (("full", ""), ("used", 'reduced = "model.h5"'), ("refused", REFUSED)):
         (tmp_path / f"{name}.toml").write_text(SCENE + lines)
@@ -55,9 +55,9 @@ def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, ca
     assert np.array_equal(found["full"][0], found["refused"][0])
     moved = np.abs(found["full"][0] - found["full"][0][0, :1]).max()
     assert 0 < np.abs(found["used"][0] - found["full"][0]).max() < 0.01 * moved
-    # The weight hangs on the held nodes, whichever model: 3 g of tissue.
+    # In both models the fixed nodes carry the weight: 3 g of tissue.
     assert np.allclose(found["full"][1], [0, 0, 3e-3], rtol=0, atol=1e-9)
-    # A run that was stopped there is not thrown away by a reduced one.
+    # A reduced run does not discard an interrupted run in the same folder.
     (tmp_path / "used" / "result.h5.parts").mkdir()
     assert main(["simulate", str(tmp_path / "used.toml"), "--out", str(tmp_path / "used")]) == 2
     assert "holds an unfinished run" in capsys.readouterr().err and (tmp_path / "used" / "result.h5.parts").exists()
@@ -78,12 +78,12 @@ def test_one_row_makes_a_model_without_correction(tmp_path, capsys):
     (tmp_path / "row.csv").write_text("law.mu\n800\n")
     arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path / "model.h5")]
     assert main(["reduce", *arguments]) == 0
-    assert "1 modes" in (said := capsys.readouterr().out) and "no correction: too few rows" in said
+    assert "1 modes" in (said := capsys.readouterr().out) and "no correction: too few training runs" in said
     assert lj.load_reduced(tmp_path / "model.h5").correction is None
 
 
 def test_a_model_is_not_written_over_a_folder(tmp_path, capsys):
-    """That is known before the runs."""
+    """The path is checked before the runs."""
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "row.csv").write_text("law.mu\n800\n")
     arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path)]

@@ -29,7 +29,7 @@ MOVING = lj.Solve(kind="dynamic", dt=0.05, steps=3)
 
 
 def _sponge(cells: tuple, order: int = 1, solve: lj.Solve = MOVING, **numbers) -> lj.Scene:
-    """A viscous sponge of 3 x 1 x 1 cm held at x = 0 under its weight, drained at the other end."""
+    """A viscous porous body of 3 x 1 x 1 cm, fixed at x = 0 under its weight, drained at the other end."""
     mesh = lj.shapes.box([0.03, 0.01, 0.01], list(cells))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     held, drained = (jnp.asarray(lj.boundary.select(mesh, w, None, "ends")) for w in ({"x_max": 0.0}, {"x_min": 0.03}))
@@ -46,7 +46,7 @@ def _sponge(cells: tuple, order: int = 1, solve: lj.Solve = MOVING, **numbers) -
 
 
 def _whole(scene: lj.Scene) -> lj.ReducedModel:
-    """One mode a free degree of freedom, one a pressure that is unknown, and all points."""
+    """Return a model with one mode per free degree of freedom, one per unknown pressure, and all points."""
     mesh = scene.mesh
     free = lj.boundary.free_degrees(mesh, scene.fixed, ())
     modes = np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape)
@@ -64,19 +64,21 @@ CASES = [
 
 
 def _with_a_region(scene: lj.Scene) -> lj.Scene:
-    """Numbers of a region go to its points."""
+    """Return the scene with a region of other porous parameters, which belong to points of the region."""
     soft = lj.Region(elements=jnp.arange(2), porosity={"permeability": 2e-8, "bulk": 300.0})
     return replace(scene, region=(soft,))
 
 
 def _assert_same(scene: lj.Scene, x: jax.Array, P: jax.Array) -> None:
-    """The model of all motions, pressures and points gives these positions and pressures of the full one."""
+    """Check that the model of all motions, pressures and points gives these positions and pressures of the full
+    model.
+    """
     model = _whole(scene)
     found = lj.simulate_reduced(model, scene)
     assert not np.any(found.status)
     moved, size = np.abs(x - scene.mesh.points[None]).max(), np.abs(P).max()
     assert size > 1.0
-    # The solver's tolerance of 1e-8 of the forces, through a condition number of some thousands.
+    # The bound is the solver's tolerance of 1e-8 times a condition number of some thousands.
     assert np.abs(lj.reduced_positions(model, scene, found) - x).max() < 1e-5 * moved
     assert np.abs(lj.reduced_pressure(model, scene, found) - P).max() < 1e-5 * size
 
@@ -91,7 +93,7 @@ def test_all_motions_pressures_and_points_are_the_full_model(order, scheme, solv
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_storage_at_vertices_is_that_of_the_points(order):
-    """Sampled points of several elements that share vertices, at uneven volumes."""
+    """The sampled points belong to several elements that share vertices, with uneven volumes."""
     scene = _sponge((2, 1, 1))
     scene = replace(scene, mesh=lj.quadratic(scene.mesh)) if order == 2 else scene
     rng, V = np.random.default_rng(4), scene.mesh.number_of_vertices
@@ -123,7 +125,7 @@ def test_the_tangent_is_the_derivative_of_the_forces(scheme):
     known, dt = (model, acting, none, rest), jnp.asarray(0.05)
     e = step.ReducedEquations(*known, None, none, None, dt, None, None, 0.0, fluid, light, dt)
     q = jnp.asarray(1e-4 / np.abs(model.modes).max() * rng.normal(size=n))  # 0.1 mm
-    # One program: by themselves the operations take ten times as long to compile.
+    # One program, because the single operations take ten times as long to compile.
     exact = jax.jit(jax.jacfwd(lambda q: step._residual(e, q, step.gradients_at(e, q))[0]))(q)
     found = jax.jit(lambda q: tangent_matrix(step._reduced_tangent(e, q)))(q)
     assert np.allclose(found, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
@@ -131,7 +133,7 @@ def test_the_tangent_is_the_derivative_of_the_forces(scheme):
 
 
 class Trained(NamedTuple):
-    """A sponge in motion, its reduced model of few rows, and two full runs with other numbers."""
+    """A porous body in motion, its reduced model of few runs, and two full runs with other values."""
 
     scene: lj.Scene
     model: lj.ReducedModel
@@ -141,7 +143,7 @@ class Trained(NamedTuple):
 
 @pytest.fixture(scope="module")
 def trained() -> Trained:
-    """All full runs, those of the training too, are of one batch: they share a program."""
+    """All full runs, including those of the training, are in one batch, so they share a program."""
     scene = _with_a_region(_sponge((4, 1, 1), initial_pressure=5.0))
     rng = np.random.default_rng(1)
     gravity = 0.2 * np.stack([rng.uniform(-2, 2, 8), rng.uniform(-2, 2, 8), rng.uniform(-5.0, -2.0, 8)], axis=1)
@@ -173,7 +175,7 @@ def test_points_serve_motion_and_pressure_and_the_errors_are_stated(trained):
             found = lj.reduced_error(m, own, found)
             true = np.linalg.norm(lj.reduced_positions(m, own, found) - full.positions, axis=-1).max(axis=1)
             off = np.abs(lj.reduced_pressure(m, own, found) - full.pressure).max(axis=1)
-            # Few modes are not the answer: there is an error to state.
+            # Few modes are not exact, so there is an error.
             assert true.max() > 1e-6 and off.max() > 0.02
             assert np.all((true < 2 * found.error) & (found.error < 2 * true + 1e-7))
             assert np.all((off < 2 * found.pressure_error) & (found.pressure_error < 2 * off + 2e-3))
@@ -218,7 +220,7 @@ def test_files_keep_the_pressure_and_other_fluids_are_refused(trained, tmp_path)
     for name in ("modes", "values", "parts", "slopes"):
         assert np.array_equal(getattr(again.pressures, name), getattr(model.pressures, name))
     inlet = Inlet(nodes=jnp.arange(2), pressure=10.0)
-    with pytest.raises(lj.InputError, match=r"no \[\[porosity.inlet\]\]"):
+    with pytest.raises(lj.InputError, match=r"cannot have \[\[porosity.inlet\]\]"):
         lj.simulate_reduced(again, replace(scene, porosity=replace(scene.porosity, inlet=(inlet,))))
     for other in (None, replace(scene.porosity, drained=None), replace(scene.porosity, scheme="lagged")):
         with pytest.raises(lj.InputError, match="was made for scene"):
@@ -289,7 +291,7 @@ def test_the_commands_make_and_use_a_porous_model(tmp_path, capsys):
     moved = np.abs(found["full"][0] - found["full"][0][0, :1]).max()
     assert 0 < np.abs(found["used"][0] - found["full"][0]).max() < 0.01 * moved
     assert 0 < np.abs(found["used"][1] - found["full"][1]).max() < 0.02 * np.abs(found["full"][1]).max()
-    # With a limit between both errors, only the pressure is too far off, and the full model runs.
+    # With a limit between both errors, only the pressure error is too large, and the full model runs.
     part = stated[0] / largest, stated[1] / np.abs(found["used"][1]).max()
     assert part[0] < part[1]
     between = f"reduced_tolerance = {np.sqrt(part[0] * part[1]):.3g}\n"

@@ -1,4 +1,4 @@
-"""Other numbers in parts of a body: every law, sets of elements from mesh files, scene files, bad regions."""
+"""Other parameters in parts of a body: every law, sets of elements from mesh files, scene files, invalid regions."""
 
 import warnings
 
@@ -29,7 +29,9 @@ QUICK = ("neo_hookean", "ogden")
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in lj.laws.LAWS])
 def test_every_number_of_every_law_may_differ_by_element(name):
-    """A region of all elements is the scene with that number; forces of half a body are those of its own elements."""
+    """A region of all elements equals the scene with this value. The forces of half a body are those of its
+    elements.
+    """
     law = lj.laws.typical(name)
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (2, 1, 1))
     E = mesh.number_of_elements
@@ -42,7 +44,7 @@ def test_every_number_of_every_law_may_differ_by_element(name):
         label = f"{field.name}.0" if isinstance(value, tuple) else field.name
         base = value[0] if isinstance(value, tuple) else value
         if label.startswith("alpha") and isinstance(value, tuple):
-            continue  # an exponent's sign is part of how a stretch law is evaluated
+            continue  # the sign of an exponent is part of how a stretch law is evaluated
         other = 1.1 * float(base)
         changed = replace(law, **{field.name: (other, *value[1:]) if isinstance(value, tuple) else other})
         whole = law_of_elements(law, (lj.Region(elements=all_of_it, law={label: other}),), E)
@@ -76,7 +78,7 @@ def test_a_region_runs_as_the_array_it_stands_for_and_has_a_gradient():
 
 
 def test_a_uniform_scene_pays_nothing():
-    """No array of one number an element stands in the program of a scene without regions, beside the mesh's own."""
+    """Without regions, the program of a scene has no array with one value per element, apart from those of the mesh."""
     scene = _pulled(lj.laws.NeoHookean(mu=800.0, bulk=3000.0))
     assert len(jax.tree.leaves(scene.region)) == 0
     assert all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.law))
@@ -90,7 +92,7 @@ def test_sets_of_elements_come_from_the_file(tmp_path):
     read = lj.read_mesh(tmp_path / "a.vtu")
     assert set(read.element_sets) == {"medit:ref=3", "medit:ref=4"}
     np.testing.assert_array_equal(read.element_sets["medit:ref=4"], np.flatnonzero(group == 4))
-    # Gmsh: triangles of the surface stand before the tetrahedra, and the groups have names.
+    # In Gmsh's file, triangles of the surface come before the tetrahedra, and the groups have names.
     triangles = lj.boundary.boundary_triangles(mesh)
     tags = [np.full(len(triangles), 7), group]
     named = meshio.Mesh(
@@ -144,19 +146,19 @@ def test_regions_of_a_scene_file(tmp_path):
 
 
 def test_a_border_that_goes_through_elements_is_told(tmp_path):
-    with pytest.warns(UserWarning, match=r"region.0: x_min = 0.013 goes through elements.* the region begins at 0.0"):
+    with pytest.warns(UserWarning, match=r"region.0: x_min = 0.013 cuts elements.* the region begins at 0.0"):
         _load(tmp_path, "[[region]]\nwhere = {x_min = 0.013}\nlaw = {bulk = 6000.0}")
 
 
 def test_bounds_on_the_surface_or_outside_of_the_body_are_not_told():
-    """A round body ends before its bounding box does; a bound beside it cuts no element."""
+    """A round body ends inside its bounding box. A bound outside the body cuts no element."""
     mesh = lj.shapes.cylinder(0.01, 0.02, 0.005)
     half = float(np.median(np.unique(np.asarray(mesh.points)[:, 2])))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for where in ({"z_min": half, "y_min": -1.0, "y_max": 1.0}, {"z_max": half, "x_min": -0.01, "x_max": 0.01}):
             assert len(select_elements(mesh, where, None))
-    with pytest.warns(UserWarning, match="x_min = 0.001 goes through elements"):
+    with pytest.warns(UserWarning, match="x_min = 0.001 cuts elements"):
         select_elements(mesh, {"x_min": 0.001, "y_min": -1.0}, None)
 
 
@@ -167,7 +169,7 @@ def test_a_scene_file_with_a_region_runs(tmp_path):
 
 
 def test_regions_that_lie_over_each_other_may_add_to_each_other(tmp_path):
-    """Only what later regions replace everywhere changes nothing."""
+    """A region has no effect only if later regions replace all its values everywhere."""
     half, more = "[[region]]\nwhere = {x_min = 0.02}\n", "[[region]]\nwhere = {x_min = 0.0}\n"
     scene = _load(tmp_path, "")
     numbers = lj.Region(elements=np.arange(3), law={"bulk": 5000.0})
@@ -194,9 +196,9 @@ def test_regions_that_lie_over_each_other_may_add_to_each_other(tmp_path):
         ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {bulk = 'a'}", "is not a number"),
         ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {bulk = nan}", "is not a number"),
         ("[[region]]\nwhere = {x_min = 0.039}\nlaw = {bulk = 1.0}", "no whole element"),
-        ("[[region]]\nwhere = {x_min = 0.1}\nlaw = {bulk = 1.0}", "meets no node"),
+        ("[[region]]\nwhere = {x_min = 0.1}\nlaw = {bulk = 1.0}", "selects no node"),
         ("[[region]]\nwhere = 3\nlaw = {bulk = 1.0}", "must be a table"),
-        (2 * "[[region]]\nwhere = {x_min = 0.02}\nlaw = {bulk = 1.0}\n", "region.0 changes nothing: later regions"),
+        (2 * "[[region]]\nwhere = {x_min = 0.02}\nlaw = {bulk = 1.0}\n", "region.0 changes nothing, because later"),
         ("[[region]]\nplace = {x_min = 0.02}\nlaw = {bulk = 1.0}", "unknown key 'place'"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Reading sweeps: units, instruments' exports, and one sentence for everything that cannot be read."""
+"""Reading sweeps: units, instruments' exports, and one-line messages for everything that cannot be read."""
 
 import numpy as np
 import pytest

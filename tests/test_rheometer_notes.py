@@ -1,4 +1,4 @@
-"""What a sweep's columns may be instead: tension, radians, other temperatures, unusable points."""
+"""Other quantities in a sweep's columns: tension, radians, other temperatures, unusable points."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from liverjax import InputError
 
 
 def test_moduli_beside_columns_of_a_dma_may_be_those_of_tension(tmp_path):
-    """E taken for G is three times too large: the headings of the moduli alone do not tell."""
+    """E taken for G is three times too large. The headings of the moduli alone do not show this."""
     head, rows = "Frequency (Hz),{}Storage Modulus (kPa),{}Loss Modulus (kPa),{},remark\n", "0.1,9,1,2,2\n1,10,2,2,2\n"
     told = {}
     for own, beside in (
@@ -56,7 +56,7 @@ def test_too_few_usable_points_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"line 4: loss_modulus_Pa = -90 is not positive; correct"):
         read_sweep(_write(tmp_path, HEADER + ROWS.replace("90", "-90")))
     two = "storage_modulus_Pa,loss_modulus_Pa,frequency_Hz\n300,30,1\n301,30,1\n302,30,2\n303,-30,3\n"
-    with pytest.raises(InputError, match="line 5"):  # three points remain, but at two frequencies
+    with pytest.raises(InputError, match="line 5"):  # three points remain, but at two frequencies only
         read_sweep(_write(tmp_path, two))
     falling = "".join(f"{k},{300 + k},{30 if k < 4 else -30}\n" for k in range(1, 9))
     with pytest.raises(InputError, match=r"line 5: .* is not positive \(and 4 more points are unusable\)"):
@@ -70,7 +70,7 @@ def test_moduli_of_tension_are_thirds_and_said(tmp_path):
     text = "Frequency,E_stor,E_loss\nHz,MPa,MPa\n1,0.3,0.03\n2,0.6,0.06\n4,0.9,0.09\n"
     s = read_sweep(_write(tmp_path, text))
     assert np.allclose(s.storage, [1e5, 2e5, 3e5]) and np.allclose(s.loss, [1e4, 2e4, 3e4])
-    assert any("G = E / 3 is taken" in n for n in s.notes)
+    assert any("G = E / 3 is used" in n for n in s.notes)
     primes = read_sweep(_write(tmp_path, "f [Hz],E' [MPa],E'' [MPa]\n1,0.3,0.03\n2,0.6,0.06\n4,0.9,0.09\n"))
     assert np.allclose(primes.storage, s.storage)
     both = "frequency_Hz,E' (Pa),storage_modulus_Pa,loss_modulus_Pa\n1,900,400,60\n2,999,500,70\n"
@@ -92,12 +92,12 @@ def test_what_changes_along_the_frequencies_is_told(tmp_path, column, first, las
     rows = [f"{f},{1000 + f},100,{t}" for f, t in zip((0.1, 1.0, 10.0), np.linspace(first, last, 3), strict=True)]
     head = f"frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,{column}\n"
     (tmp_path / "s.csv").write_text(head + "\n".join(rows) + "\n")
-    told = [n for n in read_sweep(tmp_path / "s.csv").notes if "taken for an effect of the frequency" in n]
+    told = [n for n in read_sweep(tmp_path / "s.csv").notes if "an effect of the frequency" in n]
     assert len(told) == (words is not None) and all(words in n for n in told)
 
 
 def test_one_modulus_of_tension_makes_the_other_one_too(tmp_path):
-    """Only the one that said so was divided by 3: the loss was three times too large, without a word."""
+    """Only the column with this heading was divided by 3. The loss was three times too large, without a message."""
     rows = "".join(f"{f},{3000 + f},300\n" for f in (0.1, 1.0, 10.0))
     (tmp_path / "s.csv").write_text("frequency_Hz,tensile_storage_modulus_Pa,loss_modulus_Pa\n" + rows)
     found = read_sweep(tmp_path / "s.csv")
@@ -126,10 +126,10 @@ def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):
         "temperature_C", (20, 37)
     )
     assert "the strains are 0.01 to 0.5" in notes("strain_%", (1, 50))
-    notes("temperature_C", (20, 37))  # who shifts sweeps by temperature reads them apart, without this advice
+    notes("temperature_C", (20, 37))  # users who shift sweeps by temperature read them separately, without this advice
     ((_, apart),) = read_all_sweeps(tmp_path / "s.csv")
     assert not any("--master" in note for note in apart.notes)
-    assert notes("temperature_C", (20, 21)).endswith("a measurement of its own") == notes(
+    assert notes("temperature_C", (20, 21)).endswith("counts as a separate measurement") == notes(
         "strain_%", (1, 1.2)
     ).endswith("own")
 
@@ -147,7 +147,7 @@ def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):
     ids=["tangent", "phase", "complex", "viscosity", "eta"],
 )
 def test_a_column_that_contradicts_the_moduli_is_told(tmp_path, heading, values, wrong):
-    """Rounded to two digits a column contradicts nothing; one that is a tenth off does."""
+    """A column rounded to two digits does not contradict the moduli; a column with an error of a tenth does."""
     omega = np.geomspace(0.1, 100.0, 13)
     S, L = 1000 * omega**0.1, 200 * omega**0.15
     lines = [
@@ -160,7 +160,7 @@ def test_a_column_that_contradicts_the_moduli_is_told(tmp_path, heading, values,
 
 
 def test_a_viscosity_beside_moduli_of_tension_contradicts_nothing(tmp_path):
-    """|E*|/omega was three times G*/omega: a note of 200 %."""
+    """|E*|/omega was three times G*/omega, which gave a note of 200 %."""
     omega = np.geomspace(0.1, 100.0, 13)
     S, L = 3000 * omega**0.1, 600 * omega**0.15
     lines = [f"{w:.6g},{s:.6g},{k:.6g},{np.hypot(s, k) / w:.4g}" for w, s, k in zip(omega, S, L, strict=True)]

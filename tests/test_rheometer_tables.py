@@ -12,7 +12,7 @@ from liverjax import InputError
 
 
 def _trios(temperatures, rows=ROWS):
-    """An export with one step a temperature, G' higher by the step's number."""
+    """Return an export with one step per temperature; G' increases with the number of the step."""
     steps = ["[Parameters]\nTemperature limit\t620.000 [°C]"]
     for k, t in enumerate(temperatures):
         numbers = "\n".join(f"{f}\t{float(s) + k}\t{l}" for f, s, l in (r.split(",") for r in rows.split()))
@@ -88,7 +88,7 @@ def test_trios_json(tmp_path):
 
 
 def _workbook(path, sheets):
-    """A minimal .xlsx: the parts that ECMA-376 asks for, texts inline."""
+    """Write a minimal .xlsx file: the parts that ECMA-376 requires, with inline texts."""
     import zipfile
     from xml.sax.saxutils import escape
 
@@ -139,7 +139,7 @@ def test_workbooks_that_cannot_be_read_are_one_sentence(tmp_path, monkeypatch):
             read_sweep(path)
         with pytest.raises(InputError, match=r"is a spreadsheet workbook.*export the sheet of curves as CSV"):
             read_curves([path])
-    monkeypatch.setitem(sys.modules, "python_calamine", None)  # as where it is not installed
+    monkeypatch.setitem(sys.modules, "python_calamine", None)  # as if it were not installed
     with pytest.raises(InputError, match=r"pip install '\.\[excel\]'"):
         read_sweep(old)
 
@@ -149,7 +149,7 @@ BELOW = "Point,Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)\n1,0.1,1000
 
 @pytest.mark.parametrize("word", ["Mean", "SD", "Average:", "Std. Dev.", "Mittelwert", "CV (%)"])
 def test_a_summary_below_a_table_is_no_point(tmp_path, word):
-    """A row "Mean" was fitted as a sixth point, with the mean of the frequencies."""
+    """A row "Mean" was fitted as a sixth point, at the mean of the frequencies."""
     s = read_sweep(_write(tmp_path, f"{BELOW}4,5,1400,200\n{word},1.65,1175,142\n"))
     assert list(s.storage) == [1000, 1100, 1200, 1400] and f"line 6 is a summary of other rows ({word})" in s.notes[0]
 
@@ -168,7 +168,7 @@ def test_commas_before_units_are_no_delimiters(tmp_path, between):
 
 
 def test_a_row_of_units_that_are_not_known_is_refused_by_name(tmp_path):
-    """The rows below were not read: "there are no numbers below the header"."""
+    """The rows below were not read, with the message "there are no numbers below the header"."""
     text = "Frequency\tStorage modulus\tLoss modulus\nrad/s\tmPa\tmPa\n0.1\t1000\t100\n1\t1200\t150\n10\t1500\t260\n"
     with pytest.raises(InputError, match="unit 'mPa' of column Storage modulus is not known"):
         read_sweep(_write(tmp_path, text))

@@ -1,4 +1,6 @@
-"""A rigid plate as a physics of scenes: its circle, the rheometer as a scene, derivatives, refusals."""
+"""A rigid plate as a physics object of scenes: its circular motion, the rheometer as a scene, derivatives, invalid
+input.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +37,9 @@ def _step(rig, x):
 
 @pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
 def test_unknowns_stand_for_positions_on_the_circle(rig, axis):
-    """Rodrigues' formula turns the nodes by 2.5 rad about an axis anywhere; the field of unknowns gives them back."""
+    """Rodrigues' formula turns the nodes by 2.5 rad about an arbitrary axis. The unknowns are recovered from the
+    positions.
+    """
     e, c, a = np.array(axis), np.array([1e-3, -2e-3, 5e-3]), 2.5
     plate = _plate(rig, axis=axis, centre=tuple(c), by="torque", lifts=True)
     X = np.asarray(rig.mesh.points)
@@ -48,7 +52,7 @@ def test_unknowns_stand_for_positions_on_the_circle(rig, axis):
     assert np.allclose(x[nodes], turned[nodes], rtol=0, atol=1e-16 / 1e-2)
     assert np.array_equal(x[: nodes[0]], X[: nodes[0]])
     assert np.isclose(tied.angle(turned), a, rtol=1e-13) and np.isclose(tied.lift(turned), 3e-4, rtol=1e-10)
-    # Forces at x work along the motions at x: the difference quotient of f . x along the field.
+    # Forces at x do work on the motions at x: the difference quotient of f . x along the field.
     rng = np.random.default_rng(0)
     f, direction = jnp.asarray(rng.normal(size=X.shape)), jnp.asarray(rng.normal(size=X.shape))
     q, h = tied.unknown(jnp.asarray(X), turned), 1e-6
@@ -59,7 +63,7 @@ def test_unknowns_stand_for_positions_on_the_circle(rig, axis):
 @pytest.mark.slow
 @pytest.mark.parametrize("lifts", [False, True])
 def test_a_given_turn_with_newmark_does_not_oscillate(lifts):
-    """The plate had the average acceleration of free nodes: its torque changed sign at every step, and grew."""
+    """The plate once had the average acceleration of free nodes. Its torque changed sign at every step, and grew."""
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
     low, top = mesh.node_sets["z_min"], mesh.node_sets["z_max"]
     arm = np.asarray(mesh.points)[top] - [0.05, 0.05, 0.1]
@@ -89,7 +93,7 @@ def test_a_given_turn_with_newmark_does_not_oscillate(lifts):
     by = turn * np.stack([-arm[:, 1], arm[:, 0], 0 * arm[:, 0]], axis=1)
     drawn = lj.Displaced(nodes=jnp.asarray(top), by=jnp.asarray(by), times=times, history=jnp.arange(2.0))
     exact = torques(10, displaced=(drawn,))
-    # Straight paths, arms at rest, and a lift that `drawn` has not, change torques in the second order of the angle.
+    # Straight paths, undeformed arms, and a lift that `drawn` lacks change torques in the second order of the angle.
     assert np.abs(found - exact).max() < 5 * turn**2 * exact.max()
 
 
@@ -104,7 +108,7 @@ CASES = [
 
 @pytest.mark.parametrize(("by", "prony", "density"), CASES)
 def test_the_rheometer_is_a_scene_too(rig, by, prony, density):
-    """The same numbers by the simulation's step as by the rig's own: angle, torque and lift, at a tenth of strain."""
+    """Both give the same numbers: angle, torque and lift, at a strain of a tenth."""
     law = lj.laws.typical("neo_hookean")
     rig = replace(rig, density=density, free_height=True)
     omega, strain = 2 * np.pi, 0.1
@@ -127,7 +131,7 @@ def test_the_rheometer_is_a_scene_too(rig, by, prony, density):
 
 @pytest.mark.slow
 def test_the_derivative_of_a_turned_body(rig):
-    """Angle under a torque, 0.5 rad: by the shear modulus, against central differences."""
+    """The angle under a torque, 0.5 rad, is differentiated with respect to mu and compared with central differences."""
     plate = _plate(rig, turn=jnp.array([0.0, 3e-3]), times=jnp.array([0.0, 1.0]), by="torque")
     law = lj.laws.NeoHookean(mu=770.0, bulk=7700.0)
     scene = lj.Scene(
@@ -164,7 +168,7 @@ def test_what_no_plate_can_use_is_refused(rig, sentence):
 
 
 def test_what_else_holds_or_moves_the_nodes_of_a_plate_is_refused(rig):
-    """It had no effect, without a word."""
+    """These settings had no effect, without a message."""
     law, plate = lj.laws.typical("neo_hookean"), _plate(rig)
     low = lj.Fixed(nodes=jnp.arange(rig.bottom))
     also = (
@@ -176,7 +180,7 @@ def test_what_else_holds_or_moves_the_nodes_of_a_plate_is_refused(rig):
     for key, parts, name in also:
         scene = lj.Scene(**{"mesh": rig.mesh, "law": law, "physics": (plate,), "fixed": (low,), key: parts})
         for refuses in (lj.check_scene, lj.simulate):
-            with pytest.raises(lj.InputError, match=rf"plate.[01] and {name} share node .* make their places differ"):
+            with pytest.raises(lj.InputError, match=rf"plate.[01] and {name} share node .* select different nodes"):
                 refuses(scene)
 
 
@@ -196,13 +200,14 @@ def test_a_factorisation_is_refused(rig):
         physics=(_plate(rig),),
         solve=lj.Solve(linear_solver="direct"),
     )
-    with pytest.raises(lj.InputError, match="cannot treat nodes that move together: use cg"):
+    with pytest.raises(lj.InputError, match="cannot be used with a rigid plate: use cg"):
         lj.simulate(scene)
 
 
 def test_a_plate_swings_as_a_pendulum_with_second_order():
-    """Over 2 rad. Newmark's method for each node by itself found no acceleration towards the axis: its error grew, and
-    steps failed."""
+    """The amplitude is above 2 rad. When Newmark's method was applied to each node alone, the acceleration towards the
+    axis was missing: the error grew, and steps failed.
+    """
     mesh, ends = lj.shapes.box((0.02, 0.03, 0.08), (1, 1, 2)), 1.4
     centre, tilted = np.array([0.01, 0.0, 0.08]), 9.81 * np.array([np.sin(1.0), 0.0, -np.cos(1.0)])
     mass, arm = 1000 * np.asarray(nodal_volumes(mesh)), np.asarray(mesh.points) - centre
@@ -250,7 +255,9 @@ def _turned(by: str) -> tuple[lj.Scene, RigidPlate]:
 
 @pytest.mark.parametrize("by", ["torque", pytest.param("angle", marks=pytest.mark.slow)])
 def test_the_mesh_error_of_a_plate_on_quadratic_elements(by):
-    """The estimate's cubic functions turned with the plate, as if they were nodes at the origin: 26 times the error."""
+    """The cubic functions of the estimate turned with the plate, as if they were nodes at the origin. The estimate was
+    26 times the error.
+    """
     scene, plate = _turned(by)
 
     def result_of(x, R):

@@ -1,4 +1,4 @@
-"""Tension, indentation and creep against what is known, their derivatives, and fits of several tests at once."""
+"""Tension, indentation and creep compared with known results, their derivatives, and fits of several tests at once."""
 
 import json
 import warnings
@@ -26,14 +26,15 @@ COARSE, FINE = glued.Cells(rim=0.3, edge=0.3, growth=2.0), glued.Cells(rim=0.02,
 
 @pytest.mark.parametrize("times", [(0.1,), pytest.param((0.1, 0.05), marks=pytest.mark.slow)], ids=["one", "two"])
 def test_creep_is_that_of_the_standard_linear_solid(times, verified):
-    """All stress relaxes alike, so a small strain creeps as 1/(1-g) - g/(1-g) exp(-t (1-g)/tau), averaged over the
-    first step, in which the load comes up; at second order."""
+    """All stress relaxes equally, so a small strain creeps as 1/(1-g) - g/(1-g) exp(-t (1-g)/tau), averaged over the
+    first step, in which the load is applied; second order.
+    """
     errors = []
     for dt in times:
-        # Two cells and linear elements: the mesh is in both, and compiles quickly.
+        # Two cells of linear elements: the mesh error is in both results, and the program compiles quickly.
         rig = glued.creep(R, H, dt, round(1 / dt), 0.01, glued.Cells(size=0.005, order=1))
         u, codes = glued.read(rig, LAW, PRONY)
-        # Nothing relaxes within 1e-9 of the time: the elastic sample, by the same program.
+        # Nothing relaxes within 1e-9 of the time, so this is the elastic sample with the same program.
         lasting = lj.Prony(ratios=PRONY.ratios, relaxation_times=jnp.array([1e9]))
         elastic = glued.read(rig, LAW, lasting)[0][-1]
         t = dt * np.arange(1, len(u) + 1)
@@ -43,28 +44,30 @@ def test_creep_is_that_of_the_standard_linear_solid(times, verified):
         errors.append(abs(float(u[-1] / elastic / exact[-1]) - 1))
     order = np.log2(errors[0] / errors[1]) if len(times) > 1 else None
     verified(f"creep of a cylinder, steps of {times[-1]} s", "standard linear solid", errors[-1], 1e-3, order)
-    # Second order in rate dt = 0.12: at most its square over 12, of what has yet to creep, exp(-1.2).
+    # Second order for rate times dt = 0.12: at most its square over 12 of the remaining creep, exp(-1.2).
     assert errors[0] < 4e-4 and (order is None or errors[0] / errors[1] > 3), errors
 
 
 @pytest.mark.slow
 def test_tension_relaxes_as_the_law_says(verified):
-    """Held at a small strain, the force falls to 1 - g (1 - q exp(...)): after many relaxation times to 1 - g."""
+    """At a constant small strain, the force falls to 1 - g (1 - q exp(...)), and after many relaxation times to
+    1 - g.
+    """
     strains = np.full(40, 1e-4)
     force, codes = glued.read(glued.tension(R, H, 0.25, strains, COARSE), LAW, PRONY)
-    # Without viscosity the volumes would have another form: nothing relaxes within 1e-12 of the time instead.
+    # Without viscosity the volumetric part would have another form. Instead, nothing relaxes within 1e-12 of the time.
     lasting = lj.Prony(ratios=PRONY.ratios, relaxation_times=jnp.array([1e12]))
     elastic = glued.read(glued.tension(R, H, 0.25, strains[:1], COARSE), LAW, lasting)[0][0]
     assert not np.any(codes)
     off = abs(float(force[-1] / elastic) - 0.6)
     verified("relaxed over elastic force of a cylinder", "1 - sum of ratios", off, 1e-6)
     assert off < 1e-6
-    # Stiffer than a free sample, E pi r^2 strain, softer than one held all around.
+    # Stiffer than a free sample, E pi r^2 strain, and softer than a confined one.
     E, M = 9 * 2400 * 800 / (3 * 2400 + 800), 2400 + 4 / 3 * 800
     assert E < float(elastic) / (np.pi * R**2 * 1e-4) < M
 
 
-#: Converged numbers of a program that shares no line with this one: experiments/sources/axisymmetric_reference.py.
+#: Converged numbers of a program without common code: experiments/sources/axisymmetric_reference.py.
 VALUES = json.loads((Path(__file__).parent / "rig_values.json").read_text())["rows"]
 MU, PART = 800.0, 1e-3
 
@@ -76,7 +79,7 @@ def _known(test, aspect, ratio, punch=0.4):
 
 
 def _errors(test, aspect, ratios, punch=0.4, cells=None, read=glued.read):
-    """Of a rig at small strain: forth and back, so that the second order in the strain cancels."""
+    """Return the errors of a rig at small strain. Steps forward and back cancel the second order in the strain."""
     both = np.array([PART, -PART]) * R
     if test == "tension":
         rig, unit = glued.tension(R, aspect * R, 1.0, both / (aspect * R), cells), MU * R * PART * R
@@ -99,10 +102,10 @@ def test_the_table_of_converged_numbers_is_that_of_another_program(verified):
     for test, force in (("tension", 1.07390e-4), ("punch", 3.462e-5)):
         off = abs(_known(test, 1.0, 20.0) * MU * R * 1e-6 / force - 1)
         verified(f"{test} of a glued cylinder, independent solver", "DOLFINx", off, 3e-4)
-        # Their strain's second order, and the digits given.
+        # The second order in the strain of DOLFINx, and its printed digits.
         assert off < 3e-4
     assert max(r["left"] for r in VALUES) < 1e-4
-    # Displacements alone are too stiff on any grid, and nearly there: pressures have not gone astray.
+    # Displacements alone are too stiff on any grid, but close. So the pressures are not wrong.
     stiffer = [(r["displacements_alone"] / r["value"] - 1) * (-1 if r["test"] == "creep" else 1) for r in VALUES]
     assert min(stiffer) > -1e-6 and max(stiffer) < 0.05
 
@@ -127,10 +130,10 @@ def test_the_default_mesh_is_within_one_percent_for_any_shape(test, aspect, veri
 @pytest.mark.slow
 @pytest.mark.parametrize("test", ["tension", "punch", "creep"])
 def test_the_estimate_is_near_the_error(test):
-    """Of a coarse mesh, whose error is some percent."""
+    """The mesh is coarse, with an error of some percent."""
     errors = _errors(test, 1.0, (3.0, 20.0), cells=COARSE)
     estimates = _errors(test, 1.0, (3.0, 20.0), cells=COARSE, read=_corrected) - errors
-    # What the estimate adds, over what is missing.
+    # The estimated error over the true error.
     ratio = -estimates / errors
     assert np.all(abs(errors) > 2e-3) and np.all((ratio > 0.5) & (ratio < 2)), (errors, ratio)
 
@@ -150,7 +153,7 @@ def test_narrow_and_wide_punches_are_within_one_percent(punch, aspect):
 
 @pytest.mark.slow
 def test_large_strains_are_those_of_another_program(verified):
-    """DOLFINx (axisymmetric, quadratic, R = H = 10 mm, K/mu 20): pulled by 1 mm, and pressed by 0.5 mm."""
+    """DOLFINx (axisymmetric, quadratic, R = H = 10 mm, K/mu 20): stretched by 1 mm, and compressed by 0.5 mm."""
     law = lj.laws.NeoHookean(mu=jnp.asarray(MU), bulk=jnp.asarray(20 * MU))
     pulled = glued.tension(R, R, 1.0, [0.05, 0.1])
     pressed = glued.indentation(R, R, 0.4 * R, 1.0, [2.5e-4, 5e-4])
@@ -163,12 +166,14 @@ def test_large_strains_are_those_of_another_program(verified):
 
 @pytest.mark.slow
 def test_indentation_tends_to_that_of_a_half_space(verified):
-    """4 G a d ln(3 - 4 nu) / (1 - 2 nu) of a glued flat punch (Mossakovskii 1954), on a block more by about a / R."""
+    """The limit is 4 G a d ln(3 - 4 nu) / (1 - 2 nu) for a glued flat punch (Mossakovskii 1954); a block adds about a /
+    R.
+    """
     nu = (3 * 2400 - 2 * 800) / (2 * (3 * 2400 + 800))
     forces = []
     for part in (0.05, 0.025):
         a = part * R
-        # Both ways: what is not linear cancels. So small a part of R has few digits of it.
+        # Both directions cancel the nonlinear part. Such a small fraction of R has few exact digits of it.
         rig = glued.indentation(R, R, a, 1.0, np.array([1e-2, -1e-2]) * a)
         rig = replace(rig, scene=replace(rig.scene, solve=replace(rig.scene.solve, tolerance=1e-6)))
         readings, codes = glued.read(rig, LAW, None)
@@ -177,14 +182,16 @@ def test_indentation_tends_to_that_of_a_half_space(verified):
         forces.append(float(readings[1] - readings[0]) / 2 / (1e-2 * a) / exact)
     off = abs(2 * forces[1] - forces[0] - 1)
     verified("glued punch, extrapolated to a half-space", "Mossakovskii 1954", off, 0.01)
-    # What is left is (a / R)^2, below 0.0025 times its factor, and the mesh's half a percent.
+    # The rest is (a / R)^2, below 0.0025 times its factor, and the mesh error of half a percent.
     assert forces[0] > forces[1] > 1 and off < 0.01
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("test", ["tension", "punch", "creep"])
 def test_a_whole_cylinder_of_given_cells_is_near_too(test):
-    """Three cells in the radius, not graded: a ring at the punch's edge, areas of circles; errors of some percent."""
+    """Three cells in the radius, not graded, with a ring at the punch's edge and areas of circles. Errors are some
+    percent.
+    """
     errors = _errors(test, 1.0, (3.0,), cells=R / 3)
     assert abs(errors).max() < {"tension": 0.02, "punch": 0.08, "creep": 0.02}[test], errors
 
@@ -192,7 +199,7 @@ def test_a_whole_cylinder_of_given_cells_is_near_too(test):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["creep", "tension", "indentation"])
 def test_derivatives_by_the_parameters(kind):
-    """Of the last reading by mu, g and tau: forward and reverse mode, and central differences."""
+    """The last reading is differentiated with respect to mu, g and tau: both modes, and central differences."""
     strains = 0.1 * np.arange(1, 4) / 3
     rig = {
         "tension": lambda: glued.tension(R, H, 0.2, strains, COARSE),
@@ -212,7 +219,7 @@ def test_derivatives_by_the_parameters(kind):
     for k in range(3):
         h = 1e-3 * float(p[k])
         difference = (last(p.at[k].add(h)) - last(p.at[k].add(-h))) / (2 * h)
-        # Newton's tolerance of 1e-9 over a step of 1e-3, and the step's square.
+        # Newton's tolerance of 1e-9 over a step of 1e-3, and the square of the step.
         assert abs(difference / reverse[k] - 1) < 1e-5
 
 
@@ -226,8 +233,9 @@ def _sweep(model, noise, seed):
 
 @pytest.mark.slow
 def test_two_tests_know_more_than_one():
-    """A slow mode outside a sweep's band: creep, of a finer mesh, adds it; every interval of the joint fit is narrower
-    than alone; the stated bias is a small part of it."""
+    """A slow mode is outside a sweep's band. Creep, computed on a finer mesh, determines it. Every interval of the
+    joint fit is narrower than before, and the stated bias is a small part of it.
+    """
     model = generalised_maxwell.Maxwell(jnp.asarray(800.0), jnp.array([0.3, 0.3]), jnp.array([8.0, 0.1]))
     rig, fine = glued.creep(R, H, 1.0, 20, 20.0), glued.creep(R, H, 1.0, 20, 20.0, FINE)
     law = lj.laws.NeoHookean(mu=1.0, bulk=3.0)
@@ -250,7 +258,9 @@ def test_two_tests_know_more_than_one():
 
 @pytest.mark.slow
 def test_a_coarse_mesh_says_what_it_does_to_a_modulus():
-    """Creep of a fine mesh fitted on a coarse one: G0 is off by some percent, as stated, and corrected to a third."""
+    """Creep of a fine mesh is fitted on a coarse one. G0 is wrong by some percent, as stated; a third remains after
+    correction.
+    """
     model = generalised_maxwell.Maxwell(jnp.asarray(800.0), jnp.array([0.3]), jnp.array([2.0]))
     law = lj.laws.NeoHookean(mu=1.0, bulk=20.0)
     viscosity = lj.Prony(ratios=model.ratios, relaxation_times=model.relaxation_times)
@@ -264,7 +274,7 @@ def test_a_coarse_mesh_says_what_it_does_to_a_modulus():
 
 @pytest.mark.slow
 def test_a_free_height_serves_as_a_test():
-    """The torsion rig whose plate may rise: at small strain the moduli are those of the fixed one."""
+    """In this torsion rig the plate may rise. At small strain the moduli are those of the fixed plate."""
     model = generalised_maxwell.Maxwell(jnp.asarray(800.0), jnp.array([0.4]), jnp.array([0.5]))
     data = _sweep(model, 0.01, 2)
     data = data._replace(
@@ -277,7 +287,7 @@ def test_a_free_height_serves_as_a_test():
     rig = torsion.make_rig(free_height=True, cell_size=0.004)
     found = joint.fit([joint.torsion_sweep(data, rig, 1e-7)], model, LAW)
     closed = joint.fit([joint.sweep(data)], model, LAW)
-    # The discrete cycle of 50 steps differs by its second-order error, below a percent.
+    # The discrete cycle of 50 steps has a second-order error below a percent.
     np.testing.assert_allclose(found.values, closed.values, rtol=0.02)
 
 
@@ -303,7 +313,7 @@ def test_bad_rigs_are_one_sentence(make, words):
 
 
 def test_shapes_and_laws_beyond_the_table_are_told():
-    """A warning names the number, and where to find the estimate; within the table there is none."""
+    """A warning names the value, and where to find the estimate. Within the table there is no warning."""
     with pytest.warns(UserWarning, match="10 radii"):
         rig = glued.tension(R, 10 * R, 0.1, [0.1])
     glued.tension(R, 5 * R, 0.1, [0.1])
@@ -322,7 +332,9 @@ def test_shapes_and_laws_beyond_the_table_are_told():
 
 
 def test_the_axis_of_a_sector_is_held_across_both_planes():
-    """Else the oblique plane would meet nodes that are held along one of its normal's two axes: refused."""
+    """Otherwise the oblique plane would meet nodes that are fixed along one axis of its normal, which raises an
+    error.
+    """
     scene = glued.tension(R, R, 1.0, [0.1]).scene
     lj.check_scene(scene)
     bottom, start, _, top = scene.fixed

@@ -1,4 +1,4 @@
-"""Inverted, flat and crushed elements: energies that are finite, stiffness that is positive, minima that are found."""
+"""Inverted, flat and crushed elements: finite energies, positive stiffness, and minima that are found."""
 
 import jax
 import jax.numpy as jnp
@@ -26,14 +26,14 @@ ALL = tuple((i, j) for i in range(3) for j in range(3))
 
 @pytest.fixture(scope="module")
 def gradients():
-    """Deformation gradients: random, half of them inverted; zero, flat, a line, rest and its mirror image."""
+    """Return deformation gradients: random, half of them inverted; zero, flat, a line, rest and its mirror image."""
     rng = np.random.default_rng(0)
     special = [np.zeros((3, 3)), np.diag([1.0, 1, 0]), np.diag([1.0, 0, 0]), np.eye(3), -np.eye(3)]
     return jnp.asarray(np.concatenate([special, rng.standard_normal((60, 3, 3))]))
 
 
 def matrix(blocks, n: int) -> np.ndarray:
-    """(n, 9, 9) of the blocks of the unit vectors."""
+    """Return the matrices (n, 9, 9) of the blocks of the unit vectors."""
     A = np.zeros((n, 9, 9))
     for (i, j), block in zip(ALL, blocks, strict=True):
         for r in range(3):
@@ -63,7 +63,7 @@ def test_projection_is_the_absolute_value_of_the_eigenvalues(gradients, name):
     values, vectors = np.linalg.eigh(A)
     assert (values < 0).any()
     exact = np.einsum("nij,nj,nkj->nik", vectors, abs(values), vectors)
-    # LAPACK's and ours: n eps |A| each, some ten operations an entry.
+    # LAPACK and this code: n eps |A| each, about ten operations per entry.
     assert np.abs(found - exact).max() < 100 * EPS * np.abs(A).max()
 
 
@@ -89,7 +89,7 @@ def test_projection_of_other_axes_is_positive_and_exact_where_nothing_is_negativ
         invariants = ("I4",)
 
         def strain_energy(self, I):
-            """Quadratic in the fibre's strain."""
+            """Return an energy quadratic in the strain of the fibre."""
             return self.k * (I.I4 - 1) ** 2
 
     law = laws.typical("costa") if name == "costa" else laws.typical("stable_neo_hookean") + Fibre(k=200.0, **fibre)
@@ -122,7 +122,7 @@ def test_a_continued_law_is_finite_and_smooth(gradients, law):
     assert np.abs(A - curved).max() < 1e4 * EPS * np.abs(A).max()
     above = np.asarray(jnp.linalg.det(gradients)) > c
     assert above.any() and np.array_equal(P[above], law.first_piola(gradients)[above])
-    # Value and slope at J = c: the differences fall with the step.
+    # Value and derivative at J = c: the differences fall with the step.
     for h in (1e-4, 1e-6):
         J = jnp.array([c - h, c + h])[:, None, None]
         F = J ** (1 / 3) * jnp.eye(3)[None]
@@ -186,7 +186,7 @@ def test_the_residual_is_the_gradient_of_the_energy(name):
     rng = np.random.default_rng(0)
     shaken = [MESH.points + 0.003 * rng.standard_normal(MESH.points.shape) for _ in range(2)]
     begin = equations.initial_state(scene)
-    # Any state will do, so no step is made: every leaf a little off rest.
+    # Any state can be used, so no step is run: every array is slightly changed from rest.
     state = jax.tree.map(lambda a: a + 0.01 * (1 + abs(a)) * rng.standard_normal(a.shape), begin)._replace(x=shaken[0])
 
     @jax.jit
@@ -196,13 +196,13 @@ def test_the_residual_is_the_gradient_of_the_energy(name):
         return equations.residual(e, q, 1.0)[0], jax.grad(lambda q: equations.energy(e, q, q0))(q)
 
     r, slope = both(scene, state, shaken[1])
-    # The porous energy holds an iterative solve to a hundredth of the scene's tolerance.
+    # The porous energy contains an iterative solve to a hundredth of the scene's tolerance.
     bound = 1e-8 if scene.porosity is not None and scene.porosity.scheme == "implicit" else 1e-12
     assert np.linalg.norm(r - slope) < bound * np.linalg.norm(r)
 
 
 def inverted_start(part: float, seed: int) -> jax.Array:
-    """Positions in which about this part of the elements is inverted."""
+    """Return positions in which about this fraction of the elements is inverted."""
     noise = np.random.default_rng(seed).standard_normal(MESH.points.shape)
     low, high = 0.0, 0.3
     for _ in range(30):
@@ -218,21 +218,23 @@ STARTS = {"finite everywhere": laws.typical("stable_neo_hookean"), "not finite":
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(STARTS))
 def test_from_inverted_starts_the_energy_falls_to_the_minimum(name):
-    """In motion a start cannot be left; in one very long step inertia does nothing."""
+    """In motion the solver must use the starting point. In one very long step, inertia has no effect."""
     scene = replace(HANGING, law=STARTS[name], solve=lj.Solve(kind="dynamic", dt=1e4, robust="projected"))
     run = jax.jit(lambda start: lj.simulate(scene, start=start))
     rest = run(MESH.points).check()
     for seed in (1, 2, 3):
         result = run(inverted_start(0.2, seed)).check()
         assert int(result.statistics.iterations[0]) <= 30
-        # Newton stops at a residual of 1e-8 of the forces; displacements are of the size of the body's strain.
+        # Newton stops at a residual of 1e-8 of the forces. Displacements have the size of the body's strain.
         assert np.abs(np.asarray(result.positions - rest.positions)).max() < 1e-6 * 0.1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STARTS)
 def test_at_rest_every_start_leads_to_the_same_equilibrium(name):
-    """A start is a guess there: nearly flat, half inverted or crushed ones are left for the reference shape."""
+    """Here a starting point is only a guess. If it is nearly flat, half inverted or crushed, the reference shape
+    replaces it.
+    """
     still = replace(HANGING, law=STARTS[name], solve=lj.Solve(robust="projected"))
     run = jax.jit(lambda start: lj.simulate(still, start=start))
     rest = run(MESH.points).check()
@@ -253,7 +255,7 @@ def test_without_it_the_code_tells():
 
 @pytest.mark.slow
 def test_equilibrium_with_inverted_elements_is_no_success():
-    """Pushed through its own support: a quadratic law has an equilibrium there, a body has not."""
+    """The body is pushed through its own support. A quadratic law has an equilibrium there, but a real body has not."""
     law = laws.StableNeoHookean(mu=770.0, lame_lambda=1000.0)
     through = lj.Displaced(nodes=BOTTOM, by=jnp.array([0.0, 0.0, 0.25]))
     scene = replace(HANGING, law=law, body=None, displaced=(through,), solve=lj.Solve(steps=4, robust="projected"))
@@ -277,14 +279,14 @@ def test_gradients_use_the_true_tangent():
     difference = (tip(-2.0 + h)[0] - tip(-2.0 - h)[0]) / (2 * h)
     value, slope = tip(-2.0)
     assert np.isclose(slope, difference, rtol=1e-6)
-    # At rest an inverted start is left for the reference shape: the answer is that of a start there.
+    # At rest an inverted starting point is replaced by the reference shape, so the result is that of a run from there.
     straight = lj.simulate(replace(HANGING, law=law, solve=lj.Solve(tolerance=1e-11))).check()
     assert np.isclose(value, straight.positions[-1, BOTTOM[0], 2], rtol=0, atol=1e-9 * 0.1)
 
 
 @pytest.mark.slow
 def test_a_following_pressure_is_held_in_each_iteration():
-    """It has no energy, and the minimiser finds the equilibrium of the plain run all the same."""
+    """The pressure has no energy. Nevertheless the minimiser finds the equilibrium of the plain run."""
     top = jnp.asarray(lj.boundary.boundary_triangles(MESH, BOTTOM))
     scene = replace(HANGING, traction=(lj.Traction(triangles=top, pressure=30.0),), solve=lj.Solve(steps=2))
     rest = lj.simulate(scene).check().positions
@@ -300,7 +302,7 @@ def test_the_kind_of_a_tangent_may_be_chosen_when_the_program_runs(taken):
     mesh, law = shapes.box((1.0, 1.0, 1.0), (1, 1, 1)), laws.typical("saint_venant_kirchhoff")
     scene = lj.Scene(mesh=mesh, law=law, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),))
     e = equations.equations(scene, equations.initial_state(scene), 1.0)
-    x = 0.4 * mesh.points  # below 0.577 its stiffness has negative eigenvalues
+    x = 0.4 * mesh.points  # below 0.577 the stiffness has negative eigenvalues
     chosen = jax.jit(lambda taken: tangent.tangent(e, None, x, 1.0, None, ("projected", taken)))(jnp.array(taken))
     kind, other = ("projected", "true") if taken else ("true", "projected")
     expected, not_this = (tangent.tangent(e, None, x, 1.0, None, k).matrix.rows for k in (kind, other))

@@ -1,4 +1,4 @@
-"""Several samples of one material: each by itself, and the population that they come from."""
+"""Several samples of one material: each sample alone, and the population that they come from."""
 
 import json
 from types import SimpleNamespace
@@ -32,7 +32,9 @@ def test_exact_samples_have_the_interval_of_student():
     [(3, 0.2, 1e-3), (6, 0.2, 1e-3), (8, 0.2, 0.2), pytest.param(8, 0.1, 0.2, marks=pytest.mark.slow)],
 )
 def test_a_new_sample_lies_in_its_interval(count, spread, error):
-    """400 populations: 95 % or more, also where the errors hide the spread; exact ones as Student's t says."""
+    """400 populations: 95 % or more are covered, also if the errors hide the spread. Exact samples follow
+    Student's t.
+    """
     rng, inside, lengths = np.random.default_rng(7), [], []
     for _ in range(400):
         true, new = spread * rng.standard_normal(count), spread * rng.standard_normal()
@@ -42,18 +44,21 @@ def test_a_new_sample_lies_in_its_interval(count, spread, error):
     assert np.mean(inside) > 0.95 - 3 * np.sqrt(0.95 * 0.05 / 400)
     if error < 0.01:
         expected = 2 * scipy.stats.t.ppf(0.975, count - 1) * spread * np.sqrt(1 + 1 / count)
-        assert 0.7 < np.median(lengths) / expected < 1.1  # the median of a chi of 2 is 0.83 of its mean square
+        # the median of a chi with 2 degrees of freedom is 0.83 of its root mean square
+        assert 0.7 < np.median(lengths) / expected < 1.1
 
 
 def test_equal_errors_are_subtracted_from_the_spread():
-    """The balanced case has a closed form: s^2 = variance - e^2; a sample keeps s^2 / (s^2 + e^2) of its place."""
+    """With equal errors there is a closed form: s^2 = variance - e^2. A sample keeps s^2 / (s^2 + e^2) of its
+    difference.
+    """
     y, e = np.array([0.0, 0.4, 0.8, -0.3, 0.1, 0.6]), 0.2
     p = population(np.exp(y), e * np.exp(y))
     variance = y.var(ddof=1) - e**2
     assert np.isclose(p.spread**2, variance, rtol=1e-4)
 
     def over_spreads(f):
-        """Mean over all s, by their likelihood in the balanced case and the half-Cauchy prior."""
+        """Return the mean over all s, weighted by their likelihood with equal errors and the half-Cauchy prior."""
 
         def weight(s):
             total = s**2 + e**2
@@ -108,7 +113,9 @@ def test_intervals_cover_the_mean_and_a_new_sample():
     ],
 )
 def test_few_samples_have_errors_that_hold_them(spread, errors):
-    """With the likeliest spread alone, which is often 0, the moved values were held in 34 to 68 % of the draws."""
+    """With the most probable spread alone, which is often 0, the shrunk values were covered in 34 to 68 % of
+    the draws.
+    """
     rng, e, draws, held = np.random.default_rng(5), np.array(errors), 200, np.zeros(3)
     for _ in range(draws):
         truth = 0.3 + spread * rng.standard_normal(len(e))
@@ -116,20 +123,20 @@ def test_few_samples_have_errors_that_hold_them(spread, errors):
         p = population(np.exp(y), e * np.exp(y))
         held[0] += np.mean(np.abs(np.log(p.pooled) - truth) < 1.96 * p.pooled_errors)
         held[1:] += [low < np.exp(x) < high for x, (low, high) in ((0.3, p.mean_interval), (new, p.new_interval))]
-    # 95 % and more: a prior that allows any spread makes intervals wide where the samples say little.
+    # 95 % or more: a prior that allows any spread gives wide intervals where the samples show little.
     assert np.all(held / draws > 0.92), held / draws
 
 
 def test_a_fluid_among_solids_is_no_sample_of_their_equilibrium_modulus():
     p = population(np.array([500.0, 700.0, 600.0, 3e-10, 650.0]), np.array([5.0, 7.0, 6.0, np.inf, 1e5]))
     assert np.isnan(p.pooled[3]) and np.isnan(p.pooled_errors[3])
-    # The last one says nothing, so it is like a new sample.
+    # The last sample contains no information, so it is like a new sample.
     low, high = np.log(p.new_interval)
     assert np.isclose(p.pooled[4], p.mean, rtol=0.05) and 0.1 < p.pooled_errors[4] / ((high - low) / 3.92) < 2
 
 
 def test_a_sample_that_is_not_of_the_others_is_named():
-    """Four of 0.8 to 1.3 kPa, and one of five times that: the interval of a new one was 0.1 to 18 kPa."""
+    """Four samples have 0.8 to 1.3 kPa, and one has five times that. The interval of a new sample was 0.1 to 18 kPa."""
     for last, told in ((5000.0, True), (1200.0, False)):
         moduli = (800.0, 950.0, 1100.0, 1300.0, last)
         sweeps = [SimpleNamespace(source=f"s{k}.csv") for k in range(5)]
@@ -144,13 +151,13 @@ def test_a_sample_that_is_not_of_the_others_is_named():
 
 
 def samples_of(rows):
-    """Samples s0.csv … whose fits have these values with their errors, by name."""
+    """Return samples s0.csv … whose fits have these values with these errors, by name."""
     sweeps = [SimpleNamespace(source=f"s{k}.csv") for k in range(len(rows))]
     return SimpleNamespace(sweeps=sweeps, fits=rows, populations=dict.fromkeys(rows[0]), values=lambda k: rows[k])
 
 
 def test_a_sample_of_other_times_is_named_by_them():
-    """The unit of the frequency, or the temperature, moves the times alone."""
+    """A wrong unit of the frequency, or another temperature, changes the times alone."""
     rows = [{"shear_modulus": (900.0 + 50 * k, 5.0), "relaxation_times[0]": (1.0 + 0.01 * k, 0.01)} for k in range(5)]
     rows[3]["relaxation_times[0]"] = (6.4, 0.05)
     (said,) = outliers(samples_of(rows))
@@ -158,7 +165,7 @@ def test_a_sample_of_other_times_is_named_by_them():
 
 
 def test_few_samples_of_another_unit_are_named():
-    """One of three in kPa gave a new sample 2e-5 to 5e12 Pa, without a word."""
+    """One of three samples in kPa gave an interval of 2e-5 to 5e12 Pa for a new sample, without a message."""
     for moduli, names in (((800.0, 950.0, 1.1e6), "s2.csv: the shear_modulus is"), ((800.0, 950.0, 2000.0), None)):
         found = SimpleNamespace(
             sweeps=[SimpleNamespace(source=f"s{k}.csv") for k in range(3)],
@@ -179,7 +186,9 @@ def test_one_measurement_in_two_files_is_refused(tmp_path, capsys):
 
 
 def write_samples(folder, count=5, spread=0.3, noise=0.01):
-    """Synthetic: a solid with one mode whose moduli and times vary between samples; the truths as well."""
+    """Write synthetic sweeps of a solid with one mode. Its moduli and times vary between samples. Return the true
+    values.
+    """
     rng, omega, files = np.random.default_rng(1), np.geomspace(0.5, 50, 12), []
     truths = np.exp(np.log([500.0, 0.5, 0.2]) + spread * rng.standard_normal((count, 3)) * [1, 0.3, 1])
     for k, (G0, ratio, tau) in enumerate(truths):
@@ -205,7 +214,7 @@ def test_the_command_fits_each_sample_and_the_population(tmp_path, capsys):
         errors = [e["shear_modulus"], e["ratios"][0], e["relaxation_times"][0]]
         assert np.all(np.abs(np.array(found) - truth) < 4 * np.array(errors))
     p = content["population"]["shear_modulus"]
-    logs = np.log(truths[:, 0])  # the truths of these five, known to 1 %
+    logs = np.log(truths[:, 0])  # the true values of these five, known to 1 %
     assert np.isclose(np.log(p["mean"]), logs.mean(), atol=0.02)
     assert np.isclose(p["spread_of_logarithms"], logs.std(ddof=1), atol=0.02)
     new, mean = p["interval_95_of_a_new_sample"], p["interval_95_of_the_mean"]
@@ -236,13 +245,13 @@ def test_ten_measured_samples_keep_their_spread(tmp_path):
         pytest.skip("the raw sweeps are not here")
     assert main([*map(str, files), "--modes", "3", "--max-frequency", "8", "--out", str(tmp_path)]) == 0
     content = json.loads((tmp_path / "fit.json").read_text())
-    # Their mean has a deviation of 48 % of G' at the first frequency (the shipped table): a spread, not noise.
+    # Their mean has a deviation of 48 % of G' at the first frequency (the shipped table). This is a spread, not noise.
     assert 0.25 < content["population"]["shear_modulus"]["spread_of_logarithms"] < 0.6
     assert content["mean_relative_error"] < 0.08
 
 
 def test_a_sample_of_a_wrong_gap_is_named_among_many_parameters():
-    """All its moduli are 1.6 times those of four others: with one level for six parameters this was no difference."""
+    """All its moduli are 1.6 times those of four others. With one level for six parameters, it was not reported."""
     rows = [
         {"shear_modulus": (G, 3.0), "equilibrium_modulus": (0.4 * G, 2.0)}
         | {f"ratios[{m}]": (0.3 + 0.002 * k, 0.003) for m in range(2)}

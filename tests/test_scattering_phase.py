@@ -1,4 +1,4 @@
-"""Sweeps whose loss scatters with the error of the phase: how they are weighed, and that it helps."""
+"""Sweeps whose loss scatters because of the phase error: their weights, and the gain by these weights."""
 
 import numpy as np
 import pytest
@@ -22,14 +22,16 @@ def modulus(ratios=RATIOS, times=TIMES) -> np.ndarray:
 
 
 def measured(G: np.ndarray, degrees: float, seed: int) -> Sweep:
-    """1 % of noise of |G*|, and noise of the phase; without the points whose loss is below zero."""
+    """Return a sweep with 1 % of noise of |G*|, and noise of the phase, without the points whose loss is negative."""
     size, phase = np.random.default_rng(seed).standard_normal((2, len(G)))
     G = G * (1 + 0.01 * size) * np.exp(1j * np.deg2rad(degrees) * phase)
     return some(Sweep(OMEGA, G.real, G.imag), G.imag > 0)
 
 
 def test_an_error_of_the_phase_no_longer_moves_the_numbers():
-    """One degree where tan(delta) is 0.01 to 0.1: ratios scattered twice as far, and the first came out 10 % small."""
+    """The phase error is one degree, and tan(delta) is 0.01 to 0.1. Before, ratios scattered twice as much, and the
+    first ratio was 10 % too small.
+    """
     found = []
     for seed in range(16):
         plain = measured(modulus(), 1.0, seed)
@@ -37,7 +39,7 @@ def test_an_error_of_the_phase_no_longer_moves_the_numbers():
         found.append([u.values[:3] / [1000, *RATIOS] - 1 for u in fits])
     (plain, weighed), (scatter, left) = np.median(found, axis=0), np.std(found, axis=0)
     assert plain[1] < -0.05 and np.all(scatter > 1.5 * left)
-    # One fit is 0.6 and 5 % off; the median of 16 has 1.25 / 4 of this error, and three times that is allowed.
+    # One fit has errors of 0.6 and 5 %. The median of 16 has 1.25 / 4 of this, and three times that is allowed.
     assert abs(weighed[0]) < 0.006 and np.all(np.abs(weighed[1:]) < 0.047)
 
 
@@ -50,7 +52,7 @@ def test_the_reader_weighs_by_the_scatter_and_says_so(tmp_path):
     size = np.hypot(s.storage, s.loss)
     assert found.sd_estimated and not found.noise_given
     assert np.allclose(found.loss_sd / size, found.loss_sd[0] / size[0])
-    # A robust deviation of 31 points is good to a fifth or so; twice that is allowed.
+    # A robust deviation of 31 points has an error of about a fifth. Twice that is allowed.
     assert np.degrees(found.loss_sd[0] / size[0]) == pytest.approx(1.0, rel=0.5)
     assert sum("error of the phase" in note for note in found.notes) == 1
     fit = viscoelastic.closed_form(found, 2)
@@ -59,12 +61,14 @@ def test_the_reader_weighs_by_the_scatter_and_says_so(tmp_path):
     lost[4:7] = [line.rsplit(",", 1)[0] + ",-3.0" for line in lost[4:7]]
     file.write_text("\n".join(lost))
     assert any("3 points are left out because loss_modulus_Pa is not above" in note for note in read_sweep(file).notes)
-    assert not any("misses the data" in w or "no noise" in w for w in fit.warnings)
+    assert not any("misses the data" in w or "not noise" in w for w in fit.warnings)
 
 
 @pytest.mark.parametrize("repeats", [3, pytest.param(50, marks=pytest.mark.slow)])
 def test_deviations_of_few_repeats_do_not_choose_the_points(repeats):
-    """Means of three with their errors: 63 to 82 % of 95 % intervals held, and numbers were off twice as far."""
+    """The points are means of three with their errors. Before, 63 to 82 % of 95 % intervals contained the truth, and
+    the parameters were wrong twice as much.
+    """
     G, hits, told, kept = modulus(np.array([0.3, 0.3])), [], 0, 0
     for seed in range(30):
         rng = np.random.default_rng(seed)
@@ -81,7 +85,9 @@ def test_deviations_of_few_repeats_do_not_choose_the_points(repeats):
 
 
 def test_points_left_keep_the_weights_of_all_points():
-    """Smoothed anew, deviations of three repeats let the ends decide 48 % of fits of nine points."""
+    """If they were smoothed again, deviations of three repeats would let the ends decide 48 % of the fits of nine
+    points.
+    """
     omega, told = np.geomspace(0.1, 10, 9) * 2, 0
     x = 1j * omega
     G = 1000 * (0.5 + 0.5 * x / (1 + x))
@@ -95,7 +101,7 @@ def test_points_left_keep_the_weights_of_all_points():
 
 
 def test_the_curvature_of_a_coarse_sweep_is_no_scatter():
-    """Three points per decade of five modes: 5 % off smooth curves without any noise."""
+    """Three points per decade of five modes deviate by 5 % from smooth curves, without any noise."""
     omega, times = np.geomspace(0.02, 200, 13), np.geomspace(0.01, 100, 5)
     x = 1j * omega[:, None] * times
     G = 1000 * (0.25 + (0.15 * x / (1 + x)).sum(axis=1))
@@ -104,7 +110,7 @@ def test_the_curvature_of_a_coarse_sweep_is_no_scatter():
 
 
 def test_a_step_of_the_deviations_is_kept():
-    """As where an instrument changes its range: no scatter."""
+    """For example, an instrument changes its range. This is no scatter."""
     G = modulus()
     sd = np.where(OMEGA < 3, 0.005, 0.08)
     s = Sweep(OMEGA, G.real, G.imag, sd * G.real, sd * G.imag)
@@ -112,12 +118,12 @@ def test_a_step_of_the_deviations_is_kept():
 
 
 def test_a_spread_between_samples_below_ten_percent_is_told():
-    """Means of samples whose factors differ by 4 %: points that scatter by 0.5 % show it."""
+    """The points are means of samples whose factors differ by 4 %. Points that scatter by 0.5 % show this."""
     rng, G = np.random.default_rng(1), modulus(np.array([0.3, 0.3]))
     for scatter in (0.005, 0.04):
         s = Sweep(OMEGA, *(part * (1 + scatter * rng.standard_normal(len(part))) for part in (G.real, G.imag)))
         s = s._replace(storage_sd=0.04 * s.storage, loss_sd=0.04 * s.loss)
-        told = any("if they are the spread between samples" in w for w in viscoelastic.closed_form(s, 2).warnings)
+        told = any("If these are the spread between samples" in w for w in viscoelastic.closed_form(s, 2).warnings)
         assert s.noise_given and told == (scatter < 0.01)
 
 
@@ -132,7 +138,7 @@ def test_other_noise_is_weighed_as_before():
     few = measured(G, 1.0, 0)
     few = some(few, np.arange(len(few.storage)) < 7)
     assert weighed_by_scatter(few) is few
-    # Noise in proportion to a loss that goes from 0.2 to 40 % of |G*| is no error of the phase.
+    # Noise proportional to a loss of 0.2 to 40 % of |G*| is not an error of the phase.
     G = modulus(np.array([0.03, 0.4]), np.array([0.1, 0.01]))
     s = Sweep(OMEGA, G.real * (1 + 0.01 * rng.standard_normal(31)), G.imag * np.exp(0.1 * rng.standard_normal(31)))
     assert weighed_by_scatter(s) is s
@@ -140,7 +146,7 @@ def test_other_noise_is_weighed_as_before():
 
 @pytest.mark.parametrize("points", [12, 16, 30])
 def test_few_points_of_equal_noise_seldom_look_like_an_error_of_the_phase(points):
-    """With one bound for all numbers of points 3 to 8 of 100 sweeps of a power law got the note."""
+    """With one bound for all numbers of points, 3 to 8 of 100 sweeps of a power law got the note."""
     omega, rng = np.geomspace(0.3, 0.3 * 10 ** (points / 6), points), np.random.default_rng(0)
     G, told = 1e3 * (1j * omega) ** 0.15, 0
     for _ in range(200):

@@ -1,4 +1,4 @@
-"""Scene files: what they say, what is refused in one sentence, what the command leaves behind."""
+"""Scene files: their content, one-line messages for invalid input, output of the command."""
 
 import json
 import re
@@ -81,7 +81,7 @@ def test_a_scene_file_says_what_it_says(folder):
 
 
 def test_a_byte_order_mark_is_no_part_of_a_scene(folder):
-    """Some editors of Windows write it first."""
+    """Some Windows editors write this mark at the beginning of a file."""
     text = (folder / "scene.toml").read_text()
     (folder / "marked.toml").write_text(text, encoding="utf-8-sig")
     assert lj.load_scene(folder / "marked.toml").solve.steps == 3
@@ -105,7 +105,7 @@ def test_parameters_by_the_files_own_names(folder):
     assert np.allclose(changed.viscosity.relaxation_times, [0.3, 0.02])
     assert np.allclose(changed.viscosity.ratios, [0.1, 0.333])
     assert changed.body.density == 1000.0 and changed.solve.dt == 0.1
-    assert jax.tree.structure(changed) == jax.tree.structure(scene)  # nothing is compiled anew
+    assert jax.tree.structure(changed) == jax.tree.structure(scene)  # nothing is compiled again
     for name, near in (("law.0.mew", "mu"), ("viscosty.ratios", "viscosity"), ("law.5.mu", "leads nowhere")):
         with pytest.raises(lj.InputError, match=near):
             lj.with_parameters(scene, {name: 1.0})
@@ -162,7 +162,7 @@ steps = 2
         assert file.attrs["status"][0] == 0 and file.attrs["status"][1] != 0
 
 
-#: A change of the scene's dictionary -> part of the sentence.
+#: A change of the scene's dictionary -> part of the message.
 REFUSED = {
     "no mesh": (lambda c: c.pop("mesh"), r"no \[mesh\]"),
     "unknown section": (lambda c: c.update(bodey={}), "did you mean body"),
@@ -171,7 +171,7 @@ REFUSED = {
     "parameter out of bounds": (lambda c: c["law"][0].update(mu=-1.0), "must be above 0"),
     "unknown unit": (lambda c: c["mesh"].update(unit="inch"), "use one of m, cm"),
     "two meshes": (lambda c: c["mesh"].update(file="a.vtu"), "either file"),
-    "where meets nothing": (lambda c: c["fixed"][0].update(where={"z_max": -1.0}), "meets no node"),
+    "where meets nothing": (lambda c: c["fixed"][0].update(where={"z_max": -1.0}), "selects no node"),
     "unknown where": (lambda c: c["fixed"][0].update(where={"zmax": 0.0}), "did you mean z_max"),
     "place beyond numbers": (lambda c: c["fixed"][0].update(where={"z_max": 10**400}), "is not a length"),
     "unknown set": (lambda c: c["fixed"][1].update(set="vena_cava"), "no node set 'vena_cava'"),
@@ -184,7 +184,7 @@ REFUSED = {
     "text for a number": (lambda c: c["body"].update(density="1060"), "not a number"),
     "steps": (lambda c: c["solve"].update(steps=0), "whole number above 0"),
     "kind": (lambda c: c["solve"].update(kind="quasistatic"), "use static or dynamic"),
-    "loose body": (lambda c: (c.pop("fixed"), c.pop("displaced")), "nothing holds the body"),
+    "loose body": (lambda c: (c.pop("fixed"), c.pop("displaced")), "do not prevent every rigid motion of the body"),
     "no triangle": (lambda c: c["traction"][0].update(where={"y_max": 0.0, "x_max": 0.0}), "no boundary triangle"),
     "steps without end": (lambda c: c["solve"].update(steps=10**24), "solve.steps must be at most 2147483647"),
     "hundreds of digits": (lambda c: c["law"][0].update(mu=10**400), "hundreds of digits"),
@@ -192,7 +192,7 @@ REFUSED = {
         lambda c: c["displaced"][0].update(history=[["0", "0", "0", "0"]]),
         "is not a table of numbers",
     ),
-    "an empty obstacle": (lambda c: c.update(obstacle=[{}]), "obstacle.0 has only a place: give shape, position"),
+    "an empty obstacle": (lambda c: c.update(obstacle=[{}]), "obstacle.0 has only where or set: give shape, position"),
     "history is missing": (lambda c: c["displaced"][0].update(history="none.csv"), "cannot be read"),
 }
 
@@ -213,14 +213,14 @@ def test_a_hinge_is_not_enough():
         "law": {"name": "neo_hookean", "mu": 1.0, "bulk": 10.0},
         "fixed": [{"where": {"z_max": 0.0, "x_max": 0.0}}],
     }
-    with pytest.raises(lj.InputError, match="against every rigid motion"):
+    with pytest.raises(lj.InputError, match="do not prevent every rigid motion"):
         scene_from(content)
     content["fixed"].append({"where": {"z_min": 1.0, "x_min": 1.0}, "axes": "z"})
     scene_from(content)
 
 
 def test_a_piece_that_hangs_on_doubled_nodes_is_told_so():
-    """Two boxes side by side with nodes of their own in the face between them: "add [[fixed]]" would split the body."""
+    """Two adjacent boxes have separate nodes in their common face. The advice "add [[fixed]]" would split the body."""
     box = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
     points, tets = np.asarray(box.points), np.asarray(box.tetrahedra)
     both = lj.tet_mesh(
@@ -229,7 +229,7 @@ def test_a_piece_that_hangs_on_doubled_nodes_is_told_so():
     low = np.flatnonzero(np.asarray(both.points)[:, 0] == 0)
     held = (lj.Fixed(nodes=jnp.asarray(low)),)
     scene = lj.Scene(mesh=both, law=lj.laws.NeoHookean(mu=1.0, bulk=10.0), fixed=held)
-    with pytest.raises(lj.InputError, match="merge the 4 nodes that are at the place of another one, if"):
+    with pytest.raises(lj.InputError, match="merge the 4 nodes that coincide with another node, if"):
         lj.check_scene(scene)
 
 
@@ -272,7 +272,7 @@ def test_scenes_made_in_python_are_refused_alike():
 
 
 def test_a_body_that_cannot_move_is_pointed_out():
-    """Holding z >= 0 where the lowest face was meant is the likeliest mistake with `where`."""
+    """The most probable mistake with `where` is to fix z >= 0 where the lowest face is meant."""
     content = {
         "mesh": {"shape": "box", "size": [0.01, 0.01, 0.01], "cells": [1, 1, 1]},
         "law": {"name": "neo_hookean", "mu": 770.0, "bulk": 2200.0},
@@ -285,7 +285,9 @@ def test_a_body_that_cannot_move_is_pointed_out():
 
 @pytest.mark.slow
 def test_density_is_one_number_or_one_a_node():
-    """By node: a body of two halves weighs what both weigh; other shapes are refused."""
+    """A density may have one value per node. A body of two halves has the weight of both; other shapes raise an
+    error.
+    """
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 3))  # 16 nodes, 18 elements
     scene = lj.Scene(
         mesh=mesh, law=lj.laws.NeoHookean(mu=770.0, bulk=2200.0), fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),)
@@ -297,7 +299,7 @@ def test_density_is_one_number_or_one_a_node():
         return replace(scene, body=lj.Body(density=density, gravity=gravity))
 
     held = np.asarray(lj.simulate(of(density)).check().reactions)[-1, :, 2].sum()
-    # Inner forces add up to zero, so what the support carries is the weight, to the tolerance of the forces.
+    # The internal forces add up to zero, so the support carries the weight, up to the tolerance of the forces.
     assert np.isclose(held, 9.81 * (density * share).sum(), rtol=1e-7)
     for body, sentence in (
         (
@@ -315,11 +317,11 @@ def test_density_is_one_number_or_one_a_node():
 @pytest.mark.parametrize(
     ("parts", "sentence"),
     [
-        ({"fixed": np.arange(9)}, "fixed is of type ndarray: give a tuple, with an lj.Fixed in it"),
+        ({"fixed": np.arange(9)}, "fixed is of type ndarray: give a tuple that contains an lj.Fixed"),
         ({"fixed": (np.arange(9),)}, "fixed.0 is of type ndarray: give an lj.Fixed"),
         ({"law": "neo_hookean"}, "law is of type str: give a law of lj.laws"),
         ({"viscosity": {"ratios": [0.5]}}, "viscosity is of type dict: give an lj.Prony"),
-        ({"physics": (3.0,)}, "physics.0 is of type float: give a physics, such as lj.Obstacle"),
+        ({"physics": (3.0,)}, "physics.0 is of type float: give a physics object, such as lj.Obstacle"),
     ],
 )
 def test_parts_of_another_type_are_refused(parts, sentence):

@@ -1,4 +1,6 @@
-"""Separated form of a static answer (proper generalised decomposition): exact cases, errors, derivatives, refusals."""
+"""Separated form of static displacements (proper generalised decomposition): exact cases, errors, derivatives,
+messages.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -41,13 +43,15 @@ def test_the_error_at_unseen_runs_is_stated(scene, model):
 
 @pytest.mark.slow
 def test_more_points_of_the_grid_lower_the_error_by_powers(scene, model):
-    """Polynomials of degree 1 and 3 in numbers on which the answer depends analytically."""
+    """The displacements are analytic in the parameters, and are approximated by polynomials of degree 1 and 3."""
     coarse = lj.separate(scene, RANGES, points=2, tolerance=1e-5)
     assert float(coarse.error.max()) > 10 * float(model.error.max())
 
 
 def test_products_are_found_as_what_they_are():
-    """Known by construction: three terms of three parameters give the tensor back, and no fourth is taken."""
+    """A tensor is made of three terms of three parameters. These terms reproduce the tensor, and no fourth term is
+    added.
+    """
     rng = np.random.default_rng(0)
     a, b, c, w = (rng.normal(size=(3, n)) for n in (4, 4, 4, 30))
     tensor = np.einsum("mi,mj,mk,mx->ijkx", a * np.array([[9.0], [3.0], [1.0]]), b, c, w)
@@ -61,14 +65,14 @@ def test_products_are_found_as_what_they_are():
 
 @pytest.mark.slow
 def test_derivatives_are_those_of_the_runs(scene, model):
-    """By the load and by the modulus, against the full model's own."""
+    """Derivatives with respect to the load and the modulus are compared with those of the full model."""
 
     def tip(u):
         return u[-1, 2]
 
     def full(mu):
         at = lj.simulate(lj.with_parameters(scene, {"law.mu": mu, "body.gravity.2": -0.8}))
-        return tip(at.positions[-1])  # a position has the displacement's derivative
+        return tip(at.positions[-1])  # positions and displacements have the same derivative
 
     def separated(mu):
         return tip(lj.separated_displacement(model, {"law.mu": mu, "body.gravity.2": -0.8}))
@@ -81,7 +85,7 @@ def test_derivatives_are_those_of_the_runs(scene, model):
 
 
 def test_traced_values_outside_of_the_range_have_no_answer(model):
-    """The polynomials gave -7 m on a body of 0.1 m, and a slope."""
+    """Outside the range, the polynomials gave -7 m for a body of 0.1 m, with a derivative."""
 
     def tip(mu):
         return lj.separated_displacement(model, {"law.mu": mu, "body.gravity.2": -0.8})[-1, 2]
@@ -93,8 +97,8 @@ def test_traced_values_outside_of_the_range_have_no_answer(model):
 
 
 def test_a_loaded_mesh_is_refused(scene):
-    """Its displacements were measured from the given shape, where they end: noise."""
-    with pytest.raises(InputError, match=r"no separated form: take the scene of lj.unloaded"):
+    """Displacements were measured from the given shape, in which the runs end, so they were only noise."""
+    with pytest.raises(InputError, match=r"no separated form: use the scene of lj.unloaded"):
         lj.separate(replace(scene, points_are="loaded"), RANGES)
 
 
@@ -107,7 +111,7 @@ def test_a_loaded_mesh_is_refused(scene):
         ({"law.mu": (900.0, 600.0)}, {}, "lowest and the highest"),
         ({"law.mu": 600.0}, {}, "lowest and the highest"),
         ({"law.mu": (-500.0, 1000.0)}, {}, r"ranges reach law.mu = -500: law.mu"),
-        (RANGES, {"points": 1}, "2 or more"),
+        (RANGES, {"points": 1}, "2 points or more"),
         (RANGES, {"points": 50}, "2000 runs at most"),
         pytest.param({"law.mu": (1e-3, 2e-3)}, {"points": 2, "checks": 1}, "narrow the ranges", marks=pytest.mark.slow),
     ],
@@ -119,7 +123,7 @@ def test_what_cannot_be_separated_gets_a_sentence(scene, ranges, more, words):
 
 
 def test_scenes_with_time_and_values_outside_are_refused(scene, model):
-    with pytest.raises(lj.InputError, match="static answer"):
+    with pytest.raises(lj.InputError, match="static solution"):
         lj.separate(replace(scene, solve=lj.Solve(kind="dynamic", dt=0.1)), RANGES)
     with pytest.raises(lj.InputError, match="outside of 600 to 900"):
         lj.separated_displacement(model, {"law.mu": 500.0, "body.gravity.2": -1.0})

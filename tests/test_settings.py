@@ -1,4 +1,4 @@
-"""Settings of scene files: values of another kind, and keys that would change nothing, get one sentence."""
+"""Settings of scene files: wrong types, and keys without effect, give a one-line message."""
 
 import copy
 import tomllib
@@ -194,14 +194,14 @@ frequencies = [60.0]
 """,
     )
 ]
-#: A value of every kind of TOML.
+#: A value of every TOML type.
 KINDS = (["a", "b"], [1.0, 2.0, 3.0], [], 5, -7.5, "a word", True, {"a": 1}, [{"a": 1}])
-#: What a section needs beside mesh, law, the held place and [solve].
+#: Sections that a section needs in addition to mesh, law, fixed nodes and [solve].
 NEEDS = {"region": ("viscosity", "porosity"), "solve": ("body",), "law": ("body",), "springpots": ("displaced",)}
 
 
 def _addresses(content, before=()):
-    """Every key of nested tables and lists of tables."""
+    """Yield every key of nested tables and lists of tables."""
     for key, value in content.items() if isinstance(content, dict) else enumerate(content):
         yield (*before, key)
         if isinstance(value, dict) or (isinstance(value, list) and value and isinstance(value[0], dict)):
@@ -209,7 +209,7 @@ def _addresses(content, before=()):
 
 
 def _changed(scene, address, value):
-    """The scene with a value changed, without sections that do not matter to it and tables beside its own."""
+    """Return the scene with a changed value, without sections and neighbouring tables that have no influence on it."""
     section, *rest = address
     wanted = {"mesh", "law", "fixed", "solve", section, *NEEDS.get(section, ())}
     content = {key: copy.deepcopy(part) for key, part in scene.items() if key in wanted}
@@ -225,7 +225,7 @@ def _changed(scene, address, value):
 
 
 def _told(content) -> str | None:
-    """The sentence that refuses a scene; None: it is read."""
+    """Return the message for an invalid scene, or None if the scene is read."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -242,7 +242,7 @@ CASES = [(k, address) for k, scene in enumerate(SCENES) for address in _addresse
 def test_the_scenes_are_read_and_have_every_key():
     assert [_told(scene) for scene in SCENES] == [None, None]
     given = {(a[0], a[-1]) for _, a in CASES if isinstance(a[-1], str)}
-    # A file and a surface stand for what other keys give.
+    # A file and a surface replace what other keys give.
     elsewhere = {("mesh", "file"), ("vessel", "surface"), ("vessel", "unit")}
     wanted = {(section, key) for section, keys in _KEYS.items() for key in keys} - elsewhere
     assert not {(s, k) for s, k in wanted if (s, k) not in given and k not in ("where", "set", "history")}
@@ -254,7 +254,7 @@ def test_a_value_of_another_kind_is_read_or_gets_one_sentence(section):
         if address[0] == section:
             told = [_told(_changed(SCENES[k], address, value)) for value in KINDS]
             words = {str(part) for part in address if isinstance(part, str)}
-            # No key takes all kinds, and each sentence names the key or its section.
+            # No key accepts all types, and each message names the key or its section.
             assert any(told), address
             assert all(sentence is None or any(word in sentence for word in words) for sentence in told), (
                 address,
@@ -262,24 +262,24 @@ def test_a_value_of_another_kind_is_read_or_gets_one_sentence(section):
             )
 
 
-#: The second scene about [mesh]; a change of one of the scenes -> part of the sentence.
+#: Section [mesh] of the second scene; a change of one of the scenes -> part of the message.
 MESHES = {
     "box radius": (
         {"shape": "box", "size": [1, 1, 1], "cells": [1, 1, 1], "radius": 3.0},
-        "radius does nothing for shape = 'box'",
+        "radius has no effect for shape = 'box'",
     ),
-    "box rim": ({"shape": "box", "size": [1, 1, 1], "cells": [1, 1, 1], "match_area": True}, "match_area does nothing"),
+    "box rim": ({"shape": "box", "size": [1, 1, 1], "cells": [1, 1, 1], "match_area": True}, "match_area has no effect"),
     "cylinder": (
         {"shape": "cylinder", "radius": 1.0, "height": 1.0, "cell_size": 1.0, "size": [1, 1, 1]},
-        "size does nothing",
+        "size has no effect",
     ),
-    "file": ({"file": "m.vtu", "cells": [1, 1, 1]}, "cells does nothing for a mesh from a file"),
+    "file": ({"file": "m.vtu", "cells": [1, 1, 1]}, "cells has no effect for a mesh from a file"),
 }
 VECTORS = [[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1e-3]]
 PLANE = {"shape": "plane", "position": [0, 0, 0.2], "axis": [0, 0, -1], "by": [0, 0, -0.01]}
 TOP, LIFT = {"where": {"z_min": 0.1}}, [0, 0, 0.01]
 IDLE = {
-    "newmark at rest": ({"solve": {"integrator": "newmark"}}, "'newmark' is for kind = 'dynamic', here it is 'static'"),
+    "newmark at rest": ({"solve": {"integrator": "newmark"}}, "'newmark' needs kind = 'dynamic', but kind = 'static'"),
     "reduced": ({"solve": {"reduced_tolerance": 0.1}}, "reduced_tolerance needs a reduced model"),
     "obstacle": ({"obstacle": [PLANE | {"history": VECTORS}], "solve": {"dt": 0.1}}, "has by and a history of displ"),
     "gravity": (
@@ -288,7 +288,7 @@ IDLE = {
     ),
     "sliding": (
         {"displaced": [TOP | {"by": LIFT}], "support": [TOP | {"sliding": True}]},
-        "moves node 1 off the plane of support.0",
+        "moves node 1 out of the plane of support.0",
     ),
     "waves": (
         {
@@ -296,15 +296,15 @@ IDLE = {
             "body": {"density": 1.0},
             "output": {"fields": ["energy"]},
         },
-        r"\[output\] fields is for runs in time",
+        r"\[output\] fields cannot be used with",
     ),
     "masses of waves": (
         {"solve": {"kind": "harmonic", "frequencies": [1.0]}, "body": {"density": 1.0, "mass": "lumped"}},
-        r"\[body\] mass = 'lumped' is for runs in time, harmonic motion has consistent masses",
+        r"\[body\] mass = 'lumped' cannot be used with \[solve\] kind = 'harmonic', which has consistent masses",
     ),
     "forces of waves": (
         {"solve": {"kind": "harmonic", "frequencies": [1.0]}, "body": {"density": 1.0}, "output": {"reactions": True}},
-        r"\[output\] reactions is for runs in time",
+        r"\[output\] reactions cannot be used with",
     ),
 }
 CUBE = {
@@ -333,12 +333,12 @@ def test_settings_that_would_change_nothing_are_refused(case, tmp_path):
     ],
 )
 def test_meshes_that_no_memory_holds_are_refused(mesh):
-    with pytest.raises(lj.InputError, match=r"ask for about .* tetrahedra"):
+    with pytest.raises(lj.InputError, match=r"would give about .* tetrahedra"):
         scene_from(CUBE | {"mesh": mesh})
 
 
 def test_settings_that_do_something_are_taken():
-    """Motion in the plane of a sliding support, factors of what is given, and no field of a wave."""
+    """Allowed are: motion in the plane of a sliding support, factors of given values, and no field of a wave."""
     for change in (
         {"displaced": [TOP | {"by": [0.01, 0, 0]}], "support": [TOP | {"sliding": True}]},
         {"displaced": [TOP | {"by": LIFT}], "support": [{"where": {"x_max": 0.0}, "sliding": True}]},

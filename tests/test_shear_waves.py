@@ -23,7 +23,7 @@ LOW, HIGH = np.geomspace(0.6, 60, 15), 2 * np.pi * np.linspace(60, 500, 12)
 
 
 def test_the_formulas_are_those_of_the_complex_wave_number():
-    """k = omega sqrt(rho / G*), with 50 digits."""
+    """Compare with k = omega sqrt(rho / G*), computed with 50 digits."""
     mpmath.mp.dps = 50
     for storage, loss, omega in ((3000.0, 800.0, 400.0), (3000.0, 1e-9, 400.0), (10.0, 5e3, 1e5)):
         k = omega * mpmath.sqrt(1000 / mpmath.mpc(storage, loss))
@@ -31,7 +31,7 @@ def test_the_formulas_are_those_of_the_complex_wave_number():
         assert np.isclose(velocity, float(omega / k.real), rtol=1e-14)
         assert np.isclose(attenuation, float(-k.imag), rtol=1e-14)
         back = shear_waves.moduli_of(velocity, attenuation, omega, 1000.0)
-        # G' is a difference of squares where the loss is larger.
+        # Where the loss is larger, G' is a difference of squares.
         assert np.allclose(back, (storage, loss), rtol=0, atol=1e-14 * abs(complex(storage, loss)))
 
 
@@ -77,7 +77,7 @@ def test_the_command_reads_waves_and_writes_waves(tmp_path):
     c, _ = shear_waves.velocity_and_attenuation(
         *generalised_maxwell.moduli(TRUTH, np.array([200 * np.pi])), 200 * np.pi, 1060.0
     )
-    assert np.isclose(ours, c[0], rtol=0.01)  # between two of four points a decade
+    assert np.isclose(ours, c[0], rtol=0.01)  # between two of four points per decade
 
 
 @pytest.mark.parametrize(
@@ -101,12 +101,12 @@ def test_waves_are_cut_to_the_band_as_sweeps_are():
     cut = dispersion.in_band(w, None, HIGH[5] / (2 * np.pi))
     assert np.array_equal(cut.angular_frequency, HIGH[:6]) and np.array_equal(cut.velocity, w.velocity[:6])
     assert "6 waves outside" in cut.notes[-1] and dispersion.in_band(w, 0.0, None) is w
-    with pytest.raises(InputError, match="only 2 frequencies are left"):
+    with pytest.raises(InputError, match="only 2 frequencies are between"):
         dispersion.in_band(w, None, HIGH[1] / (2 * np.pi))
 
 
 def test_errors_of_waves_are_relative_to_smooth_curves():
-    """Relative to each measured number, velocities that are low by chance would weigh most."""
+    """With errors relative to each measured value, velocities that are low by chance would have too much weight."""
     noisy, exact = waves(0.2), waves(0.0)
     assert np.allclose(exact.scales, exact.measured, rtol=1e-3)
     off = [np.std(np.log(scales / exact.measured)) for scales in (noisy.scales, noisy.measured)]
@@ -115,8 +115,8 @@ def test_errors_of_waves_are_relative_to_smooth_curves():
 
 
 def test_the_density_of_a_common_fit_needs_no_height():
-    """The default method written out: it was refused for the height that it does without."""
+    """The default method was given explicitly. It raised an error about the height, which it does not need."""
     options = sweep_command.parser("fitting").parse_args(
         ["sweep.csv", "--with", "waves.csv", "--density", "1060", "--method", "closed-form"]
     )
-    assert sweep_command._check(options) is None  # no refusal
+    assert sweep_command._check(options) is None  # no error

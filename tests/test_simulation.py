@@ -1,4 +1,4 @@
-"""Runs of scenes: patch test, balances, orders, other programs' solutions, gradients, and what is left out."""
+"""Runs of scenes: patch test, balances, orders, solutions of other programs, gradients, and parts that are left out."""
 
 import re
 
@@ -31,17 +31,17 @@ def box(n: int = 2) -> lj.TetMesh:
 
 
 def bottom(mesh: lj.TetMesh) -> lj.Fixed:
-    """Its lower face, held."""
+    """Return the nodes of the lower face, which is fixed."""
     return lj.Fixed(nodes=jnp.asarray(boundary.select(mesh, {"z_max": 0.0})))
 
 
 def top(mesh: lj.TetMesh, **motion) -> lj.Displaced:
-    """Its upper face, moved."""
+    """Return the nodes of the upper face, which is moved."""
     return lj.Displaced(nodes=jnp.asarray(boundary.select(mesh, {"z_min": 0.1})), **motion)
 
 
 def test_patch_test_is_exact(verified):
-    # Boundary positions of a homogeneous deformation: the inner nodes follow it exactly, whatever the mesh.
+    # The boundary positions are those of a homogeneous deformation. The inner nodes follow it exactly in every mesh.
     mesh = box(3)
     inner = np.setdiff1d(np.arange(mesh.number_of_nodes), boundary.boundary_triangles(mesh))
     points = np.asarray(mesh.points).copy()
@@ -54,7 +54,7 @@ def test_patch_test_is_exact(verified):
     rest = np.abs(force[inner]).max() / np.abs(force).max()
     verified("patch test: force on inner nodes of a homogeneous stretch", "exact: 0 (Irons)", rest, 1e-13)
     assert rest < 1e-13
-    # And found from elsewhere: the outer nodes held there, the inner ones displaced by hand.
+    # The solver finds it from another starting point: outer nodes fixed there, inner nodes displaced by hand.
     start = x.copy()
     start[inner] += 0.002 * np.random.default_rng(1).uniform(-1, 1, (len(inner), 3))
     held = lj.Scene(mesh=mesh, law=LAW, fixed=(lj.Fixed(nodes=jnp.asarray(outer)),), solve=lj.Solve(tolerance=1e-12))
@@ -85,7 +85,7 @@ def sheared(steps: int) -> lj.Scene:
 
 @pytest.mark.slow
 def test_an_elastic_state_has_no_memory():
-    """More load steps end at the same place."""
+    """More load steps end in the same state."""
     one, two = (np.asarray(lj.simulate(sheared(steps)).check().positions[-1]) for steps in (1, 2))
     assert np.abs(one - two).max() < 1e-8 * 0.03
 
@@ -134,7 +134,7 @@ def test_a_far_motion_is_cut_into_parts_and_a_hopeless_one_is_told():
     far = crushed(-0.085)
     assert int(far.status[0]) == status.CONVERGED
     assert int(far.statistics.cuts[0]) > 0
-    hopeless = crushed(-0.11)  # through the floor: infinite energy in between
+    hopeless = crushed(-0.11)  # through the floor: the energy in between is infinite
     assert int(hopeless.status[0]) != status.CONVERGED
     assert np.isfinite(np.asarray(hopeless.positions)).all()
     with pytest.raises(RuntimeError, match=r"step 1: .*smaller"):
@@ -142,7 +142,9 @@ def test_a_far_motion_is_cut_into_parts_and_a_hopeless_one_is_told():
 
 
 def march(scene: lj.Scene, runs: tuple[int, ...], duration: float, start: jax.Array | None = None) -> list:
-    """Runs with these numbers of steps by one program, the time step being a number: last states, all reactions."""
+    """Run with several numbers of steps in one program, with the time step as a parameter. Return last states and
+    reactions.
+    """
 
     @jax.jit
     def advance(state, k, dt):
@@ -210,7 +212,7 @@ def test_implicit_euler_only_dissipates():
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["euler", "newmark"])
 def test_momentum_changes_by_the_outer_forces(integrator):
-    # Sum of m a = weight + reactions, in every step, whatever happens inside.
+    # In every step, the sum of m a is weight + reactions, whatever happens inside the body.
     mesh = box()
     gravity = jnp.array([0.5, 0.0, -2.0])
     scene = lj.Scene(
@@ -239,7 +241,7 @@ def test_momentum_changes_by_the_outer_forces(integrator):
 
 @pytest.mark.slow
 def test_free_fall_is_exact(verified):
-    # A body that nothing holds moves rigidly: no stress, and implicit Euler's own sum of velocities.
+    # An unsupported body moves rigidly: without stress, and with implicit Euler's sum of velocities.
     mesh = box()
     n, dt, g = 10, 0.02, np.array([1.0, 2.0, -9.81])
     scene = lj.Scene(
@@ -267,7 +269,7 @@ def test_long_relaxation_leaves_the_elastic_state_with_less_stress(verified):
     slow = lj.simulate(lj.Scene(**parts, viscosity=TABLE_2, solve=lj.Solve(dt=0.1, steps=60))).check()
     remaining = 1 - float(jnp.sum(TABLE_2.ratios))
     size = np.abs(np.asarray(elastic.reactions)).max()
-    # After 5.9 s the longest memory, 0.27 s, is down to exp(-22).
+    # After 5.9 s the longest memory, with 0.27 s, has decayed to exp(-22).
     off = np.abs(np.asarray(slow.reactions[-1]) - remaining * np.asarray(elastic.reactions[-1])).max() / size
     verified("long relaxation: reactions", "elastic ones times 1 - sum of ratios (chapter 4.2)", off, 1e-7)
     assert off < 1e-7
@@ -289,7 +291,7 @@ def febio_cube(febio) -> lj.TetMesh:
 
 
 def held_and_moved(mesh: lj.TetMesh, **motion) -> dict:
-    """Its bottom held, its top moved."""
+    """Return fixed nodes at the bottom and moved nodes at the top, as arguments of a scene."""
     low, high = boundary.select(mesh, {"z_max": 0.0}), boundary.select(mesh, {"z_min": 1.0})
     return {
         "fixed": (lj.Fixed(nodes=jnp.asarray(low)),),
@@ -327,7 +329,8 @@ def test_viscous_ramp_and_hold_of_febio(febio, verified):
         at = np.rint(0.3 / n * np.arange(1, n + 1) / 0.0025).astype(int)
         ours = reactions[:, top_nodes].sum(axis=1)
         errors.append(np.abs(ours - theirs[at, 2:5]).max() / np.abs(theirs[:, 2:5]).max())
-    # Both recursions are exact for a stress that is linear over a step: second order, and FEBio's own steps remain.
+    # Both recursions are exact for a stress that is linear over a step. They are of second order, and FEBio's steps
+    # remain.
     order = np.log2(errors[0] / errors[1])
     verified("viscous ramp and hold: force, 60 steps", "FEBio, steps of 2.5 ms", errors[1], 2e-3, order)
     assert errors[1] < 2e-3
@@ -355,7 +358,7 @@ def test_a_scene_carries_only_what_it_has():
     assert len(jax.tree.leaves(initial_state(slow))) == 3  # positions, memory, last stress
     body = lj.Body(density=1000.0)
     assert len(jax.tree.leaves(initial_state(replace(plain, body=body, solve=lj.Solve(dt=0.1, kind="dynamic"))))) == 2
-    # And computes only that: the memory's exponentials, the sponge's logarithm, the load that follows.
+    # Only this is computed: the exponentials of the memory, the logarithm of the porous body, the load that follows.
     sponge = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
     porous = replace(plain, porosity=sponge, solve=lj.Solve(dt=0.1))
     assert not {"exp", "expm1", "log1p"} & _primitives(plain)
@@ -369,13 +372,15 @@ def _primitives(scene: lj.Scene) -> set[str]:
 
 @pytest.mark.slow
 def test_a_tolerance_below_roundoff_stalls_at_the_answer():
-    """In float32 no residual of 1e-8 can be met: the step says so, is not cut to pieces, and is near the root."""
+    """In float32 a residual of 1e-8 cannot be reached. The step reports this, is not cut, and is close to the
+    solution.
+    """
     mesh = box()
     scene = lj.Scene(mesh=mesh, law=LAW, fixed=(bottom(mesh),), displaced=(top(mesh, by=jnp.array([0.01, 0.0, 0.02])),))
     exact = lj.simulate(scene).check()
     single = lj.simulate(replace(scene, solve=replace(scene.solve, precision="float32")))
     assert int(single.status[0]) == status.STALLED and int(single.statistics.cuts[0]) == 0
-    # The residual's roundoff, some 1e-5 of the forces, is as much of the displacements.
+    # Rounding of the residual is about 1e-5 of the forces. The displacements have the same relative error.
     assert np.abs(np.asarray(single.positions, float) - np.asarray(exact.positions)).max() < 1e-4 * 0.02
 
 
@@ -419,18 +424,19 @@ def test_cooks_membrane(cells, allowed, verified):
         )
         x = np.asarray(lj.simulate(scene).check().positions[-1])
         k = np.argmin(np.linalg.norm(points - np.array([0.048, 0.052, 0]), axis=1))
-        errors.append(1 - (x - points)[k, 1] / 14.74e-3)  # linear elements are too stiff, on every mesh
+        errors.append(1 - (x - points)[k, 1] / 14.74e-3)  # linear elements are too stiff on every mesh
     order = np.log2(errors[0] / errors[1]) if len(cells) > 1 else None
     number = f"{6 * cells[-1] ** 2:,}"
     verified(f"Cook's membrane, {number} tetrahedra: rise", "14.74 mm (Miehe 1994)", errors[-1], allowed, order)
-    # Three for halved cells, near second order with the corner's singularity: 1 % of 64 cells is 9 % of 16.
+    # Near second order with the corner's singularity, halved cells have a third of the error: 1 % for 64 cells, 9 % for
+    # 16.
     assert 0 < errors[-1] < allowed
     assert order is None or errors[0] / errors[1] > 3
 
 
 @pytest.mark.slow
 def test_what_ends_unloaded_has_converged():
-    # Down and back to rest, with a bend inside a step: roundoff is no unbalanced force.
+    # Down and back to rest, with a kink inside a step. Rounding is not an unbalanced force.
     mesh = box(1)
     history = dict(times=jnp.array([0.0, 0.05, 0.25]), history=jnp.array([[0.0, 0, 0], [0, 0, 0.01], [0, 0, 0]]))
     scene = lj.Scene(mesh=mesh, law=LAW, fixed=(bottom(mesh),), displaced=(top(mesh, **history),))
@@ -451,5 +457,5 @@ def test_newmark_does_not_swing_where_motion_is_prescribed():
         solve=lj.Solve(kind="dynamic", dt=0.02, steps=40, integrator="newmark"),
     )
     pull = np.asarray(jnp.sum(lj.simulate(scene).check().reactions[:, scene.displaced[0].nodes, 2], axis=1))
-    # Constant speed: after the first step no inertia remains, the force follows the strain.
+    # At constant speed there is no inertia after the first step, and the force follows the strain.
     assert np.abs(np.diff(pull[2:], n=2)).max() < 0.02 * pull[-1]

@@ -1,4 +1,4 @@
-"""Linear and nonlinear solvers: residuals, counts, codes, implicit derivatives."""
+"""Linear and nonlinear solvers: residuals, counts, status codes, implicit derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ def test_conjugate_gradients_report_what_they_did():
     assert s.iterations == 1
     zero, s = conjugate_gradients(lambda v: A @ v, 0 * b, _none, 1e-10, 100)
     assert s.iterations == 0 and not zero.any()
-    # An indefinite matrix is noticed instead of followed.
+    # An indefinite matrix is detected, and the iteration stops.
     _, s = conjugate_gradients(lambda v: -(A @ v), b, _none, 1e-10, 100)
     assert s.iterations <= 1 and s.residual > 0.1
 
@@ -66,7 +66,7 @@ def test_a_wrong_solution_does_not_pass_for_one():
 
 
 def _solve(p, start=None, **options):
-    """A x + p x^3 = b."""
+    """Solve A x + p x^3 = b."""
     start = jnp.zeros_like(b) if start is None else start
     settings = newton.NewtonOptions(**({"tolerance": 1e-13} | options))
     return newton.newton_root(lambda x: A @ x + p * x**3 - b, start, _none, jnp.linalg.norm(b), settings)
@@ -92,7 +92,7 @@ def test_newton_tells_the_truth_when_it_fails():
 
 
 def test_newton_halves_a_step_that_overshoots():
-    # From 3 the full Newton step for atan leaves every bound.
+    # From 3, the full Newton step for atan diverges.
     x, s = newton.newton_root(jnp.arctan, jnp.array([3.0]), _none, 1.0, newton.NewtonOptions(tolerance=1e-12))
     assert s.status == status.CONVERGED and abs(x[0]) < 1e-12
 
@@ -106,7 +106,8 @@ def test_a_solve_begun_near_its_solution_is_as_exact_and_takes_less():
         taken.append(int(s.iterations))
         return x, s.residual
 
-    for near in (jnp.zeros(20), exact + 1e-5 * b, 1e3 * b):  # the last is farther away than 0: left out
+    # the last starting point is farther away than 0, and is not used
+    for near in (jnp.zeros(20), exact + 1e-5 * b, 1e3 * b):
         x, residual = started(solver, lambda v: A @ v, b, near, 1e-10)
         left = float(jnp.linalg.norm(b - A @ x) / jnp.linalg.norm(b))
         assert left < 1e-10 and np.isclose(float(residual), left, rtol=1e-3)
@@ -114,7 +115,7 @@ def test_a_solve_begun_near_its_solution_is_as_exact_and_takes_less():
 
 
 def test_derivatives_handed_from_step_to_step():
-    """x_k = A^-1 (x_(k-1)^2 + p): the next solve begins with those before, in both modes, and changes no number."""
+    """For x_k = A^-1 (x_(k-1)^2 + p), the next solve begins with earlier ones, in both modes, and no result changes."""
     found = []
 
     def solver(b, earlier):
@@ -133,7 +134,7 @@ def test_derivatives_handed_from_step_to_step():
     plain, handed = (jax.grad(lambda p, h=h: end(p, h))(b) for h in (False, True))
     jax.effects_barrier()
     assert np.allclose(plain, handed, rtol=1e-12, atol=0)
-    # Reverse mode: the first solve of the way back has none before it, the next that one, then both, the latest first.
+    # In reverse mode, the first solve has no earlier one, the second has one, and the third has both, the latest first.
     (first, x), (second, y), (third, _) = ((Earlier(*e), x) for e, x in found[-3:])
     assert not first.solutions.any() and np.array_equal(second.solutions[0], x) and not second.solutions[1:].any()
     assert np.array_equal(third.solutions[:2], [y, x]) and np.allclose(third.loads[:2], [A @ y, A @ x], rtol=1e-10)
@@ -142,7 +143,7 @@ def test_derivatives_handed_from_step_to_step():
 
 
 def test_earlier_solves_of_nearly_the_same_loads_are_combined():
-    """Loads on a curve in time, hardly apart: the next is foretold as by a polynomial of their number."""
+    """Loads on a curve in time are nearly equal. The next load is extrapolated as by a polynomial through them."""
 
     def load(t):
         return jnp.sin(jnp.arange(20.0) + t) + t**2 * b
@@ -155,7 +156,7 @@ def test_earlier_solves_of_nearly_the_same_loads_are_combined():
     line = jnp.linalg.norm(new - 2 * earlier.loads[0] + earlier.loads[1]) / jnp.linalg.norm(new)
     assert left < 1e-6 < 1e-5 < line
     assert not no_earlier(b, b).combined(b).any()
-    # The same load many times over says nothing new, and harms nothing.
+    # The same load several times adds no information, and causes no error.
     same = no_earlier(b, b)
     for _ in range(EARLIER):
         same = same.with_latest(b, A @ b)
@@ -163,7 +164,9 @@ def test_earlier_solves_of_nearly_the_same_loads_are_combined():
 
 
 def test_a_guess_takes_up_what_the_last_steps_foretold():
-    """Roots 1 + k/10 + k^2/20, guessed straight on: always short by 1/10, which the third guess makes up for."""
+    """The solutions are 1 + k/10 + k^2/20, and the guess is a linear extrapolation. It is always 1/10 too small. From
+    the third step on, the guess contains this error.
+    """
 
     def root(k):
         return 1 + 0.1 * k + 0.05 * k**2
@@ -212,7 +215,7 @@ def test_a_second_derivative_of_steps_is_right_or_nan_never_another_number():
         return jax.lax.scan(step, jnp.full(1, 0.4), None, length=2)[0][0]
 
     a, slope = jnp.asarray(2.0), jax.grad(end)
-    differences = (slope(a + 1e-4) - slope(a - 1e-4)) / 2e-4  # off by 1e-8, the square of the width
+    differences = (slope(a + 1e-4) - slope(a - 1e-4)) / 2e-4  # an error of 1e-8, the square of the step width
     for second in (jax.jacfwd(jax.jacfwd(end)), jax.grad(jax.jacfwd(end))):
         assert np.isclose(second(a), differences, rtol=1e-7)
     for second in (jax.hessian(end), jax.grad(slope)):
@@ -227,7 +230,7 @@ def test_lanes_do_not_disturb_each_other():
 
 
 def test_a_step_that_fails_in_one_go_is_followed_in_parts():
-    """log q + 5 = 0 from q = 1: full steps leave the domain until the part is an eighth."""
+    """For log q + 5 = 0 from q = 1, full steps leave the domain until the part of the load is an eighth."""
     method = Problem(
         residual=lambda q, s: (jnp.log(q) + 5, jnp.ones(()), None),
         tangent=lambda q, s, by, near: 1 / q,
@@ -237,7 +240,7 @@ def test_a_step_that_fails_in_one_go_is_followed_in_parts():
     )
     options = StepOptions(max_halvings=0)
     cuts = []
-    for guess in (None, jnp.array([-1.0])):  # a guess that is out of the domain costs no cut
+    for guess in (None, jnp.array([-1.0])):  # a guess outside the domain causes no cut
         q, s, kept = jax.jit(lambda q, g=guess: step_cutting.solve(method, q, options, g))(jnp.ones(1))
         assert s.status == status.CONVERGED and bool(kept.made)
         assert np.allclose(q, np.exp(-5), rtol=1e-7)
@@ -249,7 +252,7 @@ def test_a_step_that_fails_in_one_go_is_followed_in_parts():
 
 @pytest.mark.parametrize("kinks", [True, False])
 def test_where_springs_come_to_act_a_direction_halved_in_vain_is_taken_whole(kinks):
-    """Two stiff springs that only press: the second acts from a thousandth of the way on, and |r| rises."""
+    """Two stiff springs act in compression only. The second one acts after a thousandth of the step, and |r| rises."""
     n = jnp.array([[2.0, 1.0], [0.1, -1.0]])
     gap, k, rest = jnp.array([0.0, 1e-4 - 1.0]), jnp.array([1e3, 1e7]), jnp.array([0.0, -1.0])
     method = Problem(
@@ -262,7 +265,7 @@ def test_where_springs_come_to_act_a_direction_halved_in_vain_is_taken_whole(kin
     )
     start = jnp.array([1.0, -1.0])
     q, s, _ = jax.jit(lambda q: step_cutting.solve(method, q, StepOptions(tolerance=1e-10)))(start)
-    # Both press at the end. Parts of the step find it too, with many more solves.
+    # Both act at the end. Parts of the step find this solution too, with many more solves.
     both = np.linalg.solve(np.eye(2) + n.T @ (k[:, None] * n), rest - n.T @ (k * gap))
     assert s.status == status.CONVERGED and np.allclose(q, both, rtol=1e-8)
     assert (s.cuts == 0) == kinks == (s.iterations <= 4)

@@ -1,4 +1,4 @@
-"""A smooth spectrum of tests in time, of several tests and of several samples, against models in closed form."""
+"""A smooth spectrum of relaxation and creep tests, of several tests and of several samples, against closed forms."""
 
 import json
 from functools import partial
@@ -25,7 +25,7 @@ NEAR = Maxwell(np.float64(800.0), np.array([0.3, 0.2]), np.array([30.0, 0.5]))
 
 
 def in_time(kind: str, name: str = NAME, noise: float = 0.003, seed: int = 0) -> reader.TimeTest:
-    """A step at 0, answered as Mittag-Leffler functions do."""
+    """A test with a step at 0, whose response is a Mittag-Leffler function."""
     answer = inverse_laplace(name, kind == "creep")
     answer = answer * (1 + noise * np.random.default_rng(seed).standard_normal(len(TIMES)))
     time, answer = np.concatenate([[0.0], TIMES]), np.concatenate([[np.nan], answer])
@@ -47,12 +47,12 @@ def test_the_spectrum_of_a_test_in_time_has_the_moduli_of_the_material(kind):
     omega = 1 / TIMES[4:-4]
     storage, _ = generalised_maxwell.moduli(found.model, omega)
     true = FORMULAS[NAME](1j * omega, *TRUTHS[NAME])
-    # Half a decade inside the band, noise of 0.3 % on 25 answers: |G*| to 1 %.
+    # Half a decade inside the band, with noise of 0.3 % on 25 points, |G*| is exact to 1 %.
     assert np.allclose(storage, true.real, rtol=0.01)
 
 
 def test_no_start_of_scipy_is_below_the_spectrum_of_creep():
-    """Creep is not linear in the strengths; the tangents must end where bounded least squares of SciPy do."""
+    """Creep is not linear in the strengths. The iteration must end where bounded least squares of SciPy end."""
     test = in_time("creep", "fractional_kelvin_voigt")
     told, grid, found = spectrum_of_tests.spectrum_of([test], NEAR, np.ones(1))
     L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
@@ -69,7 +69,7 @@ def test_no_start_of_scipy_is_below_the_spectrum_of_creep():
     for _ in range(8):
         start = np.exp(rng.uniform(-4, 1, len(found.x)))
         best = scipy.optimize.least_squares(rows, start, slopes, bounds=(0, np.inf), max_nfev=300)
-        assert own <= 2 * best.cost * (1 + 1e-4)  # the iteration ends where a step gains 1e-9; SciPy at 1e-8
+        assert own <= 2 * best.cost * (1 + 1e-4)  # the iteration ends if a step gains less than 1e-9; SciPy's at 1e-8
     assert told.effective < 12
 
 
@@ -134,10 +134,11 @@ def test_the_commands_write_spectra(words, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("labels", "criteria", "chosen"),
     [
-        ((Label("spectrum"), Label("prony", 2)), (0, 5), 1),  # a spectrum can be modes: 5 is no strong evidence
+        ((Label("spectrum"), Label("prony", 2)), (0, 5), 1),  # a spectrum contains modes, so 5 is not strong evidence
         ((Label("spectrum"), Label("prony", 2)), (0, 7), 0),
         ((Label("fractional_parallel"), Label("fractional_kelvin_voigt")), (0, 3), 1),
-        ((Label("fractional_maxwell"), Label("fractional_kelvin_voigt")), (0, 3), 0),  # neither is a case of the other
+        # neither is a special case of the other
+        ((Label("fractional_maxwell"), Label("fractional_kelvin_voigt")), (0, 3), 0),
         ((Label("fractional_zener"), Label("prony", 1)), (0, 3), 1),
         ((Label("fractional_zener"), Label("prony", 2)), (0, 3), 0),
         ((Label("prony", 3), Label("prony_fluid", 3)), (0, 3), 1),

@@ -1,4 +1,4 @@
-"""Springpot models of tests in time and of several tests, against inverse Laplace transforms by mpmath."""
+"""Springpot models of relaxation and creep tests and of several tests, against inverse Laplace transforms by mpmath."""
 
 import json
 
@@ -30,7 +30,7 @@ def logit(p: float) -> float:
 
 
 def places(name: str) -> np.ndarray:
-    """The six numbers of the code (reference 1 rad/s) of the literature's parameters."""
+    """Return the six numbers of the code (reference 1 rad/s) for the literature's parameters."""
     v = TRUTHS[name]
     u = np.zeros(springpots.SIZE)
     if name == "fractional_zener":
@@ -49,7 +49,7 @@ def places(name: str) -> np.ndarray:
 
 
 def inverse_laplace(name: str, creep: bool, times: np.ndarray = TIMES) -> np.ndarray:
-    """G(t) [Pa] or J(t) [1/Pa] after a step: what Mittag-Leffler functions give, by Talbot's contour."""
+    """Return G(t) [Pa] or J(t) [1/Pa] after a step, which are Mittag-Leffler functions, by Talbot's contour."""
 
     def transformed(s):
         G = FORMULAS[name](s, *TRUTHS[name])
@@ -63,7 +63,7 @@ def test_the_modes_of_a_springpot_answer_as_mittag_leffler_functions(name):
     times = springpots.times_of_modes(TIMES[0], TIMES[-1])
     made = springpots.as_modes(jnp.asarray(places(name)), CASES[name].switches, jnp.asarray(times), 1.0)
     model = Maxwell(*(np.asarray(v) for v in made))
-    # The trapezium rule converges exponentially; what is left is of the spectrum beyond its ends.
+    # The trapezium rule converges exponentially. The rest comes from the spectrum beyond its ends.
     few = TIMES[::4]
     assert np.allclose(time_response.relaxation_modulus(model, few), inverse_laplace(name, False, few), rtol=5e-4)
     assert np.allclose(time_response.creep_compliance(model, few), inverse_laplace(name, True, few), rtol=5e-4)
@@ -79,7 +79,8 @@ def test_a_relaxation_test_gives_the_numbers_of_a_springpot_model_back(tmp_path,
     (tmp_path / "a.csv").write_text("\n".join(["time_s,relaxation_modulus_Pa", *rows]) + "\n")
     assert main(["relaxation", str(tmp_path / "a.csv"), "--model", "auto", "--out", str(tmp_path / "out")]) == 0
     content = json.loads((tmp_path / "out" / "fit.json").read_text())
-    # A step long ago shows how the model ends; tau = 0.05 s is before the first answer, so two numbers are left free.
+    # Long after the step only the end of the model shows. tau = 0.05 s is before the first point, so two numbers are
+    # free.
     tried = {row["model"]: row for row in content["details"]["tried"]}
     assert set(CASES) < set(tried) and content["mean_relative_error"] < 0.006
     assert tried["fractional_zener"]["above_the_lowest"] < 10 and "Prony modes" in capsys.readouterr().out
@@ -101,7 +102,9 @@ def test_creep_gives_them_too(tmp_path):
 
 @pytest.mark.slow
 def test_a_sweep_and_a_relaxation_test_together(tmp_path, capsys):
-    """The relaxation time of this model, 0.05 s, is within the sweep's band, its equilibrium within the other's."""
+    """The relaxation time of this model, 0.05 s, is in the sweep's band; its equilibrium is in the range of the other
+    test.
+    """
     rng, omega = np.random.default_rng(1), np.geomspace(0.5, 300, 20)
     G = FORMULAS["fractional_zener"](1j * omega, *TRUTHS["fractional_zener"])
     factor = 1 + 0.01 * rng.standard_normal((2, 20))
@@ -166,7 +169,7 @@ def test_every_model_reaches_the_best_of_a_hundred_starts_of_scipy(kind, file):
                 return rows(u) is not None and seen[u.tobytes()][1]
 
             found = scipy.optimize.least_squares(rows, start, slopes, method="lm", max_nfev=200)
-            # An exponent within 1e-3 of 1 is a dashpot: on two records it answers at the first times alone.
+            # An exponent within 1e-3 of 1 is a dashpot. In two records it acts only at the first times.
             if found.x[CASES[fit.kind.name].free.index(3)] < 7:
                 best = min(best, found.cost)
         assert float(fit.solution.cost) <= best * (1 + 1e-4), fit.kind.name
@@ -174,7 +177,7 @@ def test_every_model_reaches_the_best_of_a_hundred_starts_of_scipy(kind, file):
 
 @pytest.mark.slow
 def test_the_posterior_of_springpots_in_time_has_the_errors_of_the_fit():
-    """A model that the test determines well: deviations of the draws are the standard errors, and means the numbers."""
+    """The test determines the model well. Deviations of the draws are the standard errors, and their means the fit."""
     answer = inverse_laplace("fractional_kelvin_voigt", False)
     answer = answer * (1 + 0.005 * np.random.default_rng(0).standard_normal(25))
     time, answer = np.concatenate([[0.0], TIMES]), np.concatenate([[np.nan], answer])
@@ -185,14 +188,14 @@ def test_the_posterior_of_springpots_in_time_has_the_errors_of_the_fit():
     drawn = posterior.of_time_test(fit, test, 500)
     assert drawn.names == fit.kind.names and np.all(drawn.r_hat < 1.02)
     draws, own = drawn.draws.reshape(-1, 3), fit.parameters
-    # Student's t of 22 degrees of freedom is 5 % wider than the normal one, 2,000 draws scatter by 2 %.
+    # Student's t with 22 degrees of freedom is 5 % wider than the normal one. 2,000 draws scatter by 2 %.
     assert np.allclose(draws.std(axis=0), own.standard_errors, rtol=0.25)
     assert np.all(np.abs(draws.mean(axis=0) - own.values) < 0.5 * own.standard_errors)
 
 
 @pytest.mark.slow
 def test_fish_muscle_relaxes_as_two_springpots_in_a_row():
-    """pyRheo shows its fractional Maxwell model on this record; modes need eleven numbers and follow it less well."""
+    """pyRheo shows its fractional Maxwell model for this record. Modes need eleven numbers and fit less well."""
     file = SHARED / "data" / "rheology" / "pyrheo" / "stressrelaxation_fishmuscle_data.csv"
     if not file.exists():
         pytest.skip("the record of fish muscle is not here")

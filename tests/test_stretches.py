@@ -1,4 +1,4 @@
-"""Stretch-based laws against 40-digit arithmetic and polynomial cases, where stretches are equal or nearly so."""
+"""Stretch-based laws against 40-digit arithmetic and polynomial cases, with equal or nearly equal stretches."""
 
 from functools import cache, partial
 
@@ -18,7 +18,7 @@ RNG = np.random.default_rng(11)
 
 
 def rotation() -> np.ndarray:
-    """A random one."""
+    """Return a random rotation."""
     Q = np.linalg.qr(RNG.standard_normal((3, 3)))[0]
     return Q * np.sign(np.linalg.det(Q))
 
@@ -42,7 +42,10 @@ LAWS = {
 
 
 def exact(law: lj.Law, stretches: tuple, *orders: tuple) -> list[float]:
-    """Derivatives of the printed energy by the principal stretches with 60 digits; an order is one count a stretch."""
+    """Return derivatives of the published energy with respect to the principal stretches, with 60 digits.
+
+    An order is one count per stretch.
+    """
     mpmath.mp.dps = 60
     number = lambda v: mpmath.mpf(float(v))  # noqa: E731
 
@@ -68,7 +71,8 @@ def exact(law: lj.Law, stretches: tuple, *orders: tuple) -> list[float]:
 
 
 FIRST = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-#: Bogen's law is a term of Ogden's, and tests/test_law_values.py has its numbers: by default Ogden's stands for both.
+#: Bogen's law is a term of Ogden's, and tests/test_law_values.py checks its numbers. By default Ogden's law stands for
+#: both.
 NAMES = [pytest.param(name, marks=pytest.mark.slow) if name == "bogen" else name for name in LAWS]
 
 
@@ -78,14 +82,14 @@ def _by_hand(law, F):
 
 
 def by_hand(law: lj.Law, F: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Energy, stress and tangent; one program for all tests with as many F."""
+    """Return energy, stress and tangent. One program serves all tests with equally many F."""
     return tuple(np.asarray(v) for v in _by_hand(law, F))
 
 
 @pytest.mark.parametrize("name", [n if n != "logarithmic" else pytest.param(n, marks=pytest.mark.slow) for n in NAMES])
 def test_energy_and_stress_against_high_precision(name):
     law = LAWS[name]
-    # The stretches are given, F is their product with rotations: both sides see the same numbers on the diagonal.
+    # The stretches are given, and F is their product with rotations. Both computations use the same diagonal.
     F = np.stack([np.diag(s) for s in CASES.values()])
     energy, P, _ = by_hand(law, F)
     for k, stretches in enumerate(CASES.values()):
@@ -101,7 +105,7 @@ def test_energy_and_stress_against_high_precision(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_tangent_against_high_precision(name):
-    # Principal form of the tangent (Ogden 1997, section 6.1.4): A_iijj = d2W/dlambda_i dlambda_j and, of unequal
+    # Principal form of the tangent (Ogden 1997, section 6.1.4): A_iijj = d2W/dlambda_i dlambda_j. For unequal
     # stretches, A_ijij +- A_ijji = (P_i -+ P_j)/(lambda_i -+ lambda_j).
     law, stretches = LAWS[name], (1.4, 0.8, 1.1)
     A, P = by_hand(law, np.stack([np.diag(stretches)] * len(CASES)))[2][0], exact(law, stretches, *FIRST)
@@ -117,7 +121,7 @@ def test_tangent_against_high_precision(name):
 
 
 def polynomial(theta, F):
-    """Ogden's law with exponents 4 and -2 written on the invariants, quadratic U(J)."""
+    """Return Ogden's law with exponents 4 and -2, written with invariants, and quadratic U(J)."""
     C, J = F.T @ F, jnp.linalg.det(F)
     I1 = jnp.trace(C)
     I2 = (I1**2 - jnp.trace(C @ C)) / 2
@@ -135,11 +139,11 @@ THETA = jnp.array([100.0, -200.0, 7000.0])
 
 @cache
 def gradients() -> jax.Array:
-    """Deformation gradients of `CASES` between two rotations."""
+    """Return the deformation gradients of `CASES` between two rotations."""
     return jnp.stack([jnp.asarray(rotation() @ np.diag(s) @ rotation()) for s in CASES.values()])
 
 
-#: The exact derivatives, of which several tests need the same.
+#: The exact derivatives, which several tests need.
 EXACT = {
     "stress": jax.grad(polynomial, 1),
     "tangent": jax.hessian(polynomial, 1),
@@ -205,13 +209,13 @@ def test_derivatives_where_stretches_are_equal(what, ours, exact, limit):
     axes = tuple(range(1, a.ndim))
     assert np.isfinite(a).all()
     size = np.abs(b).max(axis=axes)
-    # At rest some derivatives are zero: the median case says how large their terms are.
+    # At rest some derivatives are zero. The median case gives the size of their terms.
     assert (np.abs(a - b).max(axis=axes) / np.maximum(size, np.median(size))).max() < limit
 
 
 @pytest.mark.slow
 def test_derivative_by_the_exponent_has_the_v_shape():
-    # Central differences fall with h^2 and rise with eps/h; the lowest point is near eps^(2/3).
+    # Central differences fall with h^2 and rise with eps/h. Their minimum is near eps^(2/3).
     F = gradients()
 
     def tangent(alpha):
@@ -243,7 +247,7 @@ def test_derivatives_beyond_the_third_are_refused():
     "name", [pytest.param(n, marks=[pytest.mark.slow] if n in ("ogden", "bogen", "logarithmic") else []) for n in LAWS]
 )
 def test_single_precision(name):
-    # float32 carries 6e-8; C = F^T F of these stretches is conditioned by (3.0/0.2)^2.
+    # float32 has a rounding error of 6e-8. The condition number of C = F^T F for these stretches is (3.0/0.2)^2.
     F = np.asarray(gradients())
     _, P, A = by_hand(LAWS[name], F)
     _, P32, A32 = by_hand(LAWS[name], F.astype(np.float32))
@@ -260,7 +264,7 @@ def test_principal_stretches_of_many_matrices():
     logs, axes = jax.jit(principal.principal)(unpack(jnp.asarray(F)))
     ours = np.sort(np.exp(np.stack(logs, axis=-1)), axis=-1)
     exact = np.sort(np.linalg.svd(F, compute_uv=False), axis=-1)
-    # F N is rounded to eps |F|: relative to the smallest stretch up to e^4 eps, times the 3 products of a sum.
+    # F N is rounded to eps |F|. Relative to the smallest stretch this is up to e^4 eps, times the 3 products of a sum.
     assert np.abs(ours / exact - 1).max() < 6 * np.exp(4) * np.finfo(float).eps
     N = np.stack([np.stack(row, axis=-1) for row in axes], axis=-2)
     assert np.abs(np.einsum("nki,nkj->nij", N, N) - np.eye(3)).max() < 30 * np.finfo(float).eps

@@ -1,4 +1,4 @@
-"""Supports: springs against what they must balance, sliding planes against the same body turned."""
+"""Supports: springs compared with the loads that they balance, sliding planes compared with the same body rotated."""
 
 from typing import ClassVar
 
@@ -31,7 +31,7 @@ def box() -> lj.TetMesh:
 
 
 def part(mesh: lj.TetMesh, **where) -> np.ndarray:
-    """Nodes of a place."""
+    """Return the nodes of a region of the boundary."""
     return lj.boundary.select(mesh, where)
 
 
@@ -48,11 +48,11 @@ def pulled(mesh: lj.TetMesh, value, **more) -> lj.Scene:
 
 
 def test_a_physics_that_needs_the_time_step_says_so():
-    """A physics of one's own ended in a TypeError where a scene has no dt."""
+    """Without dt in the scene, a user-defined physics object ended in a TypeError."""
 
     @lj.struct
     class Damper(ElasticSupport):
-        """In name only."""
+        """A support that claims to need the time step."""
 
         in_time: ClassVar[bool] = True
 
@@ -63,7 +63,7 @@ def test_a_physics_that_needs_the_time_step_says_so():
 
 @pytest.mark.slow
 def test_springs_stiffer_than_the_digits_allow_are_told_as_roundoff():
-    """1e14 Pa/m times the rounding of positions is above the tolerance: no shorter step helps, and none is tried."""
+    """1e14 Pa/m times the rounding of positions is above the tolerance. No shorter step helps, and none is tried."""
     mesh = box()
     scene = pulled(
         mesh, [0.0, 0.0, 30.0], physics=(springs(mesh, part(mesh, z_max=0.0), normal=1e14, tangential=1e14),)
@@ -71,13 +71,15 @@ def test_springs_stiffer_than_the_digits_allow_are_told_as_roundoff():
     glued = pulled(mesh, [0.0, 0.0, 30.0], fixed=(lj.Fixed(nodes=part(mesh, z_max=0.0)),))
     result, held = lj.simulate(scene), lj.simulate(glued).check().positions[-1]
     assert int(result.status[-1]) == status.STALLED and int(result.statistics.cuts[-1]) == 0
-    # The residual that is left times the compliance of a tissue of 1 kPa.
+    # The remaining residual times the compliance of a tissue of 1 kPa.
     assert np.abs(result.positions[-1] - held).max() < 1e-5 * np.abs(held - mesh.points).max()
 
 
 @pytest.mark.slow
 def test_springs_along_the_normal_carry_the_whole_pull():
-    """p on top, k below, sides that slide: uniform stress, so the bottom moves by p/k exactly, whatever the mesh."""
+    """Traction p on top, springs k below, sliding sides: the stress is uniform, so the bottom moves by p/k in every
+    mesh.
+    """
     mesh = box()
     sides = (on_plane(mesh, part(mesh, x_max=0.0)), on_plane(mesh, part(mesh, y_max=0.0)))
     scene = pulled(mesh, [0.0, 0.0, 30.0], physics=(springs(mesh, part(mesh, z_max=0.0), normal=5e4), *sides))
@@ -87,14 +89,16 @@ def test_springs_along_the_normal_carry_the_whole_pull():
         found = lj.simulate(lj.with_parameters(scene, {"support.0.normal": k}))
         return found.positions[-1, part(mesh, z_max=0.0), 2]
 
-    # Residual 1e-8 of the forces at work, which are some times the pull.
+    # The residual is 1e-8 of the acting forces, which are a few times the load.
     lifted, slope = jax.jvp(lift, (5e4,), (1.0,))
     assert np.allclose(lifted, 30.0 / 5e4, rtol=1e-6)
     assert np.allclose(slope, -30.0 / 5e4**2, rtol=1e-6)
 
 
 def test_springs_of_quadratic_elements_are_integrated():
-    """u = c x^2 along the normal: k c^2/2 of the integral of x^4. Springs at the nodes gave 1.003 times this energy."""
+    """For u = c x^2 along the normal, the energy is k c^2/2 times the integral of x^4. Springs at the nodes gave 1.003
+    times this.
+    """
     mesh = lj.quadratic(box())
     support = springs(mesh, part(mesh, z_max=0.0), normal=5e4)
     step = Step(mesh, mesh.points, 1, 1, None, False, None, Free(jnp.ones_like(mesh.points)))
@@ -105,13 +109,13 @@ def test_springs_of_quadratic_elements_are_integrated():
 
 @pytest.mark.slow
 def test_springs_along_the_surface_carry_shear():
-    """A stiff cube pushed sideways: the springs of its sole give way by p/k, those of its weightless top do not act."""
+    """A stiff cube is pushed sideways. The springs of its bottom yield by p/k; those of its unloaded top do not act."""
     mesh = box()
     sole = springs(mesh, part(mesh, z_max=0.0), tangential=2e3, normal=1e9)
     stiff = replace(pulled(mesh, [3.0, 0.0, 0.0]), law=lj.laws.NeoHookean(mu=1e8, bulk=1e9), physics=(sole,))
     lj.check_scene(stiff)
     moved = np.asarray(lj.simulate(stiff).check().positions[-1] - mesh.points)
-    # A rigid cube: shear adds p/mu and turning p/(k_n side) times some, 1e-4 of it together.
+    # The cube is rigid. Its shear adds p/mu, and its rotation some times p/(k_n side): together 1e-4.
     assert np.allclose(moved[part(mesh, z_max=0.0), 0], 3.0 / 2e3, rtol=1e-3)
 
 
@@ -126,7 +130,7 @@ def test_springs_on_nodes():
     assert np.allclose(carried, [0.0, 0.0, 30.0 * SIDE**2], atol=1e-6 * 30.0 * SIDE**2)
 
 
-TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3  # a rotation along no axis
+TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3  # a rotation about none of the axes
 
 
 @pytest.mark.slow
@@ -141,7 +145,9 @@ TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3  # a
     ids=["cg", "direct", "robust", "newmark"],
 )
 def test_a_turned_body_slides_as_the_straight_one(changes):
-    """The straight body slides along axes, which are left out of the unknowns; the turned one along its normals."""
+    """The straight body slides along axes, which are left out of the unknowns. The rotated body slides along
+    normals.
+    """
     mesh = box()
     turned = lj.tet_mesh(np.asarray(mesh.points) @ TURN.T, mesh.tetrahedra)
     held = jnp.asarray(part(mesh, z_max=0.0, x_max=0.0, y_max=0.0))
@@ -158,7 +164,7 @@ def test_a_turned_body_slides_as_the_straight_one(changes):
             physics=(
                 on_plane(body, low),
                 on_plane(body, side),
-                # Turning about the normal of the low plane is held by springs.
+                # Springs prevent a rotation about the normal of the low plane.
                 ElasticSupport(nodes=jnp.asarray(low), stiffness=1.0),
             ),
             solve=lj.Solve(**changes),
@@ -185,7 +191,7 @@ def test_reactions_of_a_slide_are_along_its_normal():
 
 
 def _forces(scene: lj.Scene) -> dict[str, np.ndarray]:
-    """Force [N] of every part at the end of a run, from the table of reactions; (3,) each."""
+    """Return the forces (3,) [N] of all parts at the end of a run, from the table of reactions."""
     names, rows = reaction_table(scene, lj.simulate(scene).check())
     last = dict(zip(names, rows[-1], strict=True))
     parts = dict.fromkeys(name.rpartition(".")[0] for name in names if name.endswith("_N"))
@@ -195,13 +201,15 @@ def _forces(scene: lj.Scene) -> dict[str, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_three_planes_of_symmetry_carry_what_pulls_at_them(order):
-    """Uniaxial tension by 1 N: the plane across the pull carries it all, the planes along it nothing."""
+    """Uniaxial tension by 1 N: the plane perpendicular to the load carries all of it, the planes parallel to it
+    nothing.
+    """
     mesh = box() if order == 1 else lj.quadratic(box())
     planes = tuple(on_plane(mesh, part(mesh, **{f"{axis}_max": 0.0})) for axis in "xyz")
     scene = pulled(mesh, [0.0, 0.0, 100.0], physics=planes)
     found = _forces(scene)
     assert np.allclose([found[f"support.{k}"] for k in range(3)], [[0, 0, 0], [0, 0, 0], [0, 0, -1.0]], atol=1e-6)
-    # The same with one plane held by its axis instead, and sideways: what two hold counts once.
+    # The same with one plane fixed along its axis and sideways: what two supports fix counts once.
     shear = replace(
         pulled(mesh, [30.0, 0.0, 100.0], physics=planes[:2]),
         fixed=(
@@ -218,7 +226,7 @@ def test_three_planes_of_symmetry_carry_what_pulls_at_them(order):
 
 @pytest.mark.slow
 def test_an_oblique_plane_has_a_force_along_its_normal_alone():
-    """A cube turned by 30 degrees about z, between planes: the oblique ones share edges with the base."""
+    """A cube rotated by 30 degrees about z, between planes. The oblique planes share edges with the base."""
     mesh, c, s = box(), np.cos(np.pi / 6), np.sin(np.pi / 6)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     turned = with_points(mesh, mesh.points @ turn.T)
@@ -231,7 +239,7 @@ def test_an_oblique_plane_has_a_force_along_its_normal_alone():
 
 
 def scene_text(*support) -> dict:
-    """The content of a scene file with these supports."""
+    """Return the content of a scene file with these supports."""
     return {
         "mesh": {"shape": "box", "size": [0.1, 0.1, 0.1], "cells": [2, 2, 2]},
         "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
@@ -254,7 +262,7 @@ def test_supports_of_a_scene_file():
     [
         (
             {"where": {"z_max": 0.0}},
-            "support.0 has only a place: give normal, tangential, stiffness, history or sliding",
+            "support.0 has only where or set: give normal, tangential, stiffness, history or sliding",
         ),
         ({"where": {"z_max": 0.0}, "normal": -1.0}, "support.0.normal = -1.0 must be at least 0 Pa/m"),
         ({"where": {"z_max": 0.0}, "normal": "soft"}, "support.0.normal = 'soft' is not a number"),
@@ -262,7 +270,7 @@ def test_supports_of_a_scene_file():
         ({"where": {"z_max": 0.0}, "sliding": False}, "support.0 sliding = False is not true"),
         ({"where": {"z_max": 0.05}, "sliding": True}, "off one plane"),
         ({"where": {"z_max": 0.0}, "norml": 1.0}, "did you mean normal"),
-        ({"where": {"z_max": 0.0}, "sliding": True}, "nothing holds the body against every rigid motion"),
+        ({"where": {"z_max": 0.0}, "sliding": True}, "do not prevent every rigid motion of the body"),
     ],
 )
 def test_bad_supports_are_refused(support, words):
@@ -270,7 +278,7 @@ def test_bad_supports_are_refused(support, words):
         scene_from(scene_text(support))
 
 
-@pytest.mark.slow  # by default tests/test_pay_for_what_is_there.py looks for the equations themselves
+@pytest.mark.slow  # the default run of tests/test_pay_for_what_is_there.py compares the equations themselves
 def test_a_scene_without_supports_pays_nothing():
     mesh = box()
     plain = pulled(mesh, [0.0, 0.0, 30.0], fixed=(lj.Fixed(nodes=jnp.asarray(part(mesh, z_max=0.0))),))
@@ -282,18 +290,18 @@ def test_a_scene_without_supports_pays_nothing():
 
 @pytest.mark.parametrize("run", [lj.simulate, lambda scene: lj.harmonic(scene, [1.0]), lj.check_scene])
 def test_two_planes_given_by_normals_share_no_node(run):
-    """The last plane alone held the nodes of their edge, and nothing was said of scenes made in Python."""
+    """Only the last plane constrained the nodes of their edge. Scenes made in Python gave no message."""
     mesh = box()
     places = ({"x_max": 0.0}, [1.0, 0.0, 0.0]), ({"z_max": 0.0}, [0.0, 0.0, 1.0])
     slides = tuple(SlidingSupport(nodes=jnp.asarray(part(mesh, **w)), normal=jnp.asarray(n)) for w, n in places)
     scene = replace(pulled(mesh, [0.0, 0.0, 10.0]), fixed=(), physics=slides)
-    with pytest.raises(InputError, match="slides in one plane given by its normal"):
+    with pytest.raises(InputError, match="can slide in only one oblique plane"):
         run(scene)
     unknown = replace(scene, physics=(replace(slides[0], nodes=jnp.array([0, 9999])), slides[1]))
     with pytest.raises(InputError, match=r"support\.0\.nodes"):
         run(unknown)
 
-    # Directions that a derivative is asked for pass the check.
+    # Traced normals, for derivatives, pass the check.
     def passed(normal):
         check_before_run(replace(scene, physics=(replace(slides[0], normal=normal), slides[1])))
         return normal

@@ -1,4 +1,4 @@
-"""Batches and sweeps: the numbers of single runs, whatever strategy, devices, kills and resumes."""
+"""Batches and sweeps: equal to single runs for every strategy, with several devices, kills and resumed runs."""
 
 import os
 import resource
@@ -52,19 +52,19 @@ def files(tmp_path):
 
 
 def command(files, *more: str) -> list[str]:
-    """Arguments of a sweep of these files."""
+    """Return the arguments of a sweep of these files."""
     return ["sweep", str(files / "scene.toml"), str(files / "rows.csv"), "--chunk", "2", *more]
 
 
 def content(file) -> dict[str, bytes]:
-    """Every dataset's bytes."""
+    """Return the bytes of every dataset."""
     with h5py.File(file) as out:
         return {name: value[()].tobytes() for name, value in out.items()}
 
 
 def test_a_batch_is_the_loop_and_a_lane_that_fails_spoils_no_other(files):
     scene = lj.load_scene(files / "scene.toml")
-    density = jnp.array([1000.0, 1e12, 1100.0])  # the second falls further than any law holds
+    density = jnp.array([1000.0, 1e12, 1100.0])  # the second body falls too far for every law
     batch = lj.simulate_batch(scene, {"body.density": density})
     assert batch.strategy == ("map" if jax.default_backend() == "cpu" else "vmap") and batch.devices == 1
     codes = np.asarray(batch.result.status)
@@ -98,7 +98,7 @@ def test_gradient_of_a_batch_mean(files):
     [
         ({}, "needs parameters"),
         ({"law.mu": 700.0}, "law.mu has no lanes"),
-        ({"law.mu": [1.0, 2.0], "law.bulk": [1.0]}, "law.bulk has 1 lanes and law.mu has 2: give as many"),
+        ({"law.mu": [1.0, 2.0], "law.bulk": [1.0]}, "law.bulk has 1 lanes and law.mu has 2: give equal numbers"),
         ({"law.nu": [1.0]}, "did you mean law.mu"),
     ],
 )
@@ -127,7 +127,7 @@ def test_a_sweep_holds_the_rows_of_single_runs(files):
 
 @pytest.mark.slow
 def test_rows_of_a_loaded_mesh_are_measured_from_their_own_shapes(files):
-    """Each row lies as given under its loads: so it has moved from a reference shape of its own."""
+    """Each body is given in its loaded shape, so each run has a separate reference shape."""
     (files / "scene.toml").write_text(SCENE.replace("[mesh]", '[mesh]\nis = "loaded"'))
     (files / "rows.csv").write_text("law.mu\n700\n1400\n2000\n")
     assert main(command(files, "--store", "largest_displacement", "final_positions")) == 0
@@ -137,7 +137,7 @@ def test_rows_of_a_loaded_mesh_are_measured_from_their_own_shapes(files):
         for k, mu in enumerate((700.0, 1400.0, 2000.0)):
             own = np.asarray(lj.unloaded(lj.with_parameters(scene, {"law.mu": mu})).scene.mesh.points)
             moved = np.linalg.norm(np.asarray(scene.mesh.points) - own, axis=1).max()
-            # Both end as given, to the tolerance of Newton's method.
+            # Both end in the given shape, up to Newton's tolerance.
             assert np.abs(out["reference"][k] - own).max() < 1e-6 * moved
             assert np.isclose(out["largest_displacement"][k], moved, rtol=1e-6)
             assert np.abs(out["final_positions"][k] - np.asarray(scene.mesh.points)).max() < 1e-6 * moved
@@ -158,17 +158,17 @@ def test_resumed_results_have_the_same_bytes(files):
 
     out = files / "stopped.h5"
     with pytest.raises(Stopped):
-        sweep.run(table, out, report=stop)  # after the first chunk
+        sweep.run(table, out, report=stop)  # stops after the first chunk
     assert not out.exists()
-    assert main(command(files, "--out", str(out))) == 2  # unfinished: asks for --resume
+    assert main(command(files, "--out", str(out))) == 2  # unfinished: the message asks for --resume
     (files / "stopped.h5.parts" / "part_000001.123").write_bytes(b"half a chunk")
     assert main(command(files, "--out", str(out), "--resume")) == 0
     assert content(out) == content(files / "whole.h5")
-    assert sweep.run(table, out, resume=True).computed == 0  # all there
+    assert sweep.run(table, out, resume=True).computed == 0  # all chunks are present
 
 
 def test_killed_and_resumed(files):
-    """Signal 9 after the first chunk."""
+    """The process is killed by signal 9 after the first chunk."""
     whole, out = files / "whole.h5", files / "killed.h5"
     assert main(command(files, "--out", str(whole))) == 0
     call = [sys.executable, "-m", "liverjax", *command(files, "--out", str(out), "--resume")]
@@ -178,14 +178,14 @@ def test_killed_and_resumed(files):
     run.kill()
     run.wait()
     part = min(files.glob("killed.h5.parts/part_*.h5"))
-    part.write_bytes(part.read_bytes()[:-500])  # as if the disk had lost its end
+    part.write_bytes(part.read_bytes()[:-500])  # as if the disk had lost the end of the file
     assert main(command(files, "--out", str(out), "--resume")) == 0
     assert content(out) == content(whole)
 
 
 @pytest.mark.slow
 def test_two_devices_find_the_same(files):
-    """In a process of its own: the number of devices is fixed at the start."""
+    """This runs in a separate process, because the number of devices is fixed at the start."""
     assert main(command(files, "--out", str(files / "one.h5"))) == 0
     call = [sys.executable, "-m", "liverjax", *command(files, "--out", str(files / "two.h5"), "--devices", "2")]
     subprocess.run(call, check=True, capture_output=True, timeout=300)
@@ -216,7 +216,9 @@ def test_failed_rows_are_listed_and_run_again_alone(files, capsys):
 
 
 def test_failed_rows_are_told_by_the_process_that_comes_last(files, monkeypatch):
-    """Another process has joined the parts between the last chunk of this one and its own try."""
+    """Another process joins the parts after this process has finished its last chunk and before it tries to
+    join them.
+    """
     (files / "rows.csv").write_text("law.mu,body.density\n700,1000\n700,1e12\n720,1000\n")
     table, out = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2), files / "rows.h5"
 
@@ -233,7 +235,7 @@ def test_failed_rows_are_told_by_the_process_that_comes_last(files, monkeypatch)
 
 @pytest.mark.slow
 def test_rows_that_end_crushed_are_told(files, capsys):
-    """They converged, and only `simulate` said that no tissue does it: a cube between walls, pressed to a tenth."""
+    """A cube between walls is compressed to a tenth. The runs converged, and only `simulate` gave a warning."""
     walls = '[[fixed]]\nwhere = {z_min = -1.0, z_max = 0.099}\naxes = "xy"\n'
     pressed = '[[displaced]]\nwhere = {z_max = 0.0}\nby = [0.0, 0.0, 0.01]\naxes = "z"\n'
     (files / "scene.toml").write_text(SCENE.replace("[solve]\nsteps = 2", f"{walls}{pressed}[solve]\nsteps = 6"))
@@ -248,7 +250,7 @@ def test_rows_that_end_crushed_are_told(files, capsys):
     assert main([*words, "--resume"]) == 0 and "worst: row 2" in capsys.readouterr().err
 
 
-#: Parts that a row may change, beside the cube.
+#: Parts that a row may change, in addition to the cube.
 PARTS = """
 [[obstacle]]
 shape = "plane"
@@ -277,7 +279,7 @@ pre_tension = 0.05
         ("obstacle.0.position.2", 0.05, "begins 0.05 m inside the body"),
         ("vessel.0.wall", 0.005, "thicker than the radius"),
         ("obstacle.0.radius", 0.02, "changes nothing: a plane has none"),
-        # A fibre is at least 5 cm long and has no length at rest at 20 N/m times that.
+        # A fibre is at least 5 cm long. At 20 N/m times that, its rest length is zero.
         ("ligament.0.pre_tension", 50.0, "must be below its limit, 1 N"),
     ],
 )
@@ -311,7 +313,7 @@ history = [[0, 0], [0.1, 1]]
     "column, good, bad, words",
     [
         ("support.0.stiffness", 0.0, 50.0, "changes nothing: springs on a surface have normal"),
-        ("displaced.0.by.1", 0.0, 0.01, "displaced.0 moves node .* off the plane of support.1"),
+        ("displaced.0.by.1", 0.0, 0.01, "displaced.0 moves node .* out of the plane of support.1"),
         ("traction.0.times.1", 0.1, -0.1, "increasing times"),
     ],
 )
@@ -326,14 +328,14 @@ def test_rows_are_refused_that_a_scene_file_may_not_have(files, column, good, ba
 
 
 def test_rows_that_nothing_holds_are_refused(files):
-    """Fibres of 5 cm and more hold the body up; longer ones at rest are slack."""
+    """Fibres of 5 cm and more support the body. With a larger rest length they are slack."""
     own = PARTS[PARTS.index("[[ligament]]") :].replace("pre_tension = 0.05", "rest_length = 0.04")
     loose = SCENE.replace("z_min = 0.1", "x_max = 0.0") + own
     (files / "scene.toml").write_text(loose.replace("[solve]", 'axes = "xy"\n[solve]'))
     (files / "rows.csv").write_text("ligament.0.rest_length\n0.04\n0.2\n")
-    with pytest.raises(lj.InputError, match="row 2: nothing holds the body"):
+    with pytest.raises(lj.InputError, match="row 2: the supports do not prevent every rigid motion of the body"):
         sweep.read_sweep(files / "scene.toml", files / "rows.csv")
-    (files / "scene.toml").write_text(loose)  # held along z too
+    (files / "scene.toml").write_text(loose)  # fixed along z too
     assert len(sweep.read_sweep(files / "scene.toml", files / "rows.csv").rows) == 2
 
 
@@ -352,9 +354,9 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
     assert main(command(files, "--resume")) == 2
     assert "another sweep (not the same scene)" in capsys.readouterr().err
     (files / "scene.toml").write_text(SCENE)
-    assert main(command(files, "--resume")) == 0  # and nothing was lost
+    assert main(command(files, "--resume")) == 0  # nothing was lost
     assert main(command(files)) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -390,14 +392,14 @@ def test_unusable_tables_are_refused(files, table, sentence):
 
 @pytest.mark.slow
 def test_writes_that_fail_keep_what_was_computed(processor, files):
-    """A limit on the size of files, where a full disk would be: the same failing write."""
+    """A limit on the size of files causes the same failing write as a full disk."""
     table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)
     out = files / "rows.h5"
     sweep.run(table, out, process=(0, 2))  # every second chunk
     finished = sorted(files.glob("rows.h5.parts/part_*"))
     most = finished[0].stat().st_size - 1
     call = [sys.executable, "-m", "liverjax", *command(files, "--resume")]
-    small = {**os.environ, "JAX_COMPILATION_CACHE_DIR": ""}  # JAX would write there
+    small = {**os.environ, "JAX_COMPILATION_CACHE_DIR": ""}  # JAX would write into this folder
 
     def limited():
         resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
@@ -419,7 +421,9 @@ def test_no_room_for_the_joined_file_keeps_the_parts(files, monkeypatch, capsys)
 
 @pytest.mark.slow
 def test_a_row_that_iterations_do_not_solve_is_factorised(files):
-    """Of rows in one program none is known: a body that keeps its volume failed, with a pull 12 times too large."""
+    """All rows share one program, in which their values are unknown. A nearly incompressible body failed, with a force
+    12 times too large.
+    """
     pull = "[[displaced]]\nwhere = {z_max = 0.0}\nby = [0.0, 0.0, -0.01]\n"
     (files / "pull.toml").write_text(SCENE + pull)
     (files / "stiff.csv").write_text("law.bulk\n7700\n7.7e6\n")
@@ -445,8 +449,8 @@ def test_unusable_options_are_refused(files, capsys):
 @pytest.mark.parametrize(
     ("solve", "words"),
     [
-        ('kind = "harmonic"\nfrequencies = [20.0]', "kind = 'harmonic' is not for sweeps"),
-        ('reduced = "model.h5"', "model.h5' is not for sweeps"),
+        ('kind = "harmonic"\nfrequencies = [20.0]', "kind = 'harmonic' cannot be used in a sweep"),
+        ('reduced = "model.h5"', "model.h5' cannot be used in a sweep"),
     ],
 )
 def test_scenes_that_are_not_swept_are_refused_before_a_file_is_written(files, solve, words, capsys):

@@ -1,4 +1,4 @@
-"""The assembled tangent of a scene against autodiff of its forces, and the solvers that use it."""
+"""The assembled tangent of a scene compared with autodiff of its forces, and the solvers that use the tangent."""
 
 from functools import partial
 
@@ -57,7 +57,7 @@ def test_viscous_and_porous_tangent_against_autodiff(part):
     scene = lj.Scene(mesh=MESH, law=LAW, viscosity=prony, porosity=SPONGE)
     F0 = deformation_gradient(MESH, X + 0.004 * V)
     law = porosity.law_in_force(SPONGE, LAW)
-    if part == "isochoric":  # a volumetric part for the other branch
+    if part == "isochoric":  # a volumetric part for the other branch of the code
         law, scene = (
             LAW,
             lj.Scene(mesh=MESH, law=LAW, viscosity=prony, porosity=lj.Porosity(**{**vars(SPONGE), "keep_bulk": True})),
@@ -103,7 +103,7 @@ def test_coupled_matrix_against_autodiff():
         return jnp.stack(block_matrix.product(A, (*V.T, dP)), axis=-1), exact
 
     ours, exact = map(np.asarray, both())
-    for column in (slice(0, 3), slice(3, 4)):  # forces and volumes: each to its own size
+    for column in (slice(0, 3), slice(3, 4)):  # forces and volumes: each relative to its own size
         assert np.abs(ours[:, column] - exact[:, column]).max() < 1e-12 * np.abs(exact[:, column]).max()
 
 
@@ -113,9 +113,10 @@ def test_darcys_laplacian_and_its_polynomial():
     n = MESH.number_of_nodes
     A = np.asarray(jax.vmap(lambda e: block_matrix.product(flow.matrix, (e,))[0])(jnp.eye(n)))
     assert np.allclose(A, A.T, rtol=0, atol=1e-15 * A.max())
-    assert np.allclose(A.sum(axis=1), np.asarray(flow.store), rtol=1e-9)  # a uniform pressure does not flow
+    assert np.allclose(A.sum(axis=1), np.asarray(flow.store), rtol=1e-9)  # a uniform pressure causes no flow
     lowest = np.linalg.eigvals(A / np.diag(A)[:, None]).real.min()
-    # All eigenvalues within the polynomial's bounds: its error is theirs. Below the bounds it stays positive definite.
+    # With all eigenvalues in the polynomial's bounds, their error is that of the polynomial. Below, it stays positive
+    # definite.
     for low, least in ((lowest, 0.9), (flow.low, 0.0)):
         known = flow._replace(low=jnp.asarray(low))
         B = np.asarray(jax.vmap(lambda e, known=known: darcy.nearly_solved(MESH, known, e))(jnp.eye(n)))
@@ -125,7 +126,7 @@ def test_darcys_laplacian_and_its_polynomial():
 
 
 def test_pressures_from_a_guess():
-    """Near or far, a guess changes neither pressures nor derivatives; a near one lets a looser solve be as exact."""
+    """A guess changes neither pressures nor derivatives. With a close guess, a looser solve is equally exact."""
     sponge = replace(SPONGE, drained=MESH.node_sets["z_max"])
     J, b = jnp.ones(MESH.number_of_elements), jnp.asarray(1e-6 * rng.standard_normal(MESH.number_of_nodes))
 
@@ -164,7 +165,7 @@ def test_bicgstab_solves_without_symmetry():
 
 
 def inflated(pressure: float, **solve) -> lj.Scene:
-    """A block held below, with a pressure on its upper face."""
+    """A block fixed at its bottom, with a pressure on its upper face."""
     return lj.Scene(
         mesh=MESH,
         law=LAW,
@@ -179,7 +180,7 @@ def inflated(pressure: float, **solve) -> lj.Scene:
 
 
 def test_follower_pressure_follows():
-    # On a closed surface a pressure has no resultant, and on a face that of its current area.
+    # On a closed surface a pressure has no resultant; on a face the resultant belongs to the current area.
     closed = (lj.Traction(triangles=jnp.asarray(boundary.boundary_triangles(MESH)), pressure=3.0),)
     assert np.abs(np.asarray(boundary.follower_forces(closed, X).sum(axis=0))).max() < 1e-15
     turned = MESH.points @ jnp.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]).T

@@ -1,4 +1,6 @@
-"""Indenters on a bonded layer: against the half-space, a printed factor, the limit of thin layers, and the series."""
+"""Indenters on a bonded layer: compared with the half-space, a published factor, the thin-layer limit, and the
+series.
+"""
 
 import numpy as np
 import pytest
@@ -9,34 +11,36 @@ from liverjax.core.errors import InputError
 
 
 def thick(shape: str) -> Indenter:
-    """A layer a million times as thick as the indenter."""
+    """Return a layer a million times as thick as the indenter."""
     return Indenter(shape, 1e3, 0.3, radius=1e-3, half_angle=60.0)
 
 
 def test_on_a_thick_layer_the_force_is_that_on_a_half_space():
-    """Hertz, Sneddon and Boussinesq, as handbooks print them."""
+    """Compare with Hertz, Sneddon and Boussinesq, as published in handbooks."""
     d, plane, R = 1e-4, 1 - 0.3**2, 1e-3
     known = {"sphere": 4 / 3 * np.sqrt(R) * d**1.5, "cone": 2 / np.pi * np.tan(np.pi / 3) * d**2, "punch": 2 * R * d}
     for shape, force in known.items():
-        # What a layer adds is of the size of contact radius over thickness, 1e-6.
+        # The layer changes the force by contact radius over thickness, 1e-6.
         assert np.allclose(Layer(thick(shape)).force(np.array([-d, 0.0, d])), [0, 0, force / plane], rtol=3e-6)
 
 
 def test_the_first_term_is_the_printed_one():
-    """Dimitriadis et al. 2002, equation 12: 1.133, from an integral that they fitted to a percent."""
+    """Dimitriadis et al. 2002, equation 12, has 1.133, from an integral that they fitted to a percent."""
     chi = 1e-6
     assert np.isclose((thin_layer.series(np.array(chi), 0.5) - 1) / chi, 1.133, rtol=0.01)
 
 
 def test_a_wide_punch_presses_like_a_column():
-    """Confined modulus times area over thickness, from the wide punch's inside; its edge adds a ring, not an area."""
+    """Inside a wide punch, the force is confined modulus times area over thickness. The edge adds a ring, not
+    an area.
+    """
     E, nu = 1.0, 0.3
     confined = E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
 
     def force(width):
         return thin_layer.punch_factor(width, 1.0, nu) * 2 * width * E / (1 - nu**2)
 
-    # Between two widths the ring's share of the force cancels: force = column + c width + c', to second differences.
+    # Second differences cancel the ring's part of the force: force = column + c width + c'.
     second = force(8.0) - 2 * force(6.0) + force(4.0)
     assert np.isclose(second, np.pi * confined * (64 - 2 * 36 + 16), rtol=1e-3)
 
@@ -53,7 +57,9 @@ def test_small_contacts_follow_the_series(poisson):
 
 
 def test_the_printed_series_fails_at_a_fifth():
-    """Of a thickness: 1 % there, a sixth of the force at chi = 1, for an incompressible layer."""
+    """The error of the series is 1 % at a fifth of the thickness, and a sixth at chi = 1, for an incompressible
+    layer.
+    """
     layer = Layer(Indenter("sphere", 1.0, 0.5, radius=1.0))
     chi = np.array([0.1, 0.2, 1.0])
     exact = layer.force(chi**2) / thin_layer.half_space(layer.rig, chi**2)
@@ -62,7 +68,7 @@ def test_the_printed_series_fails_at_a_fifth():
 
 
 def test_more_points_change_nothing(monkeypatch):
-    """At the widest contact, where waves are steepest."""
+    """This is tested at the widest contact, where the integrand varies fastest."""
     before = thin_layer._contact(8.0, 0.5, "sphere")
     monkeypatch.setattr(thin_layer, "_WAVES", 240)
     monkeypatch.setattr(thin_layer, "_POINTS", 72)
@@ -77,7 +83,7 @@ def test_more_points_change_nothing(monkeypatch):
         ({"thickness": 0.0}, "thickness = 0.0"),
         ({"poisson": 0.6}, "poisson = 0.6"),
         ({"shape": "cone", "half_angle": 90.0}, "half_angle = 90.0"),
-        ({"shape": "punch", "thickness": 1e-5}, "use a smaller one"),
+        ({"shape": "punch", "thickness": 1e-5}, "use a smaller punch"),
     ],
 )
 def test_one_sentence_for_what_cannot_be_used(changes, sentence):

@@ -1,4 +1,6 @@
-"""Columns of tests in time: headings of other programs, quantities of tension, several tables, the other kind."""
+"""Columns of relaxation and creep tests: headings of other programs, tension, several tables, the other kind of
+test.
+"""
 
 import json
 
@@ -74,8 +76,8 @@ def test_quantities_of_tension_are_made_those_of_shear(header, quantity, factor,
     ],
 )
 def test_one_column_of_tension_makes_the_others_those_of_tension(header, quantity, factor, tmp_path):
-    """A modulus beside a tensile strain came out three times too large, with a note that said the opposite."""
-    more = ",#DIV/0!" * (header.count(",") - 2)  # as workbooks write 0/0: of a column that is not used
+    """A modulus in a table with tensile strain was three times too large, and a note claimed the opposite."""
+    more = ",#DIV/0!" * (header.count(",") - 2)  # as workbooks write 0/0, here in an unused column
     rows = "".join(f"{k},{900 - k},{5 + k}{more}\n" for k in range(1, 9))
     (tmp_path / "t.csv").write_text(header + "\n" + rows)
     columns, _ = read_columns(tmp_path / "t.csv")
@@ -94,7 +96,7 @@ def test_large_strain_in_tension_is_told(tmp_path):
 @pytest.mark.parametrize("gap", ["", "\n"])
 @pytest.mark.parametrize("first", [60.0, 0.5])
 def test_a_second_table_is_not_appended_to_the_first(gap, first, tmp_path):
-    """The other table has another unit, and goes on or begins again: a modulus of 1000 Pa came out as 942."""
+    """The other table has another unit, and continues or begins again. A modulus of 1000 Pa was read as 942 Pa."""
 
     def rows(times):
         return "".join(f"{t:g},{400 + 600 * np.exp(-t / 10):.6g}\n" for t in times)
@@ -121,7 +123,7 @@ def test_a_file_of_the_other_kind_is_told(kind, tmp_path):
 
 @pytest.mark.parametrize("sizes", [(), ("--radius", "0.004", "--height", "0.002")])
 def test_errors_of_a_test_in_time_contain_the_size_of_the_sample(sizes, tmp_path):
-    """50 um of 4 mm or 2 mm, and four times 10 um of the radius; ratios and times do not feel it."""
+    """The errors are 50 um of 4 mm or 2 mm, and four times 10 um of the radius. Ratios and times are not affected."""
     t = np.geomspace(0.01, 100, 40)
     noisy = (500 + 300 * np.exp(-t)) * (1 + 0.002 * np.random.default_rng(0).standard_normal(40))
     file = write(tmp_path / "t.csv", "time_s,relaxation_modulus_Pa", t, noisy)
@@ -135,7 +137,7 @@ def test_errors_of_a_test_in_time_contain_the_size_of_the_sample(sizes, tmp_path
 
 
 def test_a_strain_in_percent_without_a_unit_is_told(tmp_path):
-    """A strain of 5, meant as 5 %, made moduli a hundred times too small."""
+    """A strain of 5, meant as 5 %, gave moduli a hundred times too small."""
     rows = "".join(f"{k},5,{90 - k}\n" for k in range(9))
     (tmp_path / "t.csv").write_text("time_s,strain,stress_Pa\n" + rows)
     _, notes = read_columns(tmp_path / "t.csv")

@@ -1,4 +1,4 @@
-"""Files of relaxation and creep: units, rest before the load, ramps, offsets, what cannot be read."""
+"""Files of relaxation and creep tests: units, rest before the load, ramps, offsets, invalid files."""
 
 import json
 
@@ -44,7 +44,7 @@ def test_units_and_forms(tmp_path):
     r, h, strain = 0.01, 0.004, 0.02
     file = write(tmp_path / "b.csv", "time_s,angle_mrad,torque_uN.m", T, 0 * T + 1e3 * strain * h / r, G * strain * 1e6)
     b = read_time_test(file, "relaxation", Sample(r, h))
-    # G = 2 M h / (pi r^4 theta), the formula of the rheometer's guide
+    # G = 2 M h / (pi r^4 theta), the formula in the guide on the rheometer
     modulus = 2 * G * strain * h / (np.pi * r**4 * strain * h / r)
     assert np.allclose(b.answer[1:] / b.driven[1:], modulus)
     file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T - 0.1, -G)
@@ -55,9 +55,9 @@ def test_units_and_forms(tmp_path):
     assert f"{100 * ((exact - exact**-2) / (3 * (exact - 1)) - 1):.2g} % too large in compression" in c.notes[1]
     file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T - 0.05, -G)
     assert not any("strained" in note for note in read_time_test(file, "relaxation", Sample(r, h)).notes)
-    file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T + 4.4, G)  # 110 %: no compression
+    file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T + 4.4, G)  # 110 %: not a compression
     note = read_time_test(file, "relaxation", Sample(r, h)).notes[1]
-    assert "moduli come out 43 % too small in tension" in note and "compression" not in note
+    assert "the moduli are 43 % too small in tension" in note and "compression" not in note
     text = "Result:\tStep strain\nPoint No.\tTime\tShear Strain\tShear Stress\n\t\t\t\n\t[s]\t[%]\t[Pa]\n"
     rows = "".join(f"{k}\t{t:.4f}\t1,0\t{G / 100:.5f}\n".replace(".", ",") for k, (t, G) in enumerate(zip(T, G)))  # noqa: B905
     (tmp_path / "d.txt").write_bytes((text + rows).encode("utf-16"))
@@ -78,7 +78,7 @@ BAD = {
     "stamps": (
         "time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n1,6\n2,5\n3,5\n",
         [],
-        "two rows have the time 1 s: write times with more digits, or one row of their mean",
+        "two rows have the time 1 s: write times with more digits, or replace both by a mean",
     ),
     "backwards": (
         "time_s,relaxation_modulus_Pa\n3,5\n2,6\n1,7\n0.5,8\n",
@@ -103,7 +103,7 @@ BAD = {
         ["--ramp", "2"],
         "since the load rose between 0 and 1 s: leave it out",
     ),
-    "late": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "5"], "2 usable answers are left"),
+    "late": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "5"], "2 usable responses are left"),
     "early": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "-1"], "--min-time -1 cannot be seconds after"),
     "modes": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--modes", "9"], "--modes 9 is out of range"),
     "radius": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--radius", "4"], "--radius 4 cannot be"),
@@ -139,7 +139,7 @@ def test_missing_files_and_damage_never_leave_a_traceback(tmp_path):
 
 
 def test_the_step_s_own_time_is_read_where_a_global_one_stands_beside_it(tmp_path):
-    """TRIOS writes both; the step began at 300 s of the experiment."""
+    """TRIOS writes both times; the step began at 300 s of the experiment."""
     t = np.geomspace(0.1, 100, 40)
     rows = "".join(
         f"{300 + a:.7g}\t{a:.7g}\t1.0\t{g * 0.01:.9g}\n" for a, g in zip(t, relaxation(SOLID, t), strict=True)
@@ -156,7 +156,7 @@ def test_the_step_s_own_time_is_read_where_a_global_one_stands_beside_it(tmp_pat
 
 
 def test_rows_that_begin_under_load_are_told_of_and_may_be_a_step(tmp_path):
-    """A step of 1 % at 0 s whose rows before 0.15 s were cut off."""
+    """A step of 1 % at 0 s. The rows before 0.15 s are missing."""
     t = np.geomspace(0.15, 40, 60)
     file = write(tmp_path / "t.csv", "time_s,strain [1],stress_Pa", t, 0 * t + 0.01, 0.01 * relaxation(SOLID, t))
     ramp, step = read_time_test(file, "relaxation"), read_time_test(file, "relaxation", ramp=0.0)
@@ -167,7 +167,7 @@ def test_rows_that_begin_under_load_are_told_of_and_may_be_a_step(tmp_path):
     assert main(["relaxation", str(file), "--modes", "2", "--ramp", "0", "--out", str(tmp_path / "out")]) == 0
     found = json.loads((tmp_path / "out" / "fit.json").read_text())
     assert abs(found["shear_modulus"] / 900 - 1) < 1e-6 and found["notes"] == []
-    # A ramp that the rows show from its beginning needs no word.
+    # A ramp that the rows show from its beginning needs no note.
     t = np.linspace(0.1, 20, 200)
     file = write(tmp_path / "r.csv", "time_s,strain [1],stress_Pa", t, 1e-4 * t, 1e-2 * t)
     assert read_time_test(file, "relaxation").notes == ()
@@ -189,7 +189,7 @@ def test_empty_cells_and_thousands_of_records(text, tmp_path):
 
 
 def test_an_offset_that_one_row_shows_is_told(tmp_path):
-    """6 Pa of an untared sensor, 5 % of the peak, made the equilibrium modulus a tenth too large, without a word."""
+    """An offset of 6 Pa, 5 % of the peak, made the equilibrium modulus a tenth too large, without a message."""
     t = np.concatenate([np.linspace(0, 1, 11), np.geomspace(1.1, 100, 40)])
     strain = 0.05 * np.minimum(t, 1.0)
     rng = np.random.default_rng(3)
@@ -205,7 +205,9 @@ HELD = np.concatenate([np.zeros(200), np.linspace(0, 1, 11)[1:], np.ones(3000)])
 
 
 def recorded(noise_of_strain=0.0, seed=0):
-    """4 s of rest, a ramp of 0.2 s and 60 s of hold at 50 Hz; 0.3 % of noise in the stress, and noise in the strain."""
+    """4 s of rest, a ramp of 0.2 s and 60 s of constant strain at 50 Hz; 0.3 % of noise in the stress, and noise in the
+    strain.
+    """
     t, rng = 0.02 * np.arange(len(HELD)), np.random.default_rng(seed)
     strain = 0.05 * HELD
     stress = driven(SOLID, t, strain, "relaxation") * (1 + 0.003 * rng.standard_normal(len(t)))
@@ -213,7 +215,9 @@ def recorded(noise_of_strain=0.0, seed=0):
 
 
 def test_a_load_that_rises_between_two_rows_may_be_a_step(tmp_path, capsys):
-    """A step at the 11th row, after rest: a straight rise in the interval before it gave G0 = 2815 ± 39 for 2000 Pa."""
+    """After rest there is a step at the 11th row. A linear rise in the interval before gave G0 = 2815 ± 39 for
+    2000 Pa.
+    """
     t = 0.1 * np.arange(200)
     strain = np.where(np.arange(200) >= 10, 0.02, 0.0)
     later = np.maximum(t - t[10], 0)
@@ -231,7 +235,7 @@ def test_a_load_that_rises_between_two_rows_may_be_a_step(tmp_path, capsys):
 
 
 def test_a_load_before_the_rows_may_be_a_step_at_the_beginning(tmp_path, capsys):
-    """The first row is under load at 0.5 s: after a step at 0 s, G0 was 12 % too low, its total error 7 %."""
+    """The first row is under load at 0.5 s. For a step at 0 s, G0 was 12 % too low, with a total error of 7 %."""
     t, noise = np.geomspace(0.5, 200, 120), 1 + 0.005 * np.random.default_rng(0).standard_normal(120)
     stress = 0.1 * relaxation(SOLID, t) * noise
     file = write(tmp_path / "t.csv", "time_s,strain [1],stress_Pa", t, np.full(120, 0.1), stress)
@@ -246,14 +250,14 @@ def test_a_load_before_the_rows_may_be_a_step_at_the_beginning(tmp_path, capsys)
 
 
 def test_every_jump_between_two_rows_may_be_a_step():
-    """A square wave: only the first jump was known."""
+    """In a square wave, only the first jump was recognised."""
     strain = np.repeat([0.0, 0.1, 0.0, 0.1], 20)
     test = TimeTest("relaxation", 0.1 * np.arange(80), strain, strain, np.arange(80) > 0)
     assert list(test.jumps) == [20, 40, 60]
     steps = with_steps(test)
     assert len(steps.time) == 83 and steps.used.sum() == 79 and np.all(np.diff(steps.time) > 0)
     assert np.all(np.abs(np.diff(steps.driven)[np.diff(steps.time) > 0.01]) < 1e-12)
-    # Rows at rest may be far apart, and answers dense after the step.
+    # Rows at rest may be far apart, and rows after the step close together.
     time = np.append(np.arange(0.0, 4.0), 4.0 + np.append(0.0, np.geomspace(0.01, 100, 60)))
     dense = TimeTest("relaxation", time, np.where(time >= 4, 0.1, 0.0), np.ones(65), time >= 4)
     assert with_steps(dense).answers_at_once and with_steps(dense).resolved[0] == pytest.approx(0.01, rel=1e-3)
@@ -262,7 +266,7 @@ def test_every_jump_between_two_rows_may_be_a_step():
 
 
 def test_no_answer_is_made_up_before_a_step(tmp_path):
-    """A second load after 18 s without a row: the row added before it had the stress of 18 s earlier."""
+    """A second load follows after 18 s without a row. The row added before it had the stress of 18 s earlier."""
     time = np.concatenate([np.arange(0.0, 2.0, 0.1), 20 + 0.1 * np.arange(300)])
     strain = np.where(time >= 20, 0.2, np.where(time > 0.95, 0.1, 0.0))
     later = [np.where(time >= t0, relaxation(SOLID, np.maximum(time - t0, 0)), 0) for t0 in (time[10], 20.0)]
@@ -276,7 +280,7 @@ def test_no_answer_is_made_up_before_a_step(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_rest_before_the_load_and_a_strain_that_scatters_do_not_matter(tmp_path, noise):
-    """An instrument's clock runs before the step, and its sensor has noise: neither is motion of the sample."""
+    """The instrument's clock starts before the step, and its sensor has noise. Neither is a motion of the sample."""
     t, strain, stress = recorded(noise)
     test = read_time_test(write(tmp_path / "t.csv", "time_s,strain [1],stress_Pa", t, strain, stress), "relaxation")
     assert abs(test.begun - 3.98) < 0.1 and test.resolved[0] < 0.2
@@ -288,7 +292,9 @@ def test_rest_before_the_load_and_a_strain_that_scatters_do_not_matter(tmp_path,
 
 @pytest.mark.parametrize("noise", [pytest.param(0.003, marks=pytest.mark.slow), 0.01])
 def test_a_ramp_that_scatters_gives_what_the_exact_ramp_gives(tmp_path, noise):
-    """A ramp of 1 s: each reading counted as a step, and G0 was 15 % low, at 5 standard errors, without a word."""
+    """The ramp takes 1 s. Each reading counted as a step, and G0 was 15 % too low, by 5 standard errors, without a
+    message.
+    """
     t, rng = np.r_[np.arange(0, 1, 0.02), 1 + np.geomspace(0.01, 20, 60)], np.random.default_rng(1)
     strain = 0.01 * np.minimum(t, 1)
     stress = driven(SOLID, t, strain, "relaxation")
@@ -299,7 +305,7 @@ def test_a_ramp_that_scatters_gives_what_the_exact_ramp_gives(tmp_path, noise):
     test = read_time_test(write(tmp_path / "b.csv", head, t, shown, stress), "relaxation")
     assert any("a straight ramp from" in note for note in test.notes)
     own = fits.fit(test)
-    # 60 readings at 1 % of scatter leave 0.13 % in the level of the strain, and as much by the ramp's end.
+    # 60 readings with 1 % of scatter give an error of 0.13 % in the strain level, and as much from the end of the ramp.
     assert np.isclose(own.uncertainty.values[0], exact.uncertainty.values[0], rtol=0.01)
 
 
@@ -328,7 +334,9 @@ def test_a_modulus_that_rises_and_a_compliance_that_falls_are_refused_with_the_c
 
 
 def test_a_strain_that_rings_is_told(tmp_path):
-    """A solid of one mode on a plate with inertia: the natural frequency is 30 rad/s. Creep alone does not fall."""
+    """A solid with one mode is on a plate with inertia, with a natural frequency of 30 rad/s. Creep alone never
+    decreases.
+    """
     t, stress = np.geomspace(0.01, 30, 120), 10.0
 
     def moves(_, y):
@@ -341,7 +349,7 @@ def test_a_strain_that_rings_is_told(tmp_path):
         noisy = strain * (1 + 0.002 * np.random.default_rng(1).standard_normal(len(t)))
         path = write(tmp_path / "c.csv", "time_s,strain_1,stress_Pa", t, noisy, np.full(len(t), stress))
         notes = read_time_test(path, "creep", start=start).notes
-        assert any("the inertia of the instrument rings" in n for n in notes) == told
+        assert any("an oscillation of the instrument's inertia" in n for n in notes) == told
 
 
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])
@@ -366,7 +374,9 @@ def test_noise_and_single_wrong_rows_are_no_other_course(tmp_path, kind):
     ],
 )
 def test_what_a_sensor_shows_before_the_load_is_taken_off(tmp_path, kind, offset, told):
-    """Standard linear solid, 1000 and 600 Pa, loaded at 2 s after ten rows at rest; the answers scatter by 0.5 %."""
+    """A standard linear solid, 1000 and 600 Pa, is loaded at 2 s after ten rows at rest. The response scatters by 0.5
+    %.
+    """
     rng = np.random.default_rng(0)
     t = np.r_[np.arange(0, 2.01, 0.2), 2 + np.geomspace(0.02, 60, 90)]
     s, on = np.clip(t - 2, 0, None), t > 2.0001
@@ -377,7 +387,7 @@ def test_what_a_sensor_shows_before_the_load_is_taken_off(tmp_path, kind, offset
         driven, answer, head = 10.0 * on, 10 * creep, "time_s,stress_Pa,strain [1]"
     answer = on * answer * (1 + 0.005 * rng.standard_normal(len(t))) + offset
     test = read_time_test(write(tmp_path / "t.csv", head, t, driven, answer), kind)
-    assert any("as an offset of the sensor" in note for note in test.notes) == told
+    assert any("this offset of the sensor is subtracted" in note for note in test.notes) == told
     found = fits.fit(test)
     assert found.modes == 1
     G0, ratio = found.uncertainty.values[0], found.uncertainty.values[1]
@@ -408,7 +418,7 @@ def test_a_column_without_a_number_is_refused_in_one_sentence(tmp_path):
 
 
 def test_small_units_are_read_and_unknown_ones_are_named(tmp_path):
-    """uN and nm were "no header names …"."""
+    """Columns in uN and nm gave the message "no header names …"."""
     t = np.linspace(0.0, 2.0, 21)
     rows = [(x, 1e-4 * min(x, 1.0), 0.02 * min(x, 1.0)) for x in t]
     read = {}
@@ -425,7 +435,7 @@ def test_small_units_are_read_and_unknown_ones_are_named(tmp_path):
 
 
 def test_noise_in_the_row_at_rest_is_no_offset(tmp_path):
-    """It is as large as that of the other rows."""
+    """It is as large as the noise of the other rows."""
     t = np.concatenate([np.linspace(0, 1, 11), np.geomspace(1.1, 100, 40)])
     strain, rng = 0.05 * np.minimum(t, 1.0), np.random.default_rng(4)
     stress = driven(SOLID, t, strain, "relaxation") + 6.0 * rng.standard_normal(len(t))

@@ -1,4 +1,4 @@
-"""Relaxation and creep: exact convolution, files, recovery of what another program computed, measured pairs."""
+"""Relaxation and creep: exact convolution, files, recovery of another program's results, measured pairs."""
 
 import json
 import re
@@ -45,7 +45,7 @@ def test_stress_is_the_convolution_of_quadrature(model):
 
 @pytest.mark.parametrize("model", [SOLID, FLUID], ids=["solid", "fluid"])
 def test_creep_and_relaxation_are_of_one_material(model):
-    """Their convolution is the time itself: the integral of G(t - s) J(s) from 0 to t is t, for every t."""
+    """Their convolution is time itself: the integral of G(t - s) J(s) from 0 to t is t, for every t."""
     for t in (0.05, 1.0, 30.0):
         product = scipy.integrate.quad(
             lambda s, t=t: float(relaxation(model, t - s) * time_response.creep_compliance(model, np.array([s]))[0]),
@@ -74,7 +74,7 @@ def test_the_two_functions_of_a_step_keep_their_digits(x):
         z = mpmath.mpf(x)
         exact = [(1 - mpmath.exp(-z)) / z, (z - 1 + mpmath.exp(-z)) / z**2]
     found = time_response._phi(jnp.array(x))
-    # The second loses up to six digits just above the change to its series.
+    # The second function loses up to six digits just above the switch to its series.
     assert np.allclose([float(v) for v in found], [float(v) for v in exact], rtol=1e-9)
     assert [float(v) for v in time_response._phi(jnp.array(0.0))] == [1.0, 0.5]
 
@@ -94,7 +94,9 @@ def test_strain_of_a_driven_stress_is_that_of_steps_added_up():
 
 
 def driven(model, time, value, kind):
-    """The answer by SciPy's solver of differential equations: dashpots, no convolution and no recursion."""
+    """Return the response by SciPy's solver for differential equations, with dashpots instead of convolution or
+    recursion.
+    """
     G0, g, tau = (np.asarray(v) for v in model)
     rest = 1 - g.sum()
 
@@ -128,7 +130,7 @@ def test_what_an_ode_solver_computed_is_recovered_from_the_file(kind, tmp_path):
     test = read_time_test(write(tmp_path / "t.csv", header, time, *columns), kind)
     f = fits.fit(test, 2)
     assert f.converged and np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=1e-3)
-    # Taken for a step, the ramp cannot be followed.
+    # If the ramp is taken for a step, it cannot be fitted.
     step = fits.fit(test._replace(driven=np.full(len(test.time), test.driven.max()), used=test.time > 0.02), 2)
     assert step.relative_errors.mean() > 0.01 > 1e3 * f.relative_errors.mean()
 
@@ -168,17 +170,17 @@ def test_relaxation_of_polystyrene_is_predicted_from_its_creep():
         for name, kind in (("creep", "creep"), ("stressrelaxation", "relaxation"))
     )
     f = fits.fit(creep)
-    assert f.kind.name == "prony_fluid" and f.relative_errors.mean() < 0.005  # of the compliance, over four decades
+    assert f.kind.name == "prony_fluid" and f.relative_errors.mean() < 0.005  # for the compliance, over four decades
     time = relaxed.time[relaxed.used]
     both = (time > 0.3) & (time < 100)
     predicted = time_response.relaxation_modulus(f.model, time[both])
     error = np.abs(predicted / relaxed.answer[relaxed.used][both] - 1)
-    # Found: 4 %. Creep and relaxation are two loadings of the sample; how far it repeats itself nobody has measured.
+    # Found: 4 %. Creep and relaxation are two loadings of the sample, and the repeatability of this sample is unknown.
     assert np.median(error) < 0.1
 
 
 def test_a_melt_with_little_left_is_compared_with_a_fluid():
-    """Structured misfit left an equilibrium modulus of 2.1 errors in a melt, and no fluid was tried."""
+    """In a melt, the structured misfit left an equilibrium modulus of 2.1 errors, and no fluid was tried."""
     folder = SHARED / "data" / "rheology" / "pyrheo"
     if not folder.is_dir():
         pytest.skip("the measured tests are not here")
@@ -197,7 +199,7 @@ def test_a_small_or_uncertain_equilibrium_modulus_may_be_that_of_a_fluid(rest, e
 
 
 def test_a_cyclic_strain_that_scatters_is_not_taken_for_wrong_signs(tmp_path):
-    """The sign of the largest reading is chance there; the work of stress on strain is not."""
+    """There, the sign of the largest reading is random. The work of stress on strain is not."""
     t = 0.02 * np.arange(1, 500)
     strain = 0.01 * np.sin(2 * np.pi * 0.3 * t)
     stress = driven(SOLID, t, strain, "relaxation")
@@ -210,7 +212,9 @@ def test_a_cyclic_strain_that_scatters_is_not_taken_for_wrong_signs(tmp_path):
 
 
 def test_a_long_record_is_thinned_by_each_load():
-    """After a small load before the test the rows of the step itself were left out: G0 was 14 standard errors off."""
+    """After a small load before the test, the rows of the step itself were left out. G0 was wrong by 14 standard
+    errors.
+    """
     time = np.arange(0.0, 900.5, 0.5)
     driven = np.where(time < 300, 0.003, 0.1)
     own = TimeTest("relaxation", time, driven, np.ones(len(time)), time > 0)
@@ -227,7 +231,7 @@ def test_a_long_record_is_thinned_by_each_load():
         (np.linspace(0.0, 1000.0, 100_001), 0.0, 1.0),
         (np.append(0.0, np.geomspace(1e-3, 1e4, 3000)), 0.0, 0.0),
         (np.append(0.0, np.linspace(10.0, 1000.0, 99_001)), 10.0, 0.0),
-        # A strain read in steps of 0.1 % flickers about the change that counts as motion.
+        # A strain read in steps of 0.1 % varies around the change that counts as motion.
         (np.linspace(0.0, 500.0, 10_001), 5.5, 0.0),
     ],
 )
@@ -239,7 +243,9 @@ def test_as_many_rows_as_allowed_are_fitted(time, ramp, first):
 
 @pytest.mark.parametrize("kind", ["relaxation", pytest.param("creep", marks=pytest.mark.slow)])
 def test_a_test_without_relaxation_is_told_with_its_modulus(kind):
-    """Six of such tests became fluids with times of 1e175 s, or did not converge with the advice of fewer modes."""
+    """Before, six of such tests became fluids with times of 1e175 s, or did not converge, with the advice of fewer
+    modes.
+    """
     time = np.linspace(0, 57, 120)
     driven, answer = np.full(120, 0.1), np.full(120, 8.0 if kind == "relaxation" else 0.1 / 80)
     for seed in range(3):
@@ -260,7 +266,7 @@ def test_a_test_without_relaxation_is_told_with_its_modulus(kind):
 
 @pytest.mark.parametrize("noise", [0.01, 0.2])
 def test_the_mean_error_of_a_noisy_test_is_its_noise(noise):
-    """It stayed near 2 %, because the lower bound of the scales grew with the noise."""
+    """The reported error stayed near 2 %, because the lower bound of the scales grew with the noise."""
     t, rng = np.geomspace(0.1, 100, 80), np.random.default_rng(0)
     G = 0.01 * (300 + 700 * np.exp(-t / 3)) * (1 + noise * rng.normal(size=80))
     at = np.concatenate([[0.0, 1e-7], t])

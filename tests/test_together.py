@@ -1,4 +1,4 @@
-"""Several tests of one material in one fit: what they say together, and what each of them adds."""
+"""Several tests of one material in one fit: the common result, and the contribution of each test."""
 
 import argparse
 import json
@@ -68,20 +68,22 @@ def test_two_tests_find_what_neither_sees_alone(found):
     errors = found.uncertainty.standard_errors
     values = np.array([800, 0.3, 0.4, 30, 0.1])
     assert found.converged and np.all(np.abs(found.uncertainty.values - values) < 4 * errors)
-    # The sweep ends at 2 s, the relaxation begins at 1 s: each leaves one time to the other.
+    # The sweep ends at 2 s, the relaxation begins at 1 s. Each test alone does not determine one of the times.
     without_sweep, without_relaxation = (s.errors_without for s in found.shares)
     assert without_sweep[4] > 20 * errors[4] and without_relaxation[3] > 3 * errors[3]
     assert np.all(without_sweep >= errors * 0.99) and np.all(without_relaxation >= errors * 0.99)
 
 
 def test_each_test_has_the_weight_of_its_own_noise(found):
-    # Root mean squares of 30 and of 25 numbers, 5 parameters: 15 %.
+    # Root mean squares of 30 and of 25 values, 5 parameters: known to 15 %.
     assert [s.noise for s in found.shares] == [pytest.approx(0.02, rel=0.4), pytest.approx(0.005, rel=0.4)]
     assert not any("do not agree" in w for w in found.warnings)
 
 
 def of_the_same_times(scale: np.ndarray | float) -> list[Sweep | TimeTest]:
-    """A sweep that sees the times of the relaxation, and the relaxation with its moduli multiplied."""
+    """Return a sweep that covers the times of the relaxation, and the relaxation with its moduli multiplied by a
+    factor.
+    """
     omega, rng = OMEGA / 50, np.random.default_rng(1)
     storage, loss = (G * (1 + 0.02 * rng.standard_normal(len(omega))) for G in generalised_maxwell.moduli(TRUTH, omega))
     return [Sweep(omega, storage, loss, source="sweep.csv"), relaxation(0.005, scale)]
@@ -89,7 +91,9 @@ def of_the_same_times(scale: np.ndarray | float) -> list[Sweep | TimeTest]:
 
 @pytest.mark.parametrize("scale", [1.0, 1.2, 0.8])
 def test_a_factor_between_the_tests_is_named(scale):
-    """Every modulus of one test is off alike, by another temperature or a wrong size: which test, and by how much."""
+    """Every modulus of one test is wrong by one factor, from another temperature or a wrong size. The test and the
+    factor are named.
+    """
     fit = springpots_in_time.choose_together(of_the_same_times(scale), "prony", 2)
     told = [w for w in fit.warnings if "the tests agree if" in w]
     if scale == 1:
@@ -100,7 +104,7 @@ def test_a_factor_between_the_tests_is_named(scale):
 
 
 def wide_and_long(factor: float, seed: int) -> list[Sweep | TimeTest]:
-    """A sweep of three decades and a relaxation whose moduli are multiplied."""
+    """Return a sweep of three decades and a relaxation whose moduli are multiplied by a factor."""
     omega, rng = np.geomspace(0.05, 100, 25), np.random.default_rng(seed)
     storage, loss = (G * (1 + 0.02 * rng.standard_normal(25)) for G in generalised_maxwell.moduli(TRUTH, omega))
     test = relaxation(0.0, factor)
@@ -110,7 +114,7 @@ def wide_and_long(factor: float, seed: int) -> list[Sweep | TimeTest]:
 
 @pytest.mark.slow
 def test_total_errors_contain_the_sizes_of_the_samples():
-    """Each test has a factor of its own: errors of noise held G0 in 3 of 10 such fits, and the second ratio in 7."""
+    """Each test has a separate factor. Errors of noise covered G0 in 3 of 10 such fits, and the second ratio in 7."""
     hits, by_noise = [], []
     for seed in range(12):
         factor = 1 + 0.013 * np.random.default_rng(100 + seed).standard_normal()
@@ -122,15 +126,17 @@ def test_total_errors_contain_the_sizes_of_the_samples():
         hits[-1][-1] = rest < u.quantile * whole["equilibrium_modulus"]
         by_noise.append(off < u.quantile * u.standard_errors)
     assert np.all(np.mean(hits, axis=0) >= 0.83) and np.mean(by_noise, axis=0).min() < 0.7
-    # A factor of both tests alike is a factor of G0 alone, and of the equilibrium modulus.
+    # A factor common to both tests changes only G0 and the equilibrium modulus.
     assert shares["geometry"]["shear_modulus"] >= 0.0129 * fit.model.shear_modulus
     assert shares["geometry"]["equilibrium_modulus"] >= 0.0128 * 240
 
 
 def test_a_factor_of_all_tests_is_one_of_the_shear_modulus_alone():
-    """Sweep and creep: a stiffer sample creeps less, so both move G0 alike and the ratios against each other."""
+    """For a sweep and a creep test: a stiffer sample creeps less, so both change G0 equally and the ratios
+    oppositely.
+    """
     at, g = np.append(0.0, TIME), 0.4
-    strain = (1 + g / (1 - g) * (1 - np.exp(-(1 - g) * at / 5.0))) / 1000  # of one mode of 5 s, G0 = 1000 Pa
+    strain = (1 + g / (1 - g) * (1 - np.exp(-(1 - g) * at / 5.0))) / 1000  # one mode of 5 s, G0 = 1000 Pa
     creep = TimeTest("creep", at, np.ones(len(at)), strain, at > 0, source="creep.csv")
     x = 1j * OMEGA / 50 * 5.0
     G = 1000 * (1 - g + g * x / (1 + x))
@@ -141,7 +147,7 @@ def test_a_factor_of_all_tests_is_one_of_the_shear_modulus_alone():
 
 
 def test_a_small_factor_between_the_tests_is_named_too():
-    """5 % hides in the ratios: each test is followed nearly as well as by itself."""
+    """A factor of 5 % is absorbed by the ratios. Each test is fitted nearly as well as alone."""
     fit = springpots_in_time.choose_together(wide_and_long(1.05, 0), "prony", 2)
     (told,) = [w for w in fit.warnings if "the tests agree if" in w]
     found, error = map(float, re.search(r"relaxation.csv are ([\d.]+) ± ([\d.e-]+) times", told).groups())
@@ -153,7 +159,7 @@ def test_a_small_factor_between_the_tests_is_named_too():
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [10.0, 50.0, 1e-3])
 def test_a_wrong_unit_of_one_test_is_named(scale):
-    """The common fit of such tests may have too few modes for either, and lies far from both."""
+    """The common fit of such tests may have too few modes for either, and misses both by far."""
     fit = springpots_in_time.choose_together(wide_and_long(scale, 0), "prony")
     alone = [s.misfit_alone for s in fit.shares]
     assert alone == [pytest.approx(0.02, rel=0.4), pytest.approx(0.01, rel=0.4)]
@@ -174,7 +180,9 @@ def test_a_factor_that_sizes_of_samples_explain_is_no_alarm(relative, explained)
 
 @pytest.mark.slow
 def test_a_common_fit_with_too_few_modes_does_not_hide_the_factor():
-    """The sweep shows the fast mode, the relaxation, ten times as stiff, the slow one: both together allow one mode."""
+    """The sweep shows the fast mode. The relaxation, ten times as stiff, shows the slow one. Both together allow one
+    mode.
+    """
     both = Maxwell(np.float64(1000.0), np.array([0.3, 0.3]), np.array([20.0, 0.05]))
     omega, time = 2 * np.pi * np.geomspace(0.1, 31.6, 20), np.append(0.0, np.geomspace(0.1, 316, 50))
     draws = np.random.default_rng(50).standard_normal((2, 20))
@@ -198,7 +206,7 @@ def test_tests_that_differ_by_more_than_a_factor_are_only_told_apart():
 
 
 def test_the_errors_are_those_of_the_stacked_rows(found):
-    """Against numerical derivatives of both tests' predictions, by hand."""
+    """Compare with numerical derivatives of both tests' predictions, by hand."""
     p = found.uncertainty.values
     noise = [s.noise for s in found.shares]
 
@@ -244,7 +252,7 @@ def test_the_command_reads_any_test(tmp_path, capsys):
 
 
 def test_further_sweeps_lose_the_points_of_the_instrument_too(tmp_path):
-    """An inertia of half of G' at the end, which grows as the square of the frequency."""
+    """The inertia is half of G' at the end, and grows with the square of the frequency."""
     G = generalised_maxwell.moduli(TRUTH, WIDE)
     spoiled = G[0] - 0.5 * G[0][-1] * (WIDE / WIDE[-1]) ** 2
     columns = np.column_stack([WIDE, spoiled, G[1]])
@@ -253,9 +261,9 @@ def test_further_sweeps_lose_the_points_of_the_instrument_too(tmp_path):
     options = argparse.Namespace(radius=None, height=None, min_frequency=None, max_frequency=None, density=None)
     found = command.read_any(options, tmp_path / "s.csv")
     assert len(found.storage) < len(WIDE) and any("mark of the instrument" in n for n in found.notes)
-    options.max_frequency = 1e3  # a band that the user names is kept
+    options.max_frequency = 1e3  # a band that the user gives is kept
     assert len(command.read_any(options, tmp_path / "s.csv").storage) == len(WIDE)
-    options.max_frequency = float(WIDE[-6]) / (2 * np.pi)  # and holds for every sweep, but not for what is predicted
+    options.max_frequency = float(WIDE[-6]) / (2 * np.pi)  # it applies to every sweep, but not to predicted tests
     assert len(command.read_any(options, tmp_path / "s.csv").storage) == len(WIDE) - 5
     assert command.read_any(options, tmp_path / "s.csv", whole=True).angular_frequency[-1] > 0.5 * WIDE[-6]
     with pytest.raises(InputError, match=r"no\.csv does not exist: give the file of a test"):
@@ -263,11 +271,11 @@ def test_further_sweeps_lose_the_points_of_the_instrument_too(tmp_path):
 
 
 def test_what_no_fit_follows_is_told():
-    """A test that the common fit misses by 63 % and a fit of its own by 44 % does not disagree with the others."""
+    """A test with a misfit of 63 % in the common fit and of 44 % alone does not disagree with the others."""
     share = together.Share("sweep", "b.csv", 38, 1.2, 1.0, 0.63, 0.44, 0.3, np.ones(3))
     assert together.disagreements([share]) == []
     assert together.missed([share]) == [
-        "the fit misses the data of b.csv by 63 %: try another --model, or look at them"
+        "the fit misses the data of b.csv by 63 %: try another --model, or look at the data"
     ]
     assert together.missed([share._replace(misfit=0.04)]) == []
 
@@ -284,7 +292,7 @@ def test_the_driven_column_is_the_one_that_is_held(tmp_path):
 
 
 def test_points_on_a_straight_drive_are_not_needed():
-    """A ramp, a hold, a ramp down: their three corners and ends say it all."""
+    """A ramp, a constant part and a ramp down are described by their corners and ends."""
     from fitting.fits.time_tests import _corners_in_time
 
     time = np.sort(np.concatenate([np.linspace(0, 10, 101), [3.33]]))
@@ -297,7 +305,7 @@ WIDE = np.geomspace(0.01, 100, 25)
 
 
 def with_deviations(stated: float, noise: float, springpot: bool = False) -> Sweep:
-    """A sweep whose stated deviations, parts of the moduli, are not its noise."""
+    """Return a sweep whose stated deviations, as fractions of the moduli, are not its noise."""
     G = np.array(generalised_maxwell.moduli(TRUTH, WIDE))
     if springpot:
         G = 400 + 300 * (1j * WIDE) ** 0.3
@@ -310,7 +318,7 @@ def with_deviations(stated: float, noise: float, springpot: bool = False) -> Swe
     "model", ["prony", *(pytest.param(m, marks=pytest.mark.slow) for m in ("fractional", "spectrum"))]
 )
 def test_given_deviations_are_believed_beside_another_test(model):
-    """5 % stated and 1 % of scatter: twice the file has errors smaller by sqrt(2), and agrees with itself."""
+    """Stated are 5 %, the scatter is 1 %. The same file twice has errors smaller by sqrt(2), and agrees with itself."""
     from fitting.fits.families.springpots_in_time import choose_together
 
     data = with_deviations(0.05, 0.01, springpot=model == "fractional")
@@ -318,13 +326,13 @@ def test_given_deviations_are_believed_beside_another_test(model):
     assert not any("do not agree" in w for w in two.warnings)
     for share in two.shares:
         assert share.noise == 1 and share.alone == 1
-        # What is reported is relative to the moduli: the scatter, not the deviations.
+        # The reported misfit is relative to the moduli. It is the scatter, not the deviations.
         assert 0.005 < share.misfit < 0.015 and 0.005 < share.misfit_alone < 0.015
         assert share.mean_relative_error < share.misfit < 2 * share.mean_relative_error
     if model == "prony":
         errors = viscoelastic.closed_form(data, 2).uncertainty.standard_errors
         assert np.allclose(two.uncertainty.standard_errors, errors / np.sqrt(2), rtol=0.02)
-    # The residuals are over 5 %, not over the scatter: no factor makes the errors smaller.
+    # The residuals are relative to 5 %, not to the scatter, so no factor reduces the errors.
     assert two.uncertainty.noise == pytest.approx(1, abs=1e-9)
 
 
@@ -339,7 +347,7 @@ def test_the_mean_error_is_not_above_the_largest_one(tmp_path):
 
 
 def test_a_joint_fit_of_one_sweep_has_the_errors_of_its_closed_form():
-    """Without deviations the noise is what the closed form leaves, not all of the moduli."""
+    """Without stated deviations, the noise is the residual of the closed form, not the size of the moduli."""
     data = with_deviations(0.05, 0.02)._replace(storage_sd=None, loss_sd=None)
     closed = viscoelastic.closed_form(data, 2)
     found = joint.fit([joint.sweep(data)], closed.model, lj.laws.create("neo_hookean", mu=770.0, bulk=7700.0))

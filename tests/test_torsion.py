@@ -1,4 +1,4 @@
-"""The simulated rheometer: discrete and continuous formulas, orders, gradients, other programs, extremes."""
+"""The simulated rheometer: discrete and continuous formulas, orders, gradients, other programs, extreme cases."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -44,7 +44,7 @@ def _complex(m: torsion.Moduli) -> np.ndarray:
 
 
 def _of_the_mesh(m: torsion.Moduli) -> np.ndarray:
-    """The moduli without their correction."""
+    """Return the moduli without their correction."""
     return _complex(m) * np.asarray(m.bias)
 
 
@@ -69,7 +69,7 @@ def test_cycle_answers_the_discrete_formula(rig, law, prony, scheme, by, verifie
     assert off < 1e-6
     assert m.statistics.status.max() == 0 and m.statistics.residual.max() < 1e-9
     assert m.defect.max() < 1e-6
-    # One cycle is enough for a fit: it starts on the cycle, what is left is of the order of the strain.
+    # One cycle is enough for a fit. It starts on the cycle, and the rest is of the order of the strain.
     one = torsion.moduli(rig, law, prony, OMEGA, _amplitude(rig, by), Drive(by=by))
     assert np.abs(_complex(one) / _discrete(prony, OMEGA, 50) - 1).max() < 0.1 * STRAIN
 
@@ -97,7 +97,7 @@ def test_observed_order_in_time(rig, law, prony, scheme, order, verified):
 
 
 def test_geometry_factor_converges_at_second_order(law, verified):
-    # cell sizes that divide the sample evenly, so that every mesh is twice as fine in each direction
+    # These cell sizes divide the sample evenly, so that every mesh is twice as fine in each direction.
     excess = [float(torsion.geometry_factor(torsion.make_rig(cell_size=0.004 / n), law)) - 1 for n in (1, 2, 4)]
     rates = np.log2(np.asarray(excess[:-1]) / np.asarray(excess[1:]))
     verified("torsion of an elastic cylinder: stiffness, 1 mm cells", "pi r^4 G / (2 h)", excess[-1], 0.05, rates[-1])
@@ -115,8 +115,8 @@ def test_correction_removes_the_mesh_bias(law, prony):
 
 @pytest.mark.slow
 def test_relaxing_the_isochoric_part_alone(rig, law, prony):
-    # Torsion changes no volume, so relaxing the isochoric part alone answers the same formula, once the bias of the
-    # mesh is taken at each frequency (with the elastic one it would be 26 % off on this coarse mesh).
+    # Torsion does not change the volume, so relaxation of the isochoric part alone has the same formula. The bias of
+    # the mesh is used at each frequency. With the elastic bias, the error would be 26 % on this coarse mesh.
     m = torsion.moduli(
         rig, law, replace(prony, part="isochoric"), OMEGA, _amplitude(rig, "angle"), Drive(by="angle", cycles=3)
     )
@@ -131,7 +131,7 @@ PLATES = [(0.004, 0.0092), (0.01, 0.004), (0.01, 0.041), (0.02, 0.001)]
 @pytest.mark.slow
 @pytest.mark.parametrize(("radius", "height"), PLATES)
 def test_a_hundred_nodes_are_enough_at_small_strain(law, prony, radius, height):
-    """What is left after the correction is of the order of the strain, on any mesh."""
+    """After the correction, the remaining error is of the order of the strain, on every mesh."""
     rig, strain = torsion.make_rig(radius, height, torsion.linear_cell_for(radius, height)), 1e-3
     assert 70 <= rig.mesh.number_of_nodes <= 200
     angle = strain * height / radius
@@ -146,8 +146,8 @@ def test_a_hundred_nodes_are_enough_at_small_strain(law, prony, radius, height):
     [("all", 1060.0), *(pytest.param(part, None, marks=pytest.mark.slow) for part in ("all", "isochoric"))],
 )
 def test_the_linear_rig_has_the_derivatives_of_the_simulation(part, density):
-    """Along a random direction in all parameters, to the order of the strain; a fit needs no more. With inertia the
-    mesh's error of the inertial part, a sixth of the modulus, counts too.
+    """The derivative along a random direction in all parameters is exact up to the order of the strain; a fit needs no
+    more. With inertia, the mesh error of the inertial part, a sixth of the modulus, is added.
     """
     sweep = Sweep(OMEGA, np.array([320.0, 480.0, 580.0]), np.array([50.0, 110.0, 130.0]))
     simulation = simulated_rheometer.Simulation(cell_size=0.004, part=part, density=density, height=0.02)
@@ -159,7 +159,7 @@ def test_the_linear_rig_has_the_derivatives_of_the_simulation(part, density):
     model = Maxwell(np.array(770.0), np.array([0.235, 0.333]), np.array([0.27, 0.03]))
     u, direction = generalised_maxwell.unconstrained(model), np.random.default_rng(0).normal(size=5)
     slope = np.asarray(run(u, data)[1]) @ direction
-    h = 1e-4  # truncation h^2, roundoff of the solved steps 1e-9 / h
+    h = 1e-4  # truncation h^2, rounding of the solved steps 1e-9 / h
     up, down = (np.asarray(run(u + s * h * direction, data)[0]) for s in (1, -1))
     allowed = simulation.strain if density is None else 0.02
     assert np.abs((up - down) / (2 * h) - slope).max() < allowed * np.abs(slope).max()
@@ -177,7 +177,7 @@ def test_inertia_and_large_strain_keep_the_derivative_and_the_mesh_of_the_simula
 
 
 def inertial(omega, G, height):
-    """What a cylinder of 1060 kg/m^3 shows: G k h cot(k h), written out."""
+    """Return the measured modulus of a cylinder of 1060 kg/m^3: G k h cot(k h), written out."""
     x = omega * height * np.sqrt(1060.0 / G)
     return G * x * np.cos(x) / np.sin(x)
 
@@ -185,9 +185,9 @@ def inertial(omega, G, height):
 @pytest.mark.slow
 @pytest.mark.parametrize("by", ["torque", "angle"])
 def test_a_cycle_with_inertia_begins_without_a_transient(law, prony, by, verified):
-    """One cycle is the torsional wave: a start on the cycle without inertia was 16 % off in G'' here.
+    """One cycle agrees with the torsional wave. When the cycle started without inertia, G'' had an error of 16 % here.
 
-    What is left is the mesh's and the steps' error of the inertial part: more cycles do not change it.
+    The rest is the error of mesh and steps in the inertial part. More cycles do not change it.
     """
     height, omega = 0.005, 2 * np.pi * np.array([5.0, 20.0, 30.0])
     rig = torsion.make_rig(0.010, height, cell_size=0.004, density=1060.0)
@@ -207,13 +207,13 @@ def test_a_cycle_with_inertia_begins_without_a_transient(law, prony, by, verifie
 
 @pytest.mark.slow
 def test_from_rest_a_given_angle_with_inertia_does_not_oscillate(law, prony):
-    """Its torque grew to 300 times that of the cycle, with a loss of the wrong sign."""
+    """The torque had grown to 300 times that of the cycle, with a loss of the wrong sign."""
     rig, omega = torsion.make_rig(cell_size=0.008, density=1060.0), 2 * np.pi * 10.0
     found = []
     for drive in (Drive(steps=40, cycles=2, by="angle"), Drive(steps=40, cycles=2, by="angle", start="rest")):
         torque, angle = torsion.demodulate(torsion.oscillate(rig, law, prony, omega, 0.02, drive), omega, drive)
         found.append(complex(torque / angle))
-    # The plate's own inertia is late by the order of a time step, here 0.16 rad; it is less than 0.3 of the torque.
+    # The plate's own inertia is late by about one time step, here 0.16 rad. It is less than 0.3 of the torque.
     assert abs(found[1] - found[0]) < 0.16 * 0.3 * abs(found[0])
 
 
@@ -227,16 +227,16 @@ def test_inertia_is_taken_off_and_put_back():
     sweep = Sweep(omega, seen.real, seen.imag)
     own = sample_inertia.taken_off(sweep, 1060.0, 0.008)
     np.testing.assert_allclose(own.storage + 1j * own.loss, G, rtol=1e-9)
-    assert "the inertia of the sample, 8 mm high, is taken off" in own.notes[-1]
+    assert "the inertia of the sample, 8 mm high, is subtracted" in own.notes[-1]
     back = sample_inertia.put_back(own, 1060.0, 0.008)
     np.testing.assert_allclose(back.storage + 1j * back.loss, seen, rtol=1e-9)
-    # No modulus of a passive material shows so little loss where all is inertia.
-    with pytest.raises(lj.InputError, match="more inertia than modulus"):
+    # No modulus of a passive material has such a small loss if inertia dominates.
+    with pytest.raises(lj.InputError, match="the inertia of the sample is larger than its modulus"):
         sample_inertia.taken_off(Sweep(omega, 0 * omega + 1.0, 0 * omega - 50.0), 1060.0, 0.008)
 
 
 def test_the_linear_derivative_passes_through_any_model_and_its_prior(monkeypatch, law):
-    """Where the simulation is the linear rig itself, both derivatives are the same: of a fluid held by a prior."""
+    """If the simulation is replaced by the linear rig, both derivatives are equal; here for a fluid with a prior."""
     kind = viscoelastic.FLUID._replace(prior=lambda u: 3 * u[1:] ** 2)
     u, omega = jnp.array([6.0, 0.3, -1.0, 0.7]), jnp.asarray(OMEGA)
     data = (None, law, omega, None, jnp.linspace(300, 100, 6), jnp.full(6, 7.0))
@@ -261,7 +261,9 @@ LAWS_OWN = {"neo_hookean": {"bulk": 1.0}, "mooney_rivlin": {"c10": 1.0, "c01": 1
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["neo_hookean", "mooney_rivlin"])
 def test_gradients_against_central_differences(rig, name):
-    """V-shaped error curve: falls with the step (truncation), rises again (roundoff), lowest below 1e-6."""
+    """The error curve is V-shaped: it falls with the step (truncation) and rises again (rounding). Its minimum is below
+    1e-6.
+    """
     base = lj.laws.typical(name)
     own = list(LAWS_OWN[name])
     drive = Drive(options=torsion.newton.NewtonOptions(tolerance=1e-12))
@@ -286,7 +288,7 @@ def test_gradients_against_central_differences(rig, name):
             errors.append(np.abs(difference - J[:, k]).max() / np.abs(J[:, k]).max())
         assert min(errors) < 1e-6, (k, errors)
         best = int(np.argmin(errors))
-        # The moduli are linear in stiffnesses: there no truncation falls, roundoff alone rises.
+        # The moduli are linear in the stiffnesses. There is no truncation error, and only rounding rises.
         assert errors[-1] > errors[best] and (errors[0] > errors[best] or errors[0] < 1e-9), (k, errors)
 
 
@@ -320,7 +322,7 @@ def test_torque_history_against_febio(febio, prony, verified):
 @pytest.mark.slow
 @pytest.mark.parametrize("cell_size", [0.005, 0.0035])
 def test_inertia_against_the_torsional_wave(law, prony, cell_size, verified):
-    """A tall sample: M = pi r^4/2 G* k cot(k h) theta, k = omega sqrt(rho/G*); at 41 mm inertia is no small thing."""
+    """A tall sample has M = pi r^4/2 G* k cot(k h) theta, k = omega sqrt(rho/G*). At 41 mm the inertia is large."""
     height, omega = 0.041, 2 * np.pi * 2.0
     rig = torsion.make_rig(0.010, height, cell_size=cell_size, density=1060.0)
     drive = Drive(steps=50, cycles=8, by="angle")
@@ -329,12 +331,12 @@ def test_inertia_against_the_torsional_wave(law, prony, cell_size, verified):
     k = omega * np.sqrt(1060.0 / G)
     exact = G * k * height / np.tan(k * height)
     assert abs(exact / G - 1) > 0.15
-    # The stiff mesh biases the elastic part alone; lumped masses of a polygon have their own polar moment.
+    # The stiff mesh biases only the elastic part. Lumped masses of a polygon have another polar moment.
     inertial = _of_the_mesh(m)[0] - float(torsion.geometry_factor(rig, law)) * G
     mass, points = 1060.0 * np.asarray(lj.boundary.nodal_volumes(rig.mesh)), np.asarray(rig.mesh.points)
     polar = (mass * (points[:, :2] ** 2).sum(axis=1)).sum() / (np.pi / 2 * 0.010**4 * height * 1060.0)
-    # The next term of the wave, (k h)^2 / 15 = 3 % of the inertial part, sees the stiff mesh too; masses lumped in N
-    # layers have the moment of the trapezoidal rule, 1 / (2 N^2) more than the integral of z^2.
+    # The next term of the wave, (k h)^2 / 15 = 3 % of the inertial part, also depends on the stiff mesh. Masses lumped
+    # in N layers have the moment of the trapezoidal rule, 1 / (2 N^2) more than the integral of z^2.
     layers = len(np.unique(points[:, 2].round(9))) - 1
     off, allowed = abs(inertial / (exact - G) / polar - 1), abs(k * height) ** 2 / 15 + 1 / (2 * layers**2)
     verified(
@@ -366,7 +368,7 @@ def test_strain_sweep_finds_where_linearity_ends(rig):
     strains = np.array([1e-4, 1e-3, 1e-2, 0.05, 0.1, 0.2])
     soft = lj.laws.NeoHookean(mu=770.0, bulk=7.7e4)
     m = torsion.strain_sweep(rig, soft, None, strains, drive=Drive(steps=20, by="angle"))
-    # Rivlin: the torque of an incompressible neo-Hookean (and Mooney-Rivlin) cylinder is linear in the twist.
+    # Rivlin: the torque of an incompressible neo-Hookean (or Mooney-Rivlin) cylinder is linear in the twist.
     assert m.statistics.status.max() == 0
     assert np.abs(np.asarray(m.storage) / 770 - 1).max() < 0.01
     assert torsion.linearity_limit(strains, m.storage) == np.inf
@@ -384,7 +386,7 @@ def test_free_plate_rises(law):
     run = torsion.oscillate(rig, law, None, 1.0, angle, Drive(steps=20, by="angle"))
     assert run.statistics.status.max() == 0
     half = torsion.oscillate(rig, law, None, 1.0, angle / 2, Drive(steps=20, by="angle"))
-    # Poynting effect: even in the twist, of second order. (This mesh is chiral: it adds a small odd part.)
+    # The Poynting effect is even in the twist, of second order. (This mesh is chiral and adds a small odd part.)
     even, even_half = ((r.lift[5] + r.lift[15]) / 2 for r in (run, half))
     assert even > 0 and np.isclose(even / even_half, 4, rtol=0.02)
 

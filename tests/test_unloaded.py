@@ -1,4 +1,4 @@
-"""The shape before the load: there and back, and against a column under its own weight."""
+"""The unloaded shape: a run from it returns to the given shape; comparison with a column under its own weight."""
 
 import json
 from collections.abc import Callable
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.quick_to_compile
 TOLERANCE = 1e-12
 SKIN = {"thickness": 1e-4, "law": {"name": "neo_hookean", "mu": 1e4}, "where": {"z_min": 0.01}}
 SUPPORT = {"where": {"x_min": 0.04}, "normal": 200.0}
-#: Pressed on its end by so much, no reference body is that long.
+#: Under this load on its end, no reference body can have this length.
 HEAVY = {"body.gravity": jnp.array([-600.0, 0, 0])}
 
 
@@ -39,24 +39,24 @@ def content(order: int = 1, **more) -> dict:
 
 
 def there_and_back(scene: lj.Scene) -> None:
-    """The run from the reference shape ends in the given one."""
+    """Check that the run from the reference shape ends in the given shape."""
     found = lj.unloaded(scene)
     assert found.status == 0 and found.residual <= TOLERANCE
     given, V = scene.mesh.points, scene.mesh.number_of_vertices
     moved = np.asarray(found.scene.mesh.points - given)[:V]
-    assert np.linalg.norm(moved, axis=1).max() > 0.04 * 0.04  # far: 4 % of the length and more
+    assert np.linalg.norm(moved, axis=1).max() > 0.04 * 0.04  # a large displacement: at least 4 % of the length
     back = np.asarray(lj.simulate(found.scene).check().positions[-1] - given)[:V]
-    # Two residuals, each of the tolerance times the forces, which sag the body by `moved`; in its softest motion a
-    # force may do ten times more.
+    # Two residuals of the tolerance times the forces, which cause the sag `moved`. In the softest motion a force may
+    # cause ten times more.
     assert np.linalg.norm(back) < 10 * 2 * TOLERANCE * np.linalg.norm(moved)
 
 
 def test_there_and_back():
-    """Of linear elements; a load that is far too large has no reference shape, and that is said."""
+    """Linear elements. For a load that is far too large there is no reference shape, and a message says so."""
     scene = scene_from(content())
     there_and_back(scene)
     heavy = lj.with_parameters(scene, HEAVY)
-    with pytest.raises(InputError, match=r"no reference shape was found that these loads bring to the given one"):
+    with pytest.raises(InputError, match=r"no reference shape was found that these loads deform into the given shape"):
         lj.simulate(heavy)
 
 
@@ -71,13 +71,13 @@ def test_a_viscous_run_that_is_too_short_to_end_in_the_given_shape_is_told():
         return cautions._of_stress_at_start(at, SimpleNamespace(times=jnp.array([lasts]), positions=zero, status=none))
 
     (sentence,) = said(0.15, dt=0.05, steps=3)
-    assert "lasts 0.15 s beside a relaxation time of 0.3 s" in sentence
+    assert "lasts 0.15 s, but a relaxation time is 0.3 s" in sentence
     assert said(3.0, dt=1.0, steps=3) == said(0.15, dt=0.05, kind="dynamic") == []
 
 
 @pytest.mark.slow
 def test_the_command_tells_it_too(tmp_path, capsys):
-    """The command runs the unloaded scene, whose points are the reference shape: the caution was lost."""
+    """The command runs the unloaded scene, whose points are the reference shape. There the warning was missing."""
     text = """mesh = {shape = "box", size = [0.02, 0.02, 0.02], cells = [1, 1, 1], is = "loaded"}
 law = {name = "neo_hookean", mu = 770.0, bulk = 2200.0}
 viscosity = {ratios = [0.3], relaxation_times = [0.3]}
@@ -87,12 +87,12 @@ solve = {dt = 0.05, steps = 3}
 """
     (tmp_path / "scene.toml").write_text(text)
     assert main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path)]) == 0
-    assert "lasts 0.15 s beside a relaxation time of 0.3 s" in capsys.readouterr().out
+    assert "lasts 0.15 s, but a relaxation time is 0.3 s" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_inside_a_program_a_shape_that_is_not_found_is_not_a_number():
-    """No run passes for one that began somewhere: its status says so."""
+    """Such a run must not look like a run from a valid shape. Its status shows the failure."""
     heavy = lj.with_parameters(scene_from(content()), HEAVY)
     points, code, run = jax.jit(lambda s: (*unload(s)[:2], lj.simulate(s).status))(heavy)
     assert code != status.CONVERGED and np.isnan(points.mesh.points).any()
@@ -111,7 +111,7 @@ def test_there_and_back_with_a_capsule_and_a_support(order):
 
 @pytest.mark.slow
 def test_a_column_under_its_own_weight(verified):
-    """P(stretch) = rho g (L - X) at every height, with the sides held: one equation for the reference length L."""
+    """With fixed sides, P(stretch) = rho g (L - X) at every height: one equation for the reference length L."""
     rho_g, length = 3000.0, 0.04
     table = content(2, body={"density": 1000.0, "gravity": [rho_g / 1000.0, 0, 0]})
     table["mesh"]["cells"] = [4, 1, 1]
@@ -134,14 +134,15 @@ def test_a_column_under_its_own_weight(verified):
         low, high = (middle, high) if loaded(middle) < length else (low, middle)
     change = abs((reference - low) / (length - low))
     verified("reference length of a column under its weight", "analytic", change, 0.001)
-    # Quadratic elements are exact at their ends for a linear column; its stretch of 2 % leaves the rest.
+    # For a linear column, quadratic elements are exact at their ends. The stretch of 2 % causes the rest.
     assert change < 0.001
 
 
 @pytest.mark.slow
 def test_a_block_is_as_another_program_finds_it_in_the_given_shape(verified):
-    """Mazier's block of 2 m by Govindjee and Mihalic's method (`experiments.sources.unloaded_block`): equilibrium in
-    the given shape and in the reference shape are the same equations of linear elements."""
+    """Mazier's block of 2 m is computed by the method of Govindjee and Mihalic (`experiments.sources.unloaded_block`).
+    For linear elements, equilibrium in the given shape and in the reference shape are the same equations.
+    """
     file = Path(__file__).parents[1] / "experiments" / "results" / "unloaded_block.json"
     points, tets, theirs = (np.array(json.loads(file.read_text())[key]) for key in ("points", "tetrahedra", "unloaded"))
     inside_out = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) < 0
@@ -155,7 +156,7 @@ def test_a_block_is_as_another_program_finds_it_in_the_given_shape(verified):
     )
     ours = lj.unloaded(scene).scene.mesh.points
     off = float(np.abs(ours - theirs).max() / np.abs(theirs - points).max())
-    # A residual of 1e-12 of the forces, and theirs, Newton's last change of 1e-13 of the side.
+    # A residual of 1e-12 of the forces, and in the other program Newton's last change of 1e-13 of the side.
     assert off < 1e-10
     verified("shape of a block before its weight", "scikit-fem", off, 1e-10)
 
@@ -165,7 +166,7 @@ def _tip(scene: lj.Scene, positions: jax.Array) -> jax.Array:
 
 
 def _length_of(scene: lj.Scene) -> Callable[[float], jax.Array]:
-    """The length [m] of the reference shape by mu."""
+    """Return a function for the length [m] of the reference shape as a function of mu."""
 
     def length(mu):
         return _tip(scene, lj.unloaded(lj.with_parameters(scene, {"law.mu": mu})).scene.mesh.points)
@@ -175,7 +176,7 @@ def _length_of(scene: lj.Scene) -> Callable[[float], jax.Array]:
 
 @pytest.mark.slow
 def test_derivatives_of_the_reference_shape():
-    """Its length by mu, against differences."""
+    """The derivative of its length with respect to mu is compared with differences."""
     length = _length_of(scene_from(content()))
     by = jax.grad(length)(800.0)
     errors = [abs((length(800.0 + h) - length(800.0 - h)) / (2 * h) / by - 1) for h in (80.0, 0.8, 8e-7)]
@@ -201,19 +202,19 @@ def test_the_end_of_a_run_from_the_reference_shape_does_not_depend_on_the_modulu
 
 @pytest.mark.slow
 def test_the_relaxed_body_lies_as_given():
-    """A viscous body ends, after long, in the given shape."""
+    """After a long time, a viscous body is in the given shape."""
     table = content(viscosity={"ratios": [0.4], "relaxation_times": [0.1]})
     table["solve"] |= {"dt": 0.5, "steps": 16}
     scene = scene_from(table)
     positions = np.asarray(lj.simulate(scene).check().positions)
     off = np.abs(positions - np.asarray(scene.mesh.points)).max(axis=(1, 2))
-    # The recursion forgets at the rate exp(-dt/tau) = 0.7 % a step, slower in creep by 1/0.6.
+    # The recursion decays with exp(-dt/tau) = 0.7 % per step, in creep more slowly by 1/0.6.
     assert off[0] > 1e-5 and off[-1] < 1e-8
 
 
 @pytest.mark.slow
 def test_an_obstacle_that_comes_later_changes_nothing():
-    """A sphere that presses on the body during the run is not part of the load of the scan."""
+    """A sphere that presses on the body during the run is not part of the load in the scan."""
     sphere = {"shape": "sphere", "radius": 0.01, "position": [0.03, 0.005, 0.021], "by": [0, 0, -0.004]}
     touched, free = (lj.unloaded(scene_from(content(**more))) for more in ({"obstacle": [sphere]}, {}))
     assert np.allclose(touched.scene.mesh.points, free.scene.mesh.points, atol=1e-14)
@@ -223,9 +224,9 @@ def test_what_cannot_be_is_said():
     with pytest.raises(InputError, match="is = 'slack' is not known"):
         scene_from(content(mesh=content()["mesh"] | {"is": "slack"}))
     sponge = {"bulk": 400.0, "limit_bulk": 2200.0, "fluid_fraction": 0.5, "permeability": 1e-6}
-    with pytest.raises(InputError, match="cannot have the pressure of a fluid"):
+    with pytest.raises(InputError, match="cannot be used with a fluid"):
         scene_from(content(porosity=sponge, solve={"dt": 0.1}))
-    with pytest.raises(InputError, match="has no harmonic motion"):
+    with pytest.raises(InputError, match="cannot be used in harmonic motion"):
         lj.harmonic(scene_from(content()), [60.0])
-    with pytest.raises(InputError, match="is not for reduced models"):
+    with pytest.raises(InputError, match="cannot be used with reduced models"):
         lj.reduce_scene(scene_from(content()), {"law.mu": [800.0]})

@@ -1,4 +1,4 @@
-"""Prony recursions: exact formulas, orders, limits, parts."""
+"""Prony recursions (updates of the viscous memory from step to step): exact formulas, orders, limits, parts."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ OMEGA = 2 * np.pi * 4.0
 
 
 def _driven(prony: lj.Prony, steps: int, cycles: int = 40) -> complex:
-    """G*/G0 of the scalar recursion under a sine, demodulated over its last cycle."""
+    """Return G*/G0 of the scalar recursion under a sine, demodulated over its last cycle."""
     dt = 2 * np.pi / OMEGA / steps
     a, b, c = viscosity.coefficients(prony, dt)
     S = jnp.sin(OMEGA * dt * jnp.arange(steps * cycles + 1))
@@ -55,7 +55,8 @@ def test_observed_order(scheme, order, table_2, verified):
 
 
 def test_loss_errors_stated_by_the_mathematics(table_2):
-    # mathematics: chapter's scheme 5.2 % at 50 steps and 2.6 % at 100, exponential 0.15 % at 50 (G'' at 4 Hz).
+    # From `mathematics.md`: chapter's scheme 5.2 % at 50 steps and 2.6 % at 100, exponential 0.15 % at 50 (G'' at 4
+    # Hz).
     exact = viscosity.complex_ratios(table_2, OMEGA).sum().imag
     for scheme, n, percent in (("chapter", 50, 5.2), ("chapter", 100, 2.6), ("exponential", 50, 0.15)):
         prony = replace(table_2, scheme=scheme)
@@ -86,7 +87,7 @@ def test_coefficients_are_exact_for_any_step(scheme, ratio):
         g = mpmath.mpf(0.3)
         exact = (g * (1 - q), e, g * (q - e)) if scheme == "exponential" else (g * r / (1 + r), 1 / (1 + r), 0)
     for ours, theirs in zip((a, b, c), exact, strict=True):
-        # 4 roundings; c is a difference of two numbers of size r, twice itself.
+        # 4 roundings; c is the difference of two numbers of size r, which doubles them.
         assert abs(ours - float(theirs)) <= 8 * np.finfo(float).eps * max(abs(float(theirs)), 1e-300)
 
 
@@ -97,7 +98,7 @@ def test_step_relaxation_follows_alpha(part, table_2):
     F = unpack(jnp.array([[[1.1, 0.2, 0.0], [0.0, 0.95, 0.1], [0.0, 0.0, 1.02]]]))
     history = viscosity.initial_history(prony, 1)
     dt, n = 0.002, 500
-    # The first step jumps to F: to the recursion a ramp over one dt; from there the stress is constant.
+    # The first step jumps to F, which the recursion takes as a ramp over one dt. Afterwards the stress is constant.
 
     def step(history, _):
         P = viscosity.first_piola(prony, viscosity.recall(prony, history, dt), law, F)
@@ -154,7 +155,7 @@ def test_a_series_that_cannot_be_is_refused_in_python_before_anything_is_compile
         lj.simulate(run(jnp.array([0.7, 0.6]), jnp.array([1.0, 0.1])))
     with pytest.raises(lj.InputError, match="has 2 ratios and 1 relaxation_times"):
         lj.simulate(run(jnp.array([0.3, 0.3]), jnp.array([1.0])))
-    # Of traced numbers only the counts are looked at.
+    # For traced values, only their number is checked.
     traced = jax.make_jaxpr(lambda g: viscosity.check_series(lj.Prony(ratios=(g, g), relaxation_times=(1.0, 0.1))))
     traced(0.7)
     with pytest.raises(lj.InputError, match="has 2 ratios and 1 relaxation_times"):
@@ -163,8 +164,9 @@ def test_a_series_that_cannot_be_is_refused_in_python_before_anything_is_compile
 
 @pytest.mark.parametrize("number", ["relaxation_time", "dt"])
 def test_coefficients_have_a_derivative_where_the_step_is_a_relaxation_time(number):
-    """Two formulas meet at dt = tau; derivatives by both were half as large. The formulas of the docstring, by complex
-    steps."""
+    """Two formulas meet at dt = tau. A derivative that mixed both was half as large. The reference is complex steps
+    through the formulas of the docstring.
+    """
     g, t = 0.3, 0.05
 
     def exact(tau, dt):

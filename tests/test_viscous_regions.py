@@ -1,4 +1,4 @@
-"""Regions with a viscosity of their own: against whole bodies of either, in harmonic motion, and refusals."""
+"""Regions with separate viscosity: compared with whole bodies of either kind, in harmonic motion, and invalid input."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ LESION = {"ratios": jnp.array([0.1, 0.5]), "relaxation_times": jnp.array([0.1, 0
 
 
 def block(order=1, viscosity=LIVER, part="all", region=(), **changes):
-    """A block of 2 x 1 x 1 cm whose nodes all stretch and shear alike, or whose end alone is moved."""
+    """A block of 2 x 1 x 1 cm. Its nodes all have the same stretch and shear, or only its end is moved."""
     mesh = lj.shapes.box((0.02, 0.01, 0.01), (4, 2, 2))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
     affine = mesh.points @ jnp.array([[0.1, 0.05, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
@@ -31,7 +31,7 @@ def block(order=1, viscosity=LIVER, part="all", region=(), **changes):
 
 
 def lower(mesh):
-    """Elements of the half y < 5 mm."""
+    """Return the elements of the half y < 5 mm."""
     centres = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
     return jnp.asarray(np.flatnonzero(centres[:, 1] < 0.005))
 
@@ -39,7 +39,7 @@ def lower(mesh):
 @pytest.mark.slow
 @pytest.mark.parametrize("order, part", [(1, "all"), (2, "isochoric")])
 def test_a_body_of_two_has_the_forces_of_both(order, part):
-    """All nodes are moved, so that every element has its own stress: the force is half of each body's."""
+    """All nodes are moved, so every element has a separate stress. The force is half of that of each whole body."""
     scene = block(order, part=part)
     end = np.asarray(scene.mesh.node_sets["x_max"])
     half = lj.Region(elements=lower(scene.mesh), viscosity=LESION)
@@ -86,7 +86,7 @@ def test_harmonic_motion_takes_the_region_as_factors():
     factors[:, np.asarray(below)] = share(LESION)[:, None]
     expected = lj.harmonic(scene, hertz, factors=jnp.asarray(factors)).check()
     np.testing.assert_allclose(found.displacement, expected.displacement, atol=1e-15)
-    # About a stretched state what never relaxes is by element too.
+    # About a stretched state, the part that never relaxes also has one value per element.
     about = mesh.points * jnp.array([[1.1, 1.0, 1.0]])
     every = lj.Region(elements=jnp.arange(mesh.number_of_elements), viscosity=LESION)
     one = element_operator(replace(scene, region=(every,)), about)
@@ -142,7 +142,7 @@ def test_a_scene_file_gives_a_region_its_viscosity():
 @pytest.mark.parametrize(
     "viscosity, words",
     [
-        ({"ratios": [0.1]}, "1 numbers and the scene 2 modes"),
+        ({"ratios": [0.1]}, "1 numbers, but the scene has 2 modes"),
         ({"ratios": [0.6, 0.5]}, "region.0: .*less than 1"),
         ({"ratios": [0.1, -0.5]}, "region.0: "),
         ({"relaxation_times": [0.1, 0.0]}, "region.0: "),
@@ -159,10 +159,10 @@ def test_a_viscosity_that_no_region_can_have_gets_a_sentence(viscosity, words):
 
 def test_scenes_without_viscosity_and_reduced_models_refuse_it():
     region = lj.Region(elements=jnp.array([0]), viscosity=LESION)
-    with pytest.raises(lj.InputError, match=r"needs a \[viscosity\] in the scene"):
+    with pytest.raises(lj.InputError, match=r"needs \[viscosity\] in the scene"):
         check_region_viscosity(None, region, "region.0")
     short = lj.Region(elements=jnp.array([0]), viscosity={"ratios": jnp.array([0.2])})
-    with pytest.raises(lj.InputError, match="1 numbers and the scene 2 modes"):  # from Python, before any compile
+    with pytest.raises(lj.InputError, match="1 numbers, but the scene has 2 modes"):  # from Python, before compilation
         lj.simulate(block(region=(short,)))
     with pytest.raises(lj.InputError, match="a reduced model has one viscosity"):
         lj.reduce_scene(block(region=(region,)), {"law.mu": [800.0]})

@@ -1,4 +1,4 @@
-"""The command on waves: tables, maps that go on, refusals in one sentence."""
+"""The command for waves: tables, maps that continue, one-line messages for invalid input."""
 
 import json
 
@@ -63,7 +63,7 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
         G, sd = file["modulus"][:], file["sd"][:]
         assert G.shape == (2, 7, 7, 9) and file["draws_of_exponent"].shape == (3, 2, 7, 7, 9)
         assert np.all(np.isfinite(G.imag) == np.isfinite(G.real))
-        # Independent of each other they are not: a third beyond one deviation would be too many or too few by chance.
+        # The voxels are correlated. A bound of one deviation would hold or fail by chance, so it is three.
         assert np.mean(np.abs(G[0].real - 3000) < 3 * sd[0].real) > 0.97
     assert command.main([*ask, "--resume"]) == 0
     again = json.loads((tmp_path / "out" / "waves.json").read_text())
@@ -72,7 +72,7 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
 
 
 def test_a_large_organ_is_fitted_in_parts(tmp_path, monkeypatch, capsys):
-    """Regions, edges, the map and its files go across the parts."""
+    """Regions, edges, the map and its files extend across the parts."""
     from fitting.commands import waves
 
     labels = np.ones((9, 9, 13), int)
@@ -85,7 +85,7 @@ def test_a_large_organ_is_fitted_in_parts(tmp_path, monkeypatch, capsys):
     path, out = written(tmp_path, ".npz", field), tmp_path / "out"
     ask = ["waves", str(path), "--density", "1000", "--out", str(out), "--samples", "2"]
     assert command.main(ask) == 0
-    assert "divided in 8 parts" in capsys.readouterr().err
+    assert "divided into 8 parts" in capsys.readouterr().err
     found = json.loads((out / "waves.json").read_text())
     assert found["parts"] == 8 and found["voxels"] == 9 * 9 * 13
     for row in (found["whole"], *found["regions"].values()):
@@ -104,7 +104,9 @@ def test_a_large_organ_is_fitted_in_parts(tmp_path, monkeypatch, capsys):
 
 
 def test_regions_of_a_run_that_was_killed_are_not_searched_for_again(tmp_path, monkeypatch):
-    """Killed in the map: the regions are read from their file, to the last bit, and only for the same waves."""
+    """The run was killed during the map. The regions are read from their file, bit by bit, and only for the
+    same waves.
+    """
     from fitting.waves import regions
 
     labels = np.ones((7, 7, 9), int)
@@ -132,28 +134,30 @@ def test_regions_of_a_run_that_was_killed_are_not_searched_for_again(tmp_path, m
 
 
 def test_too_few_balances_and_a_length_in_millimetres_are_refused(tmp_path, capsys):
-    """4 x 4 x 4 voxels have one brick, with fewer balances than pressures."""
+    """4 x 4 x 4 voxels have one brick, with fewer balance equations than pressures."""
     path = written(tmp_path, ".npz", plane_waves((4, 4, 4)))
     assert command.main(["waves", str(path), "--noise", "1e-7", "--out", str(tmp_path / "out")]) == 2
-    assert "give 0 equations beside the unknown pressures: waves need at least 10" in capsys.readouterr().err
+    assert "give 0 equations, without those for the unknown pressures. At least 10 are" in capsys.readouterr().err
     path = written(tmp_path, ".npz", plane_waves((7, 7, 9), noise=1e-7))
     assert command.main(["waves", str(path), "--out", str(tmp_path / "out"), "--length", "4"]) == 2
     assert "--length 4 m is much longer than the organ (0.016 m)" in capsys.readouterr().err
 
 
 def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
-    """Text, and HDF5 of another program."""
+    """The files are a text, and an HDF5 file of another program."""
     own = organ()
     course = stiffness_map.course_of(own.body, own.matrices, own.waves, modulus(HERTZ), 0.01)
     for write in (lambda file: file.write_text("no progress"), lambda file: h5py.File(file, "w").close()):
         file = tmp_path / "progress.h5"
         write(file)
-        with pytest.raises(InputError, match=r"belongs to another fit|is damaged, or of another program: leave out"):
+        with pytest.raises(InputError, match=r"belongs to another fit|is damaged, or from another program: leave out"):
             stiffness_map._first_or_resumed(course, file)
 
 
 def test_a_map_that_was_stopped_goes_on_to_the_same_end(tmp_path, monkeypatch):
-    """Stopped in the second deviation, the first one is judged again: the same numbers as without the stop."""
+    """The run stops at the second deviation of the prior. The first one is evaluated again, with the same numbers as
+    without a stop.
+    """
     own, file = organ(noise=5e-7), tmp_path / "progress.h5"
     monkeypatch.setattr(stiffness_map, "DEVIATIONS", (0.2, 0.4))
     less = own.waves._replace(sd=0.1 * own.waves.sd)  # so that no deviation explains the waves
@@ -161,7 +165,7 @@ def test_a_map_that_was_stopped_goes_on_to_the_same_end(tmp_path, monkeypatch):
     told = []
     unbroken = stiffness_map.map_of(course, progress=lambda k, chi2: told.append(k))
     assert told.count(1) >= 2 and unbroken.distance <= stiffness_map.FAR
-    assert unbroken.history[0]["steps"] <= 12  # with the Hessian of the start alone it takes 24
+    assert unbroken.history[0]["steps"] <= 12  # with the Hessian of the starting point alone it takes 24
 
     def stop(k, chi2):
         stopped.append(k)
@@ -195,7 +199,7 @@ def test_a_map_goes_on_from_its_own_problem_alone(tmp_path, other):
 
 def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
     hertz = np.array([40.0, 60.0, 80.0, 100.0])
-    G = 2000 + 1500 * (2j * np.pi * hertz / 400) ** 0.4  # a spring beside a springpot
+    G = 2000 + 1500 * (2j * np.pi * hertz / 400) ** 0.4  # a spring in parallel with a springpot
     part = {"storage_Pa": G.real, "loss_Pa": G.imag, "error_storage_Pa": 1e-3 * G.real, "error_loss_Pa": 1e-3 * G.imag}
     whole = {name: values.tolist() for name, values in part.items()}
     content = {"frequencies_Hz": hertz.tolist(), "whole": whole, "regions": None}

@@ -15,7 +15,9 @@ DENSITY, SOFT, STIFF = 1000.0, 3000.0, 10000.0
 
 
 def beside_a_cylinder(radius, centre, spacing, hertz, noise=0.02, voxels_across=21, seed=0):
-    """Voxels of two plane shear waves that meet a stiff cylinder, with noise; 1 Pa s on both sides."""
+    """Return voxels of two plane shear waves that meet a stiff cylinder, with noise; the viscosity is 1 Pa s on both
+    sides.
+    """
     shape = (voxels_across, voxels_across, 5)
     X = np.stack(np.meshgrid(*[spacing * (np.arange(n) - (n - 1) / 2) for n in shape], indexing="ij"), axis=-1)
     omega = 2 * np.pi * hertz
@@ -38,7 +40,7 @@ def organ_of(field):
 
 
 def test_the_series_is_continuous_and_in_balance():
-    """By differences: -omega^2 rho u = div(stress), and so curl(u) obeys Helmholtz's equation on each side."""
+    """Check by differences: -omega^2 rho u = div(stress), so curl(u) satisfies Helmholtz's equation on each side."""
     omega, h = 2 * np.pi * 80.0, 2e-5
     medium = cylinders_in_waves.Medium(SOFT + 300j, STIFF + 500j, omega, DENSITY)
     cylinders = [((0.0, 0.0), 0.005), ((0.013, 0.002), 0.003)]
@@ -57,26 +59,28 @@ def test_the_series_is_continuous_and_in_balance():
 
 
 def test_sheared_layers_are_in_balance():
-    """Simple shear across a plane edge anywhere in the elements: strain jumps, stress does not, no force is left."""
+    """Simple shear across a plane edge at any position in the elements: strain jumps, stress does not, no force
+    remains.
+    """
     body = voxels.voxel_body(np.ones((7, 5, 5), bool), np.ones(3))
     m = balance.matrices(body, DENSITY)
     phi = np.asarray(body.mesh.points)[:, 0] - 3.3
     found = edges.region_matrices(m, body, DENSITY, np.stack([-phi, phi]))
     G = np.array([3000.0, 9000.0])
-    # u_y = c phi + d |phi| has the stress G_1 (c - d) = G_2 (c + d); kinks add their part with the other sign.
+    # u_y = c phi + d |phi| has the stress G_1 (c - d) = G_2 (c + d). The unknowns for kinks have the other sign.
     c, d = 2.0, -1.0
     u = np.zeros((body.mesh.number_of_nodes, 3))
     u[:, 1] = c * phi + d * np.abs(phi)
     kinks = np.tile([0.0, -d, 0.0], found.kinks // 3)
     forces, without = (found.rows(G, 0.0) @ np.concatenate([u.ravel(), part * kinks]) for part in (1, 0))
     left, size = np.sort(np.abs(forces)), np.abs(without).max()
-    # The one inner corner has three rows of its kink. They are integrals over parts that are planes in an eighth of an
-    # element: what is left of them is of that order. All others are exact.
+    # The one inner corner has three rows of its kink. They are integrals over parts with plane edges in an eighth of an
+    # element, and their error is of this order. All other rows are exact.
     assert found.kinks > 3 and left[-4] < 1e-12 * size and left[-1] < size / 8
 
 
 def layers():
-    """Two layers whose edge is at x = 3.3 voxels, its distance (V,), their equations and moduli."""
+    """Return two layers with their edge at x = 3.3 voxels, the distance from it (V,), their equations and moduli."""
     body = voxels.voxel_body(np.ones((7, 5, 5), bool), np.ones(3))
     phi = np.asarray(body.mesh.points)[:, 0] - 3.3
     m = edges.region_matrices(balance.matrices(body, DENSITY), body, DENSITY, np.stack([-phi, phi]))
@@ -84,18 +88,18 @@ def layers():
 
 
 def test_kinks_are_free_of_the_measurement():
-    """Sheared layers, without noise: the kinks come out by themselves, with an amplitude of 1 voxel."""
+    """Sheared layers without noise: the amplitude of the kinks, 1 voxel, is found without a measurement of it."""
     body, phi, m, G = layers()
     u = np.zeros((body.mesh.number_of_nodes, 3), complex)
     u[:, 1] = 2.0 * phi - np.abs(phi)
     here = regions._state_of_regions(m, G, 0.0, u.ravel(), 1e-3).here
     kinks = here.motion[u.size :].reshape(-1, 3)
-    # What is left of chi^2 (8) is of the quadrature in an eighth of an element; kinks of 0 would leave 4e6.
+    # The remaining chi^2 (8) comes from the quadrature in an eighth of an element. Without kinks it would be 4e6.
     assert here.chi2 < 100 and abs(np.median(kinks[:, 1]) - 1) < 0.1
 
 
 def test_pressures_jump_at_edges():
-    """Stretched along x and pressed along y by the same amount, layers need pressures that differ by 2 (G2 - G1)."""
+    """The layers are stretched along x and compressed equally along y. Their pressures differ by 2 (G2 - G1)."""
     body, _, m, G = layers()
     X = np.asarray(body.mesh.points)
     u = np.stack([X[:, 0], -X[:, 1], 0 * X[:, 0]], axis=1).ravel()
@@ -108,7 +112,7 @@ def test_pressures_jump_at_edges():
 
 
 def test_small_labels_keep_their_volume():
-    """Smoothing alone would take a good part of a ball of 2 voxels; volumes are counted between the voxels."""
+    """Smoothing alone would remove much of a ball of 2 voxels. Volumes are counted between the voxels."""
     grid = np.stack(np.meshgrid(*[np.arange(11)] * 3, indexing="ij"), axis=-1)
     labels = 1 + (np.linalg.norm(grid - 5.0, axis=-1) < 2.1)
     body = voxels.voxel_body(np.ones(labels.shape, bool), np.ones(3))
@@ -120,7 +124,9 @@ def test_small_labels_keep_their_volume():
 
 @pytest.mark.parametrize("radius", [0.1, 1.1, 2.5])
 def test_a_small_label_leaves_the_edges_of_others_alone(radius):
-    """What lifts a small label to its volume was added everywhere: one voxel took all other edges of the body."""
+    """The shift that gives a small label its volume was added everywhere. One voxel removed all other edges of the
+    body.
+    """
     grid = np.stack(np.meshgrid(*[np.arange(n) for n in (21, 13, 13)], indexing="ij"), axis=-1)
     labels = np.where(grid[..., 0] < 8, 2, 1)
     labels[np.linalg.norm(grid - [15, 6, 6], axis=-1) < radius] = 3
@@ -131,7 +137,7 @@ def test_a_small_label_leaves_the_edges_of_others_alone(radius):
 
 
 def test_labels_whose_edges_cut_every_element():
-    """A box of 3 voxels in one of 5: no element lies in one region alone."""
+    """A box of 3 voxels is inside one of 5, so no element lies in one region alone."""
     field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 60.0, voxels_across=5)
     labels = np.ones((5, 5, 5), int)
     labels[1:4, 1:4, 1:4] = 2
@@ -146,7 +152,7 @@ def test_a_region_without_an_error_has_its_row_in_the_table():
 
 
 def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
-    """chi^2 with edges a fiftieth of a voxel farther out, up to the second order that its Hessian has."""
+    """chi^2 with edges shifted outwards by a fiftieth of a voxel, up to the second order that its Hessian contains."""
     monkeypatch.setattr(edge_places, "FARTHER", 0.02)
     field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, voxels_across=13)
     own = organ_of(field)
@@ -164,9 +170,9 @@ def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
 
 
 def test_how_far_labels_tell_the_edge_of_a_circle():
-    """Circles of 2.5, 5 and 8 voxels anywhere among the voxels: deviations and length of `edge_places`.
+    """Circles of 2.5, 5 and 8 voxels have any position among the voxels: deviations and length in `edge_places`.
 
-    The deviation of whole edges is larger there, for labels are rarely so good.
+    The deviation of whole edges is larger in `edge_places`, because real labels are rarely as good.
     """
     rng, around = np.random.default_rng(0), np.linspace(0, 2 * np.pi, 60, endpoint=False)
     way = np.stack([np.cos(around), np.sin(around), 0 * around], axis=-1)
@@ -219,9 +225,9 @@ def test_smoothed_labels_keep_place_and_volume():
     ],
 )
 def test_the_modulus_of_a_cylinder_of_few_voxels(radius, centre, spacing, elements, verified):
-    """2 % of noise: within three standard errors and the elements' own error, which edges in their true place leave.
+    """With 2 % of noise: within three standard errors plus the error of the elements, which remains if edges are exact.
 
-    That is 7 % for 2.5 voxels of radius in this place, and below 1 % for 3 to 5 voxels.
+    This is 7 % for a radius of 2.5 voxels at this position, and below 1 % for 3 to 5 voxels.
     """
     own = organ_of(beside_a_cylinder(radius, centre, spacing, 100.0))
     found = elastography.regions_of(own).parts
@@ -240,7 +246,9 @@ def test_the_modulus_of_a_cylinder_of_few_voxels(radius, centre, spacing, elemen
 
 @pytest.mark.slow
 def test_intervals_of_a_map_hold_the_truth_beside_edges():
-    """The map is linear in its bricks and sees no edge: without the place within its slopes too few voxels are held."""
+    """The map is linear in its bricks and does not know the edge. Without the error of position along its gradients,
+    too few voxels are covered.
+    """
     field = beside_a_cylinder(0.006, (3e-4, -4e-4), 2e-3, 100.0)
     own = organ_of(field)
     found = elastography.regions_of(own._replace(field=field._replace(labels=None)))
@@ -253,7 +261,7 @@ def test_intervals_of_a_map_hold_the_truth_beside_edges():
 
 
 def in_its_true_place(field, radius, centre, farther=0.0):
-    """Distances from a cylinder's edge [voxels] as `places` has them (2, V)."""
+    """Return distances (2, V) from the exact edge of a cylinder [voxels], in the format of `places`."""
     X = np.asarray(elastography.body_of(field).mesh.points)
     inside = (radius - np.hypot(X[:, 0] - centre[0], X[:, 1] - centre[1])) / field.spacing[0] + farther
     return np.stack([-inside / 2, inside / 2])
@@ -262,9 +270,9 @@ def in_its_true_place(field, radius, centre, farther=0.0):
 @pytest.mark.slow
 @pytest.mark.parametrize(("radius", "most", "edges_do"), [(0.010, 0.01, 0.025), (0.005, 0.07, 0.0)])
 def test_what_labels_and_elements_do_to_a_cylinder(radius, most, edges_do, monkeypatch):
-    """Without noise: with edges in their true place, and of labels with one place for each whole edge.
+    """Without noise: with exact edges, and with edges from labels that may shift only as a whole.
 
-    Of 5 voxels, labels do 3 to 4 % here, by where the cylinder lies among the voxels, and elements below 1 %.
+    For 5 voxels, labels cause an error of 3 to 4 %, depending on the cylinder's position, and elements below 1 %.
     """
     off = []
     for centre in ((3e-4, -4e-4), (1e-3, 1e-5)):
@@ -286,7 +294,7 @@ def test_what_labels_and_elements_do_to_a_cylinder(radius, most, edges_do, monke
 
 
 def test_the_errors_of_a_cylinder_are_those_of_repeated_noise():
-    """Twelve measurements scatter as the standard errors say: their ratio has itself a deviation of a fifth."""
+    """Twelve measurements scatter as the standard errors state. Their ratio has a deviation of a fifth."""
     field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, noise=0.0, voxels_across=13)
     own = organ_of(field)
     m = edges.region_matrices(
@@ -324,6 +332,6 @@ def test_regions_smaller_than_their_error_says_are_told(radius, told):
     said = cautions._of_small_regions(field, np.array([1, 2]))
     assert [one.partition("regions ")[2].partition(":")[0] for one in said] == told
     slab = np.zeros(labels.shape, bool)
-    slab[:, :, 6:8] = True  # two slices of an organ: its own surface makes no region small
+    slab[:, :, 6:8] = True  # two slices of an organ: its surface does not make a region small
     said = cautions._of_small_regions(field._replace(mask=slab), np.array([1, 2]))
     assert not any("1 (" in one for one in said)

@@ -1,4 +1,4 @@
-"""Waves on voxels from files: formats, units, wrapped phases, and files that cannot be used."""
+"""Waves on voxels from files: formats, units, wrapped phases, and unusable files."""
 
 import re
 import sys
@@ -19,7 +19,11 @@ pytestmark = pytest.mark.quick_to_compile
 @pytest.mark.parametrize(
     ("kind", "shape", "words"),
     [
-        (np.float32, (6, 6, 6, 3, 2), "its numbers are real, and taken for labels: give the waves as complex numbers"),
+        (
+            np.float32,
+            (6, 6, 6, 3, 2),
+            "the numbers are real, so they are read as labels: give waves as complex numbers",
+        ),
         (np.complex64, (6, 6, 6), r"displacement has shape \(6, 6, 6\): give complex numbers \(nx, ny, nz, 3\)"),
     ],
 )
@@ -42,7 +46,7 @@ def test_a_file_of_any_format_is_read_as_it_was_written(tmp_path, ending):
 
 
 def test_a_table_may_have_the_columns_of_other_formats(tmp_path):
-    """frequency_Hz was ignored beside --frequencies, and so were mask and labels."""
+    """A column frequency_Hz was ignored if --frequencies was given, and so were mask and labels."""
     field = plane_waves((5, 5, 5))
     path = written(tmp_path, ".csv", field)
     head, *rows = path.read_text().splitlines()
@@ -54,16 +58,16 @@ def test_a_table_may_have_the_columns_of_other_formats(tmp_path):
     assert found.mask.sum() == 75 and found.labels[:, 0, 0].tolist() == [1, 1, 1, 2, 2]
     whole, n = path.read_text(), len(rows) // 2
     path.write_text(whole.replace("labels", "label").replace("mask", "region"))
-    with pytest.raises(InputError, match="two columns mean label: leave one of them"):
+    with pytest.raises(InputError, match="two columns contain label: remove one of them"):
         wave_field.read_waves(path)
-    # A spreadsheet leaves empty columns, and two of one unknown name mean nothing.
+    # Spreadsheets leave empty columns. Two columns of one unknown name have no meaning.
     head, *lines = whole.splitlines()
     for more in (",,", ",note,note"):
         path.write_text("\n".join([head + more, *(line + ",," for line in lines)]) + "\n")
         assert wave_field.read_waves(path).mask.sum() == 75
     last = rows[-1].split(",")
     path.write_text(whole.replace(rows[-1], ",".join([*last[:-2], str(1 - int(last[-2])), last[-1]])))
-    with pytest.raises(InputError, match=f"row ({n + 1}|{2 * n + 1}): mask differs from that of another frequency"):
+    with pytest.raises(InputError, match=f"row ({n + 1}|{2 * n + 1}): mask differs from another frequency"):
         wave_field.read_waves(path)
 
 
@@ -75,7 +79,7 @@ def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
     found = wave_field.read_waves(tmp_path / "phases.npz", list(HERTZ))
     np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-18)
     assert not any("instants" in note for note in found.notes)
-    # The end of the period repeats its beginning: the moduli would be 5 % off.
+    # The end of the period repeats its beginning. The error of the moduli would be 5 %.
     phases = np.concatenate([phases, phases[:, :1]], axis=1)
     noise = np.random.default_rng(0).normal(size=phases.shape) * 0.1 * np.std(phases)
     np.savez(tmp_path / "phases.npz", phases=phases + noise, spacing=H)
@@ -108,7 +112,7 @@ def test_text_and_objects_in_place_of_arrays_get_a_sentence_about_numbers(tmp_pa
 
 
 def wrapped_file(path, radians_per_metre=2.8e5):
-    """Phases of waves that go over 2 pi several times, as a scanner stores them: a corner is not measured."""
+    """Write phases of waves that exceed 2 pi several times, as a scanner stores them. One corner is not measured."""
     field = plane_waves((12, 12, 14))
     t = np.arange(8) / 8
     motion = np.stack([np.real(field.displacement * np.exp(2j * np.pi * one)) for one in t], axis=1)
@@ -121,7 +125,7 @@ def wrapped_file(path, radians_per_metre=2.8e5):
 def test_wrapped_phases_are_unwrapped(tmp_path):
     pytest.importorskip("skimage")
     exact, reach = wrapped_file(tmp_path / "wrapped.npz")
-    assert reach > 2 * np.pi  # else nothing is wrapped
+    assert reach > 2 * np.pi  # otherwise nothing is wrapped
     found = wave_field.read_waves(tmp_path / "wrapped.npz")
     off = (found.displacement - exact)[:, 2:]
     np.testing.assert_allclose(off, 0, atol=1e-12)
@@ -129,12 +133,12 @@ def test_wrapped_phases_are_unwrapped(tmp_path):
     assert not [note for note in found.notes if not note.startswith("component y is zero")]
     wrapped_file(tmp_path / "steep.npz", 6e5)  # more than pi from one voxel to the next
     steep, left, _ = wave_field.read_waves(tmp_path / "steep.npz").notes
-    assert "mask them" in left
+    assert "Remove these voxels from the mask" in left
     assert re.match(r"frequency 2 of 2: [\d.]+ % of neighbouring voxels differ by nearly pi", steep)
 
 
 def test_phases_of_air_are_not_unwrapped(tmp_path):
-    """Noise outside of the mask was told as waves too steep."""
+    """Noise outside the mask was reported as waves that are too steep."""
     pytest.importorskip("skimage")
     exact, _ = wrapped_file(tmp_path / "wrapped.npz")
     held = dict(np.load(tmp_path / "wrapped.npz"))
@@ -164,8 +168,8 @@ def test_wrapped_phases_that_are_no_radians_get_a_sentence(tmp_path, monkeypatch
     [
         ({"spacing": None}, "give --spacing"),
         ({"spacing": [2.0, 2.0, 2.0]}, "give metres, not mm"),
-        ({"frequencies": None}, "give --frequencies with 2"),
-        ({"frequencies": [60.0]}, "1 frequencies for 2 fields"),
+        ({"frequencies": None}, "give 2 in Hz, e.g. --frequencies"),
+        ({"frequencies": [60.0]}, "1 frequencies for 2 displacement fields"),
         ({"frequencies": [60.0, 60.0]}, "not all different"),
         ({"frequencies": [60.0, -1.0]}, "above 0 Hz"),
         ({"displacement": np.ones((2, 5, 5, 5, 3))}, "no imaginary part"),
@@ -173,10 +177,10 @@ def test_wrapped_phases_that_are_no_radians_get_a_sentence(tmp_path, monkeypatch
         ({"displacement": np.full((2, 5, 5, 5, 3), 0j)}, "zero or not a number everywhere"),
         ({"displacement": None}, "store the waves as displacement"),
         ({"mask": np.zeros((5, 5, 5), int)}, "no voxel of the mask"),
-        ({"mask": np.ones((4, 5, 5), int)}, "on the same voxels"),
+        ({"mask": np.ones((4, 5, 5), int)}, "use the same voxels"),
         ({"labels": np.full((5, 5, 5), 0.5)}, "whole numbers"),
         ({"unit": "inch"}, "unit 'inch' is not known"),
-        ({"frequencies": ["sixty", "hundred"]}, "frequencies holds"),
+        ({"frequencies": ["sixty", "hundred"]}, "does not contain numbers"),
         ({"origin": [0.0, np.nan, 0.0]}, "three coordinates"),
     ],
 )
@@ -209,7 +213,7 @@ def test_other_frequencies_than_those_of_the_file_are_refused(tmp_path, asked):
 
 @pytest.mark.parametrize("version", ["5", "7.3"])
 def test_files_of_matlab_have_the_axes_that_matlab_shows(tmp_path, version):
-    """SciPy writes version 5; 7.3 is HDF5 with the axes reversed, classes as attributes and text as numbers."""
+    """SciPy writes version 5. Version 7.3 is HDF5 with reversed axes, classes as attributes and text as numbers."""
     field = plane_waves((5, 6, 7))
     held = {"displacement": 1e3 * field.displacement, "frequencies": np.array([HERTZ]), "spacing": np.full((1, 3), H)}
     if version == "5":
@@ -247,7 +251,7 @@ def test_units_in_the_headings_of_a_table_are_read(tmp_path):
     np.testing.assert_allclose(found.displacement, exact.displacement, rtol=1e-12)
     np.testing.assert_allclose(found.spacing, exact.spacing, rtol=1e-12)
     path.write_text(path.read_text().replace("y [mm]", "y_m", 1))
-    with pytest.raises(InputError, match="the heading y_m has another unit than mm"):
+    with pytest.raises(InputError, match="heading y_m has a unit other than mm"):
         wave_field.read_waves(path)
 
 
@@ -267,13 +271,13 @@ def test_a_table_with_semicolons_and_decimal_commas_is_read(tmp_path):
 
 
 def test_a_component_of_zeros_is_told(tmp_path):
-    """A wave may have one direction; but programs also write zeros where they did not measure."""
+    """A wave may have one direction. But programs also write zeros where they did not measure."""
     field = plane_waves((5, 5, 5), noise=1e-7)
     U = field.displacement.copy()
     U[..., 2] = 0
     np.savez(tmp_path / "two.npz", displacement=U, spacing=H, frequencies=HERTZ, unit=b"m")
     found = wave_field.read_waves(tmp_path / "two.npz")
-    assert found.notes == ("component z is zero everywhere: write NaN where it was not measured",)
+    assert found.notes == ("component z is zero everywhere: write NaN if this component was not measured",)
     U[..., 2] = np.nan
     np.savez(tmp_path / "two.npz", displacement=U, spacing=H, frequencies=HERTZ)
     assert not wave_field.read_waves(tmp_path / "two.npz").notes
@@ -291,7 +295,7 @@ def test_labels_on_voxels_of_another_size_are_refused(tmp_path):
 
 
 def test_rounded_places_tell_the_spacing_by_their_whole_length(tmp_path):
-    """Voxels of 1.5625 mm, written with five decimals: single steps are 1.56 and 1.57 mm."""
+    """Voxels of 1.5625 mm are written with five decimals, so single steps are 1.56 and 1.57 mm."""
     field = plane_waves((12, 5, 5))
     text = written(tmp_path, ".csv", field).read_text().splitlines()
     rows = [line.split(",") for line in text[1:]]
@@ -307,7 +311,7 @@ def test_a_column_with_another_name_is_told(tmp_path):
     path = written(tmp_path, ".csv", plane_waves((5, 5, 5)))
     head, *rows = path.read_text().replace("frequency", "freq_Hz").splitlines()
     path.write_text("\n".join([f"mask,{head}", *(f"1,{row}" for row in rows)]) + "\n")
-    with pytest.raises(InputError, match=r"name the column of the frequencies frequency \(not freq_hz\)"):
+    with pytest.raises(InputError, match=r"rename column freq_hz to frequency if it contains the frequencies"):
         wave_field.read_waves(path)
 
 
@@ -324,12 +328,14 @@ SHEARED = np.array([[2.0, 1.0, 0, 0], [0, 2.0, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 
 @pytest.mark.parametrize(
     ("affine", "pixdim", "words"),
     [
-        (np.diag([2.0, 2, 2, 1]), [1.0, 1, 1], "its header has voxels of [1.0, 1.0, 1.0] and its affine of"),
-        (SHEARED, None, "the axes of its voxels are not at right angles"),
+        (np.diag([2.0, 2, 2, 1]), [1.0, 1, 1], "the header states the voxel size [1.0, 1.0, 1.0], but the affine"),
+        (SHEARED, None, "the axes of the voxels are not perpendicular"),
     ],
 )
 def test_a_nifti_file_whose_voxels_are_not_known_is_refused(tmp_path, affine, pixdim, words):
-    """The spacing came from the header: 754 Pa for 3000 where the affine said another one."""
+    """The spacing was taken from the header. Where the affine matrix has another one, the result was 754 Pa for 3000
+    Pa.
+    """
     path = tmp_path / "w.nii"
     _nifti_of_waves(path, affine)
     if pixdim is not None:  # nibabel writes both alike
@@ -341,7 +347,7 @@ def test_a_nifti_file_whose_voxels_are_not_known_is_refused(tmp_path, affine, pi
     if pixdim is not None:
         found = wave_field.read_waves(path, frequencies=list(HERTZ), spacing=[0.002] * 3)
         assert np.array_equal(found.spacing, [0.002] * 3)
-        # A mask with the same wrong header: its place is not known, so only its shape counts.
+        # A mask with the same wrong header: its position is unknown, so only its shape counts.
         nibabel = pytest.importorskip("nibabel")
         nibabel.save(nibabel.Nifti1Image(np.ones(found.mask.shape, np.int16), affine), tmp_path / "m.nii")
         raw = bytearray((tmp_path / "m.nii").read_bytes())
@@ -353,7 +359,7 @@ def test_a_nifti_file_whose_voxels_are_not_known_is_refused(tmp_path, affine, pi
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_labels_that_lie_elsewhere_than_the_waves_are_refused(tmp_path, turned):
-    """Stored with x backwards, the soft region took the stiff one's place."""
+    """The labels were stored with reversed x, and the soft region replaced the stiff one."""
     field = _nifti_of_waves(tmp_path / "w.nii", np.diag([2.0, 2, 2, 1]))
     nibabel, labels = pytest.importorskip("nibabel"), np.ones(field.mask.shape, np.int16)
     labels[4:] = 2
@@ -362,7 +368,7 @@ def test_labels_that_lie_elsewhere_than_the_waves_are_refused(tmp_path, turned):
         affine[0, 0], affine[0, 3], labels = -2.0, 12.0, labels[::-1].copy()
     nibabel.save(nibabel.Nifti1Image(labels, affine), tmp_path / "l.nii")
     if turned:
-        with pytest.raises(InputError, match="its voxels lie elsewhere than those of the waves"):
+        with pytest.raises(InputError, match="the voxels are not at the positions of the voxels of the waves"):
             wave_field.read_waves(tmp_path / "w.nii", labels=tmp_path / "l.nii", frequencies=list(HERTZ))
         return
     read = wave_field.read_waves(tmp_path / "w.nii", labels=tmp_path / "l.nii", frequencies=list(HERTZ))

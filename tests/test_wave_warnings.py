@@ -1,4 +1,4 @@
-"""What data of waves may be instead: wrong units, wrong signs, gaps, noise alone."""
+"""Warnings on wave data: wrong units, wrong signs, gaps, noise alone."""
 
 from types import SimpleNamespace
 
@@ -23,7 +23,7 @@ def test_gaps_within_the_organ_are_told():
     field.displacement[0, [2, 4, 6], [4, 6, 4], [4, 6, 8], 1] = np.nan
     (note,) = elastography.notes_on_gaps(field)
     left = len(np.asarray(elastography.body_of(field).linear.tetrahedra)) / 6 / (4 * 4 * 6)
-    assert f"3 voxels within the organ have no displacement or are not in the mask, and {100 * left:.2g} % of" in note
+    assert f"3 voxels within the organ have no displacement or are not in the mask, so only {100 * left:.2g} %" in note
 
 
 def test_voxels_in_no_element_are_told():
@@ -72,11 +72,11 @@ def test_another_spacing_than_that_of_the_file_is_told(tmp_path):
     np.savez(tmp_path / "w.npz", **arrays)
     (_,) = wave_field.read_waves(tmp_path / "w.npz", spacing=list(field.spacing)).notes  # a component is 0
     note, _ = wave_field.read_waves(tmp_path / "w.npz", spacing=list(2 * field.spacing)).notes
-    assert "the file states a spacing of" in note and note.endswith("m is used: moduli grow with its square")
+    assert "the file states a spacing of" in note and note.endswith("to the square of the spacing")
 
 
 def test_a_springpot_that_misses_the_moduli_is_told(tmp_path):
-    """Solids of three materials at three frequencies: no springpot rises and falls so."""
+    """The moduli are those of three different solids at three frequencies. No springpot has such a change."""
     rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
     rows += ["50,3200,600,17,17", "75,2500,1900,17,17", "100,3800,300,17,17"]
     (tmp_path / "s.csv").write_text("\n".join(rows) + "\n")
@@ -90,11 +90,11 @@ def test_a_springpot_that_misses_the_moduli_is_told(tmp_path):
     [
         ((0, 2, 1), (1, 1, 1), "(x, z, y)"),
         ((1, 2, 0), (1, 1, 1), "(z, x, y)"),
-        ((0, 1, 2), (-1, 1, 1), "-"),  # of x or of z: waves across y do not tell
+        ((0, 1, 2), (-1, 1, 1), "-"),  # exchange of x or z: waves across y do not show it
     ],
 )
 def test_components_that_do_not_follow_the_axes_are_told(noise, order, signs, told):
-    """Shear waves keep the volume; with exchanged components or a wrong sign they would not."""
+    """Shear waves keep the volume. With exchanged components or a wrong sign they would not."""
     field = plane_waves((9, 9, 9), noise=noise)
     said = components.order_sentence(
         field._replace(displacement=np.asarray(signs) * field.displacement[..., list(order)])
@@ -105,7 +105,7 @@ def test_components_that_do_not_follow_the_axes_are_told(noise, order, signs, to
 @pytest.mark.parametrize("noise", [0.0, 4e-7, 4e-6])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_components_that_follow_the_axes_are_never_accused(noise, sign):
-    """Noise changes the volume in every order alike; the sign of all together says nothing."""
+    """Noise changes the volume equally in every order. A common sign of all components has no effect."""
     field = plane_waves((9, 9, 9), noise=noise)
     assert components.order_sentence(field._replace(displacement=sign * field.displacement)) is None
 
@@ -113,7 +113,7 @@ def test_components_that_follow_the_axes_are_never_accused(noise, sign):
 @pytest.mark.parametrize(
     ("moduli", "words"),
     [
-        ([1338 + 400j, 6756 + 2000j], "to the power of 4"),  # fields of 3000 Pa, each with the other's frequency
+        ([1338 + 400j, 6756 + 2000j], "to the power of 4"),  # fields of 3000 Pa, each with the frequency of the other
         ([6756 + 2000j, 1338 + 400j], "to the power of -4"),
         ([3000 + 900j, 3300 + 990j], ""),
         ([30 + 9j, 33 + 9j], "check the spacing"),
@@ -121,7 +121,7 @@ def test_components_that_follow_the_axes_are_never_accused(noise, sign):
     ],
 )
 def test_scales_that_no_tissue_has_are_told(moduli, words):
-    """The balance of forces has no scale: chi^2 is 1 with a wrong spacing, and with frequencies in another order."""
+    """The balance of forces has no scale: chi^2 is 1 also with a wrong spacing, or with exchanged frequencies."""
     G = np.array(moduli)[:, None]
     own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array([50.0, 75.0])), density=DENSITY)
     found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
@@ -140,7 +140,9 @@ def test_scales_that_no_tissue_has_are_told(moduli, words):
     ],
 )
 def test_frequencies_in_radians_are_told(hertz, told):
-    """A liver at 1.8 m/s becomes one at 11 m/s, which a stiff tissue may have, and its modulus 39 times as large."""
+    """A liver with 1.8 m/s becomes one with 11 m/s, which a stiff tissue may have, and its modulus is 39 times as
+    large.
+    """
     G = np.array([123e3 + 27e3j, 129e3 + 29e3j])[:, None]
     own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array(hertz)), density=DENSITY)
     found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
@@ -149,7 +151,7 @@ def test_frequencies_in_radians_are_told(hertz, told):
 
 
 def test_moduli_that_no_springpot_has_are_written_all_the_same(tmp_path):
-    """A loss that noise makes negative: of a nearly elastic phantom."""
+    """In a nearly elastic phantom, noise makes the loss negative."""
     file = tmp_path / "sweep_whole.csv"
     file.write_text(
         "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa\n"
@@ -161,7 +163,7 @@ def test_moduli_that_no_springpot_has_are_written_all_the_same(tmp_path):
 
 def test_a_field_that_holds_no_number_is_named(tmp_path):
     field = plane_waves((6, 6, 6), noise=1e-7)
-    for part, words in ((slice(None), "its noise at 100 Hz cannot .* leave this field out"), (slice(0, 3), "")):
+    for part, words in ((slice(None), "the noise at 100 Hz cannot .* remove this field"), (slice(0, 3), "")):
         U = field.displacement.copy()
         U[1, part] = np.nan
         np.savez(tmp_path / "w.npz", displacement=U, spacing=[H] * 3, frequencies=HERTZ)
@@ -174,7 +176,7 @@ def test_a_field_that_holds_no_number_is_named(tmp_path):
 
 
 def test_zeros_at_one_frequency_are_no_measurement(tmp_path):
-    """They were taken for motion: 2396 +- 35 for 3000."""
+    """Zeros were taken for motion, with the result 2396 +- 35 for 3000."""
     field = plane_waves((6, 6, 6), noise=1e-7)
     U = field.displacement.copy()
     U[1, :2] = 0.0
@@ -182,7 +184,7 @@ def test_zeros_at_one_frequency_are_no_measurement(tmp_path):
     np.savez(tmp_path / "w.npz", displacement=U, spacing=[H] * 3, frequencies=HERTZ)
     found = wave_field.read_waves(tmp_path / "w.npz")
     assert np.isnan(found.displacement[1, :2]).all() and np.isfinite(found.displacement[0, :2]).all()
-    assert any("72 voxels do not move in field 2, but in others" in n for n in found.notes)
+    assert any("72 voxels do not move in field 2 but move in other" in n for n in found.notes)
     assert any("field 1 has 6 components that are exactly 0" in n for n in found.notes)
 
 

@@ -25,12 +25,12 @@ PLANE = (((0.6, 0, 0.8), (0.8, 0, -0.6), 1e-5), ((0, 1, 0), (0, 0, 1), 5e-6), ((
 
 
 def modulus(hertz):
-    """Of a Kelvin-Voigt solid [Pa]."""
+    """Return the modulus of a Kelvin-Voigt solid [Pa]."""
     return 3000 + 2j * np.pi * hertz * 1.0
 
 
 def plane_waves(shape, noise=0.0, seed=0, **more):
-    """Waves of the closed form on voxels."""
+    """Return waves of the closed form on voxels."""
     X = np.stack(np.meshgrid(*[np.arange(n) * H for n in shape], indexing="ij"), axis=-1)
     k = 2 * np.pi * HERTZ * np.sqrt(DENSITY / modulus(HERTZ))
     U = [sum(a * np.exp(-1j * one * (X @ np.array(n)))[..., None] * np.array(p) for n, p, a in PLANE) for one in k]
@@ -68,7 +68,8 @@ def test_a_hole_in_the_mask_takes_away_its_bricks_and_their_inner_nodes():
     body = voxels.voxel_body(mask, np.ones(3))
     assert np.asarray(body.linear.volumes).sum() == pytest.approx(6**3 - 8)
     whole = voxels.voxel_body(np.ones((7, 7, 7), bool), np.ones(3))
-    assert whole.inner.sum() - body.inner.sum() == 2**3  # inner nodes of that brick: the four around it look in
+    # the inner nodes of the removed brick
+    assert whole.inner.sum() - body.inner.sum() == 2**3
 
 
 def test_the_block_solver_is_that_of_the_whole_matrix(small):
@@ -83,7 +84,7 @@ def test_the_block_solver_is_that_of_the_whole_matrix(small):
 
 
 def test_the_likeliest_motion_obeys_the_balance_up_to_a_pressure(small):
-    """C u = - B p: what is left of the forces is a gradient, and nothing else."""
+    """For the most probable motion, C u = - B p: the remaining forces are the gradient of a pressure."""
     m, w = small.matrices, small.waves
     G = np.full(m.rows.shape[-1], modulus(60.0))
     found = balance.balanced(m, G, w.omega[0], w.motion[0], w.sd[0])
@@ -97,7 +98,9 @@ def test_the_likeliest_motion_obeys_the_balance_up_to_a_pressure(small):
 
 
 def test_the_gradient_by_the_modulus_is_the_difference(small):
-    """Re(q^H C' u) / sd^2 is the slope of chi^2 / 2; differences have their V: h^2 above, roundoff below."""
+    """Re(q^H C' u) / sd^2 is the derivative of chi^2 / 2. Differences have a V-shaped error: h^2 above,
+    rounding below.
+    """
     m, w = small.matrices, small.waves
     one = np.ones(m.rows.shape[-1])
 
@@ -111,12 +114,14 @@ def test_the_gradient_by_the_modulus_is_the_difference(small):
 
 
 def test_moduli_of_plane_waves_within_their_errors(small, verified):
-    """Closed form, 2 % of noise: storage and loss within three standard errors and the stated share of the voxels."""
+    """Closed form with 2 % of noise: storage and loss are exact within three standard errors plus the stated voxel
+    error.
+    """
     found = elastography.regions_of(small)
     G, e = found.whole.modulus[:, 0], found.whole.standard_errors[:, 0].real
     off = G * (1 - found.mesh_bias) - modulus(HERTZ)
     assert np.all(found.whole.converged) and np.all(found.whole.chi2 / found.whole.components < 1.3)
-    share = np.abs(found.mesh_bias * G)  # a mean of directions; these waves have theirs
+    share = np.abs(found.mesh_bias * G)  # a mean over directions; these waves have particular ones
     assert np.all(np.abs(off.real) < 3 * e + share) and np.all(np.abs(off.imag) < 3 * e + share)
     allowed = float((3 * e + share)[1] * np.sqrt(2) / abs(G[1]))  # real and imaginary part
     verified(
@@ -125,7 +130,7 @@ def test_moduli_of_plane_waves_within_their_errors(small, verified):
 
 
 def test_noise_does_not_pull_the_modulus_down_and_the_errors_are_right():
-    """Forty measurements with 5 % of noise: mean and scatter of (found - true) / error are 0 and 1."""
+    """Forty measurements with 5 % of noise: (found - true) / error has mean 0 and deviation 1."""
     first = organ((7, 7, 7), noise=5e-7)
     clean = plane_waves((7, 7, 7)).displacement[(slice(None), *first.body.voxel.T)].reshape(2, -1)
     alone = elastography._uniform(first.matrices, first.body, DENSITY)
@@ -141,7 +146,7 @@ def test_noise_does_not_pull_the_modulus_down_and_the_errors_are_right():
 
 
 def test_the_direct_inversion_has_the_error_of_its_stencil_and_noise_lowers_it():
-    """Second differences of a wave are smaller by (k h)^2 / 12 along each axis, curls as well, so G is larger."""
+    """Second differences of a wave are smaller by (k h)^2 / 12 along each axis, and so are curls. So G is larger."""
     field = plane_waves((11, 11, 11))
     axis = np.exp(-1j * 2 * np.pi * HERTZ * np.sqrt(DENSITY / modulus(HERTZ)) * H * np.arange(11)[:, None])  # (11, F)
     U = np.zeros_like(field.displacement)
@@ -180,7 +185,7 @@ def test_labels_of_means_stay_in_their_place():
 
 
 def test_changes_over_a_slope_are_those_of_a_linear_field():
-    """Over the length, and over a brick's side where that is longer."""
+    """The change is taken over the length, or over the side of a brick if this is longer."""
     spacing = np.array([1e-3, 2e-3, 3e-3])
     body = voxels.voxel_body(np.ones((7, 7, 9), bool), spacing)
     a = np.array([3.0, -2.0, 5.0 + 1j])
@@ -191,7 +196,7 @@ def test_changes_over_a_slope_are_those_of_a_linear_field():
 
 
 def test_samples_of_the_map_scatter_as_its_deviations_say():
-    """Of 400 samples the deviation is known to 3.5 %. It is of the posterior and of the place."""
+    """With 400 samples the deviation is known to 3.5 %. It contains the posterior and the error of position."""
     own = organ(noise=5e-7)
     course = stiffness_map.course_of(own.body, own.matrices, own.waves, 1.3 * modulus(HERTZ), 0.01)
     drawn = stiffness_map.map_of(course, draws=400)
@@ -203,7 +208,7 @@ def test_samples_of_the_map_scatter_as_its_deviations_say():
 
 @pytest.mark.parametrize("wrong", [(1.3, 1.0), (1.0, 1.3)])
 def test_a_map_finds_the_ratio_of_its_frequencies(wrong):
-    """It held the ratio of the moduli that it began from: 35 % and 20 % off at the lower frequency."""
+    """The ratio of the starting moduli was kept. At the lower frequency, the errors were 35 % and 20 %."""
     own = organ(noise=5e-7)
     course = stiffness_map.course_of(own.body, own.matrices, own.waves, np.array(wrong) * modulus(HERTZ), 0.01)
     drawn = stiffness_map.map_of(course, draws=400)
@@ -225,7 +230,9 @@ def test_deviations_of_a_modulus_are_those_of_samples():
 
 @pytest.mark.parametrize("axis", [0, *(pytest.param(axis, marks=pytest.mark.slow) for axis in (1, 2))])
 def test_the_error_of_long_voxels_is_that_of_the_waves_that_cross_them(axis):
-    """Voxels twice as long along the way of a wave as across it: the wave's own error, whatever the axis."""
+    """Voxels are twice as long along the direction of the wave as across it. The estimate is the wave's error for each
+    axis.
+    """
     spacing, shape = np.full(3, H), np.full(3, 7)
     spacing[axis] *= 2
     X = np.stack(np.meshgrid(*[np.arange(n) * h for n, h in zip(shape, spacing, strict=True)], indexing="ij"), axis=-1)
@@ -237,12 +244,14 @@ def test_the_error_of_long_voxels_is_that_of_the_waves_that_cross_them(axis):
     found = elastography.regions_of(elastography.organ_of(field, elastography.body_of(field), DENSITY))
     error = found.whole.modulus[:, 0] / modulus(HERTZ) - 1
     assert np.all(np.abs(error) > 0.005)
-    # The patch of the estimate is as small as this body, but another one: its edges are elsewhere in the wave.
+    # The patch of the estimate is as small as this body, but its edges are at other positions in the wave.
     assert np.all(np.abs(found.mesh_bias - error) < 0.25 * np.abs(error))
 
 
 def test_each_region_has_the_error_of_waves_of_its_own_length():
-    """A soft region beside a stiff one: that of the whole organ's modulus was a sixth of it."""
+    """A soft region is beside a stiff one. The estimate with the modulus of the whole organ was a sixth of its
+    error.
+    """
     field = plane_waves((9, 9, 9), noise=4e-7)
     organ, G = elastography.organ_of(field, elastography.body_of(field), DENSITY), modulus(HERTZ)[0]
     bias, left = elastography._biases(organ, np.array([[G, 4 * G, 1.1 * G, 2 * G]] * len(HERTZ)))
@@ -250,8 +259,8 @@ def test_each_region_has_the_error_of_waves_of_its_own_length():
     for r, factor in ((0, 1), (1, 4), (2, 1.1), (3, 2)):
         own, weights = elastography.plane_wave_biases(factor * G, 2 * np.pi * HERTZ[0], organ, strength[0])
         exact = own @ weights
-        # A modulus near another one takes its waves, as the error goes with the square of the wave number: to a
-        # quarter, which is how well this estimate is known.
+        # A region with a similar modulus uses the waves of the other. The error goes with the square of the wave
+        # number, so it is known to a quarter, which is the accuracy of this estimate.
         assert abs(bias[0, r] - exact) < (1e-12 if r != 2 else 0.25) * abs(exact)
         assert left[0, r].shape == (2 * len(elastography.DIRECTIONS),)
     assert abs(bias[0, 0] - bias[0, 1]) > 0.1 * abs(bias[0, 0])
@@ -262,10 +271,10 @@ def test_each_region_has_the_error_of_waves_of_its_own_length():
     [(5, 0), (3, 0), *(pytest.param(*own, marks=pytest.mark.slow) for own in ((5, 1), (5, 2), (3, 1)))],
 )
 def test_the_error_of_the_voxels_of_a_thin_slab_is_known(layers, seed):
-    """One or two bricks thick, six waves of any polarisation (12 seeds).
+    """The slab is one or two bricks thick, with six waves of any polarisation (12 seeds).
 
-    In two bricks, one polarisation for each direction and equal weights missed the error by 0.8 of its size on average;
-    now 0.3. In one brick they missed it by 0.17, and both polarisations with equal weights by 0.12; now 0.017.
+    In two bricks, one polarisation per direction and equal weights missed the error by 0.8 of its size on average; now
+    it is 0.3. In one brick they missed it by 0.17, and both polarisations with equal weights by 0.12; now it is 0.017.
     """
     rng, sizes = np.random.default_rng(seed), np.array([2e-3, 2.2e-3, 1.8e-3])
     G = 2500 + 1600j
@@ -287,7 +296,7 @@ def test_the_error_of_the_voxels_of_a_thin_slab_is_known(layers, seed):
 
 
 def _waves_of_many_directions(shape, seed):
-    """Eight plane waves at 75 Hz in 3000 + 900i Pa (1, nx, ny, nz, 3), whose root mean square is 1e-5 m."""
+    """Return eight plane waves at 75 Hz in 3000 + 900i Pa (1, nx, ny, nz, 3), with a root mean square of 1e-5 m."""
     rng, k = np.random.default_rng(seed), 2 * np.pi * 75.0 * np.sqrt(DENSITY / (3000 + 900j))
     X = np.stack(np.meshgrid(*[2e-3 * (np.arange(n) - n / 2) for n in shape], indexing="ij"), axis=-1)
     U = np.zeros((*shape, 3), complex)
@@ -311,8 +320,9 @@ def _found_in(U):
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [0.0, 0.7])
 def test_errors_of_smoothed_noise_hold_the_truth(width):
-    """Noise of 2 % behind a Gaussian filter of 0.7 voxels: stated errors were a third of the true ones, without a
-    word; two thirds of the moduli were more than two of them off."""
+    """Noise of 2 % is smoothed by a Gaussian filter of 0.7 voxels. Stated errors were a third of the true ones, without
+    a message. Two thirds of the moduli were wrong by more than two of them.
+    """
     off = []
     for seed in range(3):
         U, rng = _waves_of_many_directions((11, 11, 9), seed), np.random.default_rng(seed)
@@ -323,15 +333,16 @@ def test_errors_of_smoothed_noise_hold_the_truth(width):
         G, error = found.whole.modulus[0, 0], found.whole.standard_errors[0, 0]
         z = G * (1 - found.mesh_bias[0]) - (3000 + 900j)
         off += [z.real / error.real, z.imag / error.imag]
-        told = any("share their residuals" in s for s in cautions.cautions_of_elastography(own, found, None))
+        told = any("voxels are correlated" in s for s in cautions.cautions_of_elastography(own, found, None))
         factor = found.whole.noise_factor[0, 0]
         assert told == bool(width) and (factor > 3 if width else factor < 1.2)
     assert np.sqrt(np.mean(np.square(off))) < 1.8  # six numbers: 1 with a deviation of 0.29
 
 
 def test_a_hole_in_the_mask_is_in_the_mesh_bias():
-    """Without noise: the elements alone are 0.15 % off, with a hole 1.2 %. Half of it is found: the measured waves are
-    a sum whose parts add up at the hole, and the estimate's waves come one by one."""
+    """Without noise, the elements alone cause an error of 0.15 %, and with a hole 1.2 %. Half of it is found. The
+    measured waves are a sum whose parts add up at the hole; the estimate treats each wave separately.
+    """
     U = _waves_of_many_directions((11, 11, 9), 10)
     U[0, 3:6, 3:6, 2:5] = np.nan
     _, found = _found_in(U)
@@ -340,7 +351,7 @@ def test_a_hole_in_the_mask_is_in_the_mesh_bias():
 
 
 def test_the_direct_inversion_leaves_out_what_the_edge_smooths():
-    """Without noise every voxel that is given is within the error of its differences, (k h)^2 / 12 on each axis."""
+    """Without noise, every voxel with a value is within the error of its differences, (k h)^2 / 12 on each axis."""
     field = plane_waves((17, 17, 17))
     G = direct_inversion.invert(field, DENSITY)
     assert np.isfinite(G[0]).sum() == 7**3
@@ -349,7 +360,9 @@ def test_the_direct_inversion_leaves_out_what_the_edge_smooths():
 
 
 def test_moduli_that_long_waves_leave_open_have_an_interval_of_their_own(small):
-    """Waves long beside the organ determine 1/G: 10376 ± 3820 Pa was stated for 30,000, five errors below it."""
+    """Waves that are long relative to the organ determine 1/G. 10376 ± 3820 Pa was stated for 30,000, wrong by five
+    errors.
+    """
     found = elastography.regions_of(small)
     G, e = 10376.0, 3820.0
 
@@ -367,13 +380,13 @@ def test_moduli_that_long_waves_leave_open_have_an_interval_of_their_own(small):
 
 
 def test_waves_of_the_other_sign_are_told(small):
-    """Conjugate waves, of exp(-i omega t), have the modulus of a solid that gains energy."""
+    """Conjugate waves, with exp(-i omega t), have the modulus of a solid that gains energy."""
     field = small.field._replace(displacement=np.conj(small.field.displacement))
     other = elastography.organ_of(field, elastography.body_of(field), DENSITY)
     assert not cautions._sign(small, elastography.regions_of(small))
     (told,) = cautions._sign(other, elastography.regions_of(other))
     assert "loss modulus is negative at 60 Hz, 100 Hz" in told and "complex conjugate" in told
-    # One modulus for two materials may have any loss: those of the regions count.
+    # One modulus for two materials may have any loss, so those of the regions count.
     found = elastography.regions_of(small)
     uniform = found.whole._replace(modulus=np.conj(found.whole.modulus))
     assert not cautions._sign(small, found._replace(whole=uniform, parts=found.whole, labels=np.array([1])))
@@ -388,7 +401,7 @@ def test_a_body_in_parts_has_the_same_elements_and_keeps_faces_out_of_the_balanc
     points = np.asarray(parts.linear.points)[np.asarray(parts.linear.tetrahedra)]
     assert np.array_equal(points, np.asarray(one.linear.points)[np.asarray(one.linear.tetrahedra)])
     assert np.array_equal(np.asarray(parts.whole.points)[parts.corner], np.asarray(parts.linear.points))
-    # Parts meet at voxels 6 and 4; there both have nodes, and none has a balance.
+    # The parts meet at voxels 6 and 4. There both have nodes, and neither has a balance equation.
     assert np.array_equal(np.unique(parts.voxel, axis=0), np.unique(one.voxel, axis=0))
     inside, all_inside = (set(map(tuple, b.voxel[b.inner])) for b in (parts, one))
     assert inside == {v for v in all_inside if v[0] != 6 and v[1] != 4}
@@ -404,7 +417,7 @@ def test_a_body_in_parts_has_the_same_elements_and_keeps_faces_out_of_the_balanc
 
 @pytest.mark.slow
 def test_moduli_and_errors_of_a_body_in_parts():
-    """The errors know that parts share the noise of their common voxels."""
+    """The errors include that parts share the noise of their common voxels."""
     apart, shared = [], []
     for seed in range(8):
         field = plane_waves((17, 13, 9), noise=1e-6, seed=seed)

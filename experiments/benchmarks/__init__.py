@@ -1,1 +1,1 @@
-"""Error against run time, and known answers."""
+"""Error against run time, and problems with known solutions."""

@@ -1,18 +1,20 @@
-"""One GPU beside the processor of the same machine, in both precisions: error and run time of what the project does.
+"""One GPU compared with the processor of the same machine, in both precisions: errors and run times of typical tasks.
 
-Every case runs in float64 and float32, on the processor and on the accelerator. All errors are against the processor in
-float64, so they have the precision and the order of the sums in them, and neither mesh nor time step.
+Every case runs in float64 and float32, on the processor and on the accelerator. All errors are relative to the result
+of the processor in float64. So they contain rounding and the order of summation, but no error of the mesh or the time
+step.
 
 * Force and stiffness of all elements, linear and quadratic.
-* A static cube pulled by 20 % in one load step, to 1e-8 (float64) and 5e-4 (float32), and the gradient of its reaction.
-* Steps of the liver phantom's models.
-* Many runs at once: the rows of a sweep.
-* A reduced model, one run and a thousand at once: of a pulled cube, or with ``--model FILE`` the phantom's that
-  ``python -m experiments.benchmarks.reduced --keep FILE`` wrote.
+* A static cube stretched by 20 % in one load step, solved to 1e-8 (float64) and 5e-4 (float32), and the gradient of its
+  reaction.
+* Time steps of the three models of the liver phantom.
+* Many runs at once: the runs of a sweep.
+* A reduced model, one run and a thousand runs at once. It is the model of a stretched cube or, with ``--model FILE``,
+  the model of the phantom that ``python -m experiments.benchmarks.reduced --keep FILE`` wrote.
 
-``python -m experiments accelerator`` (5 minutes) writes results/accelerator.json. Without a GPU it says so and ends;
-``--platforms cpu`` prints the rows of the processor alone. Programs are compiled side by side first; run times are
-medians without compilation.
+``python -m experiments accelerator`` (5 minutes) writes results/accelerator.json. Without a GPU the script prints a
+message and ends; ``--platforms cpu`` prints the results of the processor alone. All programs are compiled first, in
+parallel. Run times are medians without compilation.
 """
 
 import argparse
@@ -44,40 +46,40 @@ from liverjax.core.struct import replace
 from liverjax.elements import mjed
 
 PRECISIONS = {"float64": jnp.float64, "float32": jnp.float32}
-#: Tolerance of Newton's method that each precision can meet.
+#: Tolerance of Newton's method that can be reached in each precision.
 TOLERANCES = {"float64": 1e-8, "float32": 5e-4}
-#: Cells of the cubes' sides.
+#: Number of cells along the side of each cube.
 ASSEMBLED, QUADRATIC, SOLVED = either(((15, 25, 55), (8, 20), (15, 25, 35)), ((6,), (3,), (6,)))
 STEPS = either(40, 4)
 LANES = either((1, 64, 1000), (1, 8))
-#: Lanes of reduced models on the processor, which runs them one by one.
+#: Largest number of reduced models in one batch on the processor, which runs them one after the other.
 FEW = 64
 
 
 class Case(NamedTuple):
-    """A program to be timed."""
+    """A program whose run time is measured."""
 
     part: str
     name: str
     precision: str
-    size: int  # tetrahedra, or lanes
+    size: int  # number of tetrahedra, time steps, or runs in the batch
     function: Callable
     arguments: tuple
-    read: Callable[[Any], tuple[np.ndarray, dict]]  # the answer that is compared, and what is told beside it
+    read: Callable[[Any], tuple[np.ndarray, dict]]  # the result that is compared, and further values for the table
 
 
 def whole(found: Any) -> tuple[np.ndarray, dict]:
-    """The answer alone."""
+    """Return the result alone, as one array, without further values."""
     return np.concatenate([np.ravel(np.asarray(a, float)) for a in jax.tree.leaves(found)]), {}
 
 
 def of_lanes(found: jax.Array) -> tuple[np.ndarray, dict]:
-    """The answers of all lanes."""
+    """Return the results of all runs in the batch."""
     return np.asarray(found, float), {}
 
 
 def of_run(result: lj.Result) -> tuple[np.ndarray, dict]:
-    """Positions, and what Newton's method did."""
+    """Return the positions, and residual, status and iterations of Newton's method."""
     s, steps = result.statistics, len(result.times)
     worst = status.NAMES[int(np.max(np.asarray(result.status)))]
     told = {"residual": float(np.max(np.asarray(s.residual))), "code": worst}
@@ -86,7 +88,7 @@ def of_run(result: lj.Result) -> tuple[np.ndarray, dict]:
 
 
 def assembly(_: Path) -> Iterator[Case]:
-    """Force and stiffness."""
+    """Yield the cases for force and stiffness."""
     law = jax.tree.map(jnp.asarray, lj.laws.typical("neo_hookean"))
     for order, sizes in ((1, ASSEMBLED), (2, QUADRATIC)):
         for cells in sizes:
@@ -100,12 +102,12 @@ def assembly(_: Path) -> Iterator[Case]:
 
 
 def of_points(mesh: lj.TetMesh, law: lj.Law, x: jax.Array) -> tuple:
-    """Force, and the pulled-back stiffness of every point, of quadratic elements."""
+    """Return the nodal forces of quadratic elements, and the pulled-back stiffness at every integration point."""
     return mjed.internal_force(mesh, law, x), mjed.element_stiffness(mesh, law, x)
 
 
 def solves(_: Path) -> Iterator[Case]:
-    """The static cube, and the derivative of its reaction by mu."""
+    """Yield the cases of the static cube, and of the derivative of its reaction with respect to mu."""
     for cells in SOLVED:
         for precision, tolerance in TOLERANCES.items():
             scene = cube(cells, tolerance=tolerance, precision=precision)
@@ -118,7 +120,7 @@ def solves(_: Path) -> Iterator[Case]:
 
 
 def reaction_and_slope(scene: lj.Scene, mu: jax.Array) -> tuple:
-    """Force on the upper end and its derivative by mu."""
+    """Return the force on the upper end and its derivative with respect to mu."""
 
     def force(mu: jax.Array) -> jax.Array:
         result = lj.simulate(lj.with_parameters(scene, {"law.mu": mu}))
@@ -128,7 +130,7 @@ def reaction_and_slope(scene: lj.Scene, mu: jax.Array) -> tuple:
 
 
 def liver(_: Path) -> Iterator[Case]:
-    """The phantom's models in steps of 0.05 s."""
+    """Yield the cases of the phantom's models, with time steps of 0.05 s."""
     for name, scene in models().items():
         for precision, tolerance in (("float64", 1e-6), ("float32", 1e-4)):
             own = with_solve(scene, 0.05 * STEPS, 0.05, tolerance=tolerance, precision=precision)
@@ -136,12 +138,12 @@ def liver(_: Path) -> Iterator[Case]:
 
 
 def spread(lanes: int, low: float, high: float) -> jax.Array:
-    """Numbers (lanes,) that repeat after `FEW`: so do the answers."""
+    """Return numbers (lanes,) that repeat after `FEW` entries, so that the results repeat too."""
     return low + (high - low) * (jnp.arange(lanes) % FEW) / (FEW - 1)
 
 
 def sweeps(_: Path) -> Iterator[Case]:
-    """Rows of one scene at once: 384 tetrahedra pulled in two load steps."""
+    """Yield the cases of one scene with many parameter sets at once: 384 tetrahedra stretched in two load steps."""
     base = cube(4, steps=2)
     for lanes in LANES:
         for precision, tolerance in TOLERANCES.items():
@@ -151,12 +153,12 @@ def sweeps(_: Path) -> Iterator[Case]:
 
 
 def swept(scene: lj.Scene, rows: dict) -> jax.Array:
-    """Last positions of all rows."""
+    """Return the last positions of the runs with all parameter sets."""
     return lj.simulate_batch(scene, rows).result.positions[:, -1]
 
 
 def reduced(folder: Path) -> Iterator[Case]:
-    """A reduced model and lanes of other mu."""
+    """Yield the cases of a reduced model, run with one or many values of mu."""
     (kept,) = folder.glob("*.h5")
     model, name = lj.load_reduced(kept), kept.stem
     scene = loosely(pulled_phantom()) if name == "phantom" else cube(4, steps=2)
@@ -169,13 +171,13 @@ def reduced(folder: Path) -> Iterator[Case]:
 
 
 def train(folder: Path) -> None:
-    """The reduced model of the cube."""
+    """Train and save the reduced model of the cube."""
     rows = {"law.mu": [600.0, 900.0, 700.0, 800.0], "law.bulk": [5e3, 1e4, 2e4, 8e3]}
     lj.save_reduced(lj.reduce_scene(cube(4, steps=2), rows, tolerance=1e-4), folder / "cube.h5")
 
 
 def lanes_of(scene: lj.Scene, model: lj.ReducedModel, mu: jax.Array) -> jax.Array:
-    """Last coordinates of runs with each mu."""
+    """Return the last reduced coordinates of the runs with each mu."""
 
     def one(mu: jax.Array) -> jax.Array:
         return lj.simulate_reduced(model, lj.with_parameters(scene, {"law.mu": mu})).coordinates[-1]
@@ -184,7 +186,7 @@ def lanes_of(scene: lj.Scene, model: lj.ReducedModel, mu: jax.Array) -> jax.Arra
 
 
 def slopes_of(scene: lj.Scene, model: lj.ReducedModel, mu: jax.Array) -> jax.Array:
-    """Derivative by each mu of the sum of their squared coordinates."""
+    """Return the derivative of the sum of the squared last coordinates with respect to each mu."""
     return jax.grad(lambda mu: jnp.sum(lanes_of(scene, model, mu) ** 2))(mu)
 
 
@@ -198,9 +200,9 @@ PARTS: dict[str, Callable[..., Iterator[Case]]] = {
 
 
 def measured(part: str, folder: Path) -> list[dict]:
-    """Rows of this process's platform, once the other processes have compiled too and it is its turn.
+    """Measure all cases of a part on the platform of this process, after it receives a line on its standard input.
 
-    The processor's answers in float64 are written, the others are held to them.
+    The processor saves its results in float64. All other results are compared with them.
     """
     cases = list(PARTS[part](folder))
     compiled, rows = [_compiled(case) for case in cases], []
@@ -222,7 +224,7 @@ def _compiled(case: Case) -> tuple[Any, float]:
     begin = time.perf_counter()
     try:
         return jax.jit(case.function).lower(*case.arguments).compile(), time.perf_counter() - begin
-    except Exception as error:  # a case that a platform cannot run must not take the others with it
+    except Exception as error:  # a case that a platform cannot run must not stop the other cases
         print(case.part, case.name, case.precision, case.size, repr(error)[:300], flush=True)
         return None, time.perf_counter() - begin
 
@@ -241,7 +243,7 @@ def _timed(case: Case, program: Any, folder: Path) -> dict:
     row = {"run_s": statistics.median(seconds), "fastest_s": min(seconds)} | told
     if place.exists():
         exact = np.load(place)
-        exact = exact[np.arange(len(answer)) % len(exact)]  # lanes repeat
+        exact = exact[np.arange(len(answer)) % len(exact)]  # the results of the batch repeat
         size = np.abs(exact).max()
         if case.read is of_run:
             size = np.abs(exact - np.asarray(case.arguments[0].mesh.points)).max()
@@ -250,7 +252,7 @@ def _timed(case: Case, program: Any, folder: Path) -> dict:
 
 
 def own_process(platform: str, part: str, folder: Path) -> subprocess.Popen:
-    """A process that compiles, says so, waits for a line, and measures."""
+    """Start a process that compiles, prints "compiled", waits for a line, and then measures."""
     own = os.environ | {"JAX_PLATFORMS": platform}
     call = [sys.executable, "-m", "experiments.benchmarks.accelerator", "--folder", str(folder), "--parts", part]
     call += ["--quick"] if QUICK else []
@@ -258,9 +260,9 @@ def own_process(platform: str, part: str, folder: Path) -> subprocess.Popen:
 
 
 def rows_of(process: subprocess.Popen) -> list[dict]:
-    """Let it measure."""
+    """Let a waiting process measure, and return its results."""
     assert process.stdin is not None and process.stdout is not None
-    if process.poll() is not None:  # it ended before it had compiled, and has said why
+    if process.poll() is not None:  # the process ended before it had compiled, and has printed the reason
         return []
     process.stdin.write("go\n")
     process.stdin.flush()
@@ -272,7 +274,7 @@ def rows_of(process: subprocess.Popen) -> list[dict]:
 
 
 def wait_until_compiled(process: subprocess.Popen) -> None:
-    """Read what it prints up to that word."""
+    """Read and print the output of a process until it prints "compiled"."""
     assert process.stdout is not None
     for line in process.stdout:
         if line == "compiled\n":
@@ -281,7 +283,7 @@ def wait_until_compiled(process: subprocess.Popen) -> None:
 
 
 def main() -> None:
-    """All parts on all platforms, each in a process of its own: all compile side by side, then each measures alone."""
+    """Run all parts on all platforms in separate processes. All compile in parallel, then each measures alone."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=list(PARTS))
     parser.add_argument("--platforms", nargs="*", help="as JAX names them; default: cpu and cuda")
@@ -292,7 +294,7 @@ def main() -> None:
     if options.folder is not None:
         measured(options.parts[0], options.folder)
         return
-    # A reservation of most of the memory, by this process too, would leave the others none.
+    # If a process (this one too) reserved most of the memory, none would be left for the others.
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     if options.platforms is None and jax.default_backend() == "cpu":
         print("this machine has no GPU that JAX finds: nothing is measured")

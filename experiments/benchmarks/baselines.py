@@ -1,7 +1,7 @@
-"""Three solvers to compare with: total Lagrangian explicit dynamics, corotational and linear elasticity.
+"""Three solvers for comparison: total Lagrangian explicit dynamics, corotational and linear elasticity.
 
-They take a `Scene` with a body and fixed nodes, and share meshes, laws and assembly with `simulate`. The explicit one
-takes a viscosity too; nothing else is supported, nothing is differentiable.
+They need a `Scene` with a body and fixed nodes, and share meshes, laws and assembly with `simulate`. The explicit
+solver also supports a Prony series. No other feature is supported, and the results are not differentiable.
 """
 
 from typing import Any, NamedTuple
@@ -29,14 +29,17 @@ def _mass_and_weight(scene: lj.Scene) -> tuple[jax.Array, jax.Array]:
 
 
 def at_rest(scene: lj.Scene) -> Equations:
-    """What acts on elements at rest: no inertia, no loads."""
+    """Return the equations of the elements at rest, without inertia and loads."""
     plain = replace(scene, body=None, traction=(), solve=replace(scene.solve, kind="static"))
     return equations(plain, initial_state(plain), 1.0)
 
 
 @jax.jit
 def critical_step(scene: lj.Scene) -> jax.Array:
-    """2 / omega_max [s] of the rest state by power iteration: above it central differences blow up."""
+    """Return the critical time step 2 / omega_max [s] of the rest state, by power iteration.
+
+    Central differences with a larger step are unstable.
+    """
     mass, _ = _mass_and_weight(scene)
     A = tangent.stiffness(at_rest(scene), None, scene.mesh.points)
     mask = boundary.free_degrees(scene.mesh, scene.fixed, ())
@@ -53,15 +56,15 @@ def critical_step(scene: lj.Scene) -> jax.Array:
 
 
 def explicit(scene: lj.Scene, dt: float, steps: int, keep: int) -> jax.Array:
-    """Central differences with a lumped mass (Miller et al. 2007), with a Prony series if the scene has one (Taylor et
-    al. 2009): every `keep`-th of the positions (T, V, 3).
+    """Central differences with a lumped mass (Miller et al. 2007), and with a Prony series if the scene has one (Taylor
+    et al. 2009). Returns every `keep`-th of the positions (T, V, 3).
     """
     mesh, law, prony = scene.mesh, scene.law, scene.viscosity
     mass, weight = _mass_and_weight(scene)
     mask = boundary.free_degrees(mesh, scene.fixed, ())
 
     def force(x, memory):
-        """Forces of the elements, and the memory after them."""
+        """Return the nodal forces of the elements, and the viscous memory after the step."""
         if prony is None:
             return mjed.internal_force(mesh, law, x), None
         F = matrices.deformation_gradient(mesh, x)
@@ -78,14 +81,14 @@ def explicit(scene: lj.Scene, dt: float, steps: int, keep: int) -> jax.Array:
         state, _ = jax.lax.scan(advance, state, length=keep)
         return state, state[0]
 
-    # Velocities live half a step apart from positions.
+    # The velocities belong to the middles of the time steps, the positions to the ends.
     v = -0.5 * dt * mask * weight / mass
     memory = None if prony is None else viscosity.initial_history(prony, mesh.weights.shape)
     return jax.lax.scan(block, (mesh.points, v, memory), length=steps // keep)[1]
 
 
 def _rotation(F: matrices.Matrix) -> matrices.Matrix:
-    """The rotation of a polar decomposition: nine of Higham's iterations R <- (R + R^-T) / 2."""
+    """Return the rotation of the polar decomposition, by nine of Higham's iterations R <- (R + R^-T) / 2."""
     for _ in range(9):
         cof = matrices.cofactor(F)
         det = matrices.determinant(F)
@@ -94,22 +97,29 @@ def _rotation(F: matrices.Matrix) -> matrices.Matrix:
 
 
 class Inertia(NamedTuple):
-    """Implicit Euler or Newmark's average acceleration, by the scene's `integrator`: m a = now u - push."""
+    """Implicit Euler or Newmark's average acceleration, chosen by the scene's `integrator`.
+
+    The inertia force in a step is m a = m (now u - push), with the displacement u in the step.
+    """
 
     newmark: bool
     dt: float  # [s]
 
     @property
     def now(self) -> float:
-        """Acceleration at the end of the step by the displacement in it [1/s^2]."""
+        """Derivative of the acceleration at the end of the step with respect to the displacement in the step
+        [1/s^2].
+        """
         return (4 if self.newmark else 1) / self.dt**2
 
     def push(self, v, a):
-        """What the motion before the step adds to the force over the mass [m/s^2]."""
+        """Return the part of the acceleration that comes from the motion before the step, with opposite sign
+        [m/s^2].
+        """
         return 4 * v / self.dt + a if self.newmark else v / self.dt
 
     def moved(self, u, v, a):
-        """Velocity and acceleration at the end of a step with displacement u."""
+        """Return velocity and acceleration at the end of a step with displacement u."""
         if self.newmark:
             return 2 * u / self.dt - v, 4 / self.dt**2 * (u - self.dt * v) - a
         return u / self.dt, a
@@ -120,9 +130,10 @@ def _inertia(scene: lj.Scene, dt: float) -> Inertia:
 
 
 def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
-    """Linear elasticity in rotated frames, one linear solve a step: positions (T, V, 3).
+    """Linear elasticity in frames that rotate with the elements, with one linear solve per step. Returns positions (T,
+    V, 3).
 
-    The element stiffness is that of the law at rest (Mueller and Gross 2004).
+    The element stiffness is the stiffness of the law at rest (Mueller and Gross 2004).
     """
     mesh, inertia = scene.mesh, _inertia(scene, dt)
     mass, weight = _mass_and_weight(scene)
@@ -170,8 +181,10 @@ def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
 
 
 def precomputed(scene: lj.Scene, dt: float) -> Any:
-    """Inverse (n, n) [m/N] of the matrix of a step of the linear body, for `linear`; its n free degrees of freedom, and
-    their masses and weights.
+    """Prepare the matrices for `linear`.
+
+    Returns the inverse (n, n) [m/N] of the system matrix of one time step of the linear body, the indices of its n free
+    degrees of freedom, and their masses and weights.
     """
     mesh = scene.mesh
     held = np.concatenate([np.asarray(f.nodes) for f in scene.fixed])
@@ -184,10 +197,16 @@ def precomputed(scene: lj.Scene, dt: float) -> Any:
 
 
 def linear(scene: lj.Scene, made: Any, dt: float, steps: int) -> jax.Array:
-    """Linear elasticity: one product with a precomputed inverse a step (James and Pai 1999): positions (T, V, 3).
+    """Linear elasticity with one product with a precomputed inverse per step (James and Pai 1999).
 
     Args:
+        scene: body, mesh and fixed nodes.
         made: `precomputed(scene, dt)`.
+        dt: time step [s].
+        steps: number of steps T.
+
+    Returns:
+        positions (T, V, 3) [m].
     """
     inverse, free, m, w = made
     mesh, inertia = scene.mesh, _inertia(scene, dt)

@@ -1,19 +1,19 @@
-"""Linear, quadratic and mixed elements: error, estimated error and run time, on bodies whose answers are known.
+"""Linear, quadratic and mixed elements: error, estimated error and run time, on bodies with known solutions.
 
-* Cook's membrane, plane strain, K/mu from 1 to 1e4: mean rise of its right edge, against another program
-  (`experiments.sources.cooks_membrane`). Graded: the cells are small near the upper corner of the clamp.
-* The beam of Land et al. 2015 (`known_answers`): its end, against 12,960 quadratic elements with their own estimate
-  (published codes end at 4.0 to 4.2 mm).
-* A column of 2 x 2 x 6 cm twisted by an eighth of a turn, K/mu up to 1e5: its torque, against mixed elements on a finer
-  mesh and their estimate. At 1e5 elements that lock are left out.
-* Linear iterations of a sheared cube on finer and finer meshes, of a sponge from no flow to fast flow, and of mixed
-  elements in plates of flatter and flatter cells.
-* The liver phantom at rest under 2 m/s^2: largest displacement. No mesh of it is known to be converged: its rows show
-  the value of each mesh and what its estimate adds.
+* Cook's membrane, plane strain, K/mu from 1 to 1e4: mean rise of its right edge, compared with another program
+  (`experiments.sources.cooks_membrane`). In graded meshes the cells are small near the upper corner of the clamp.
+* The beam of Land et al. 2015 (`known_answers`): height of its end, compared with 12,960 quadratic elements corrected
+  by their own error estimate (published codes give 4.0 to 4.2 mm).
+* A column of 2 x 2 x 6 cm twisted by an eighth of a turn, K/mu up to 1e5: its torque, compared with mixed elements on a
+  finer mesh, corrected by their estimate. At K/mu = 1e5, elements that lock are left out.
+* Linear iterations of a sheared cube on finer and finer meshes, of a porous body from no flow to fast flow, and of
+  mixed elements in plates of flatter and flatter cells.
+* The liver phantom at rest under 2 m/s^2: largest displacement. No mesh of the phantom is known to be converged. So the
+  table shows the value of each mesh, and the correction by the error estimate.
 
-The estimate is `simulate(…, mesh_error=True)`; effectivity is its change over the true error.
+The estimate is `simulate(…, mesh_error=True)`. Effectivity is the estimated error divided by the true error.
 ``python -m experiments elements`` (15 minutes) writes results/elements.json;
-``python -m experiments.benchmarks.elements "Land's beam" sponge`` runs these two again.
+``python -m experiments.benchmarks.elements "Land's beam" sponge`` runs these two parts again.
 """
 
 import json
@@ -39,7 +39,7 @@ from liverjax.scenes.enriched import enriched
 RATIOS = either((1.0, 3.0, 100.0, 1e4), (100.0,))
 MM = 1e-3
 MU, TURN = 770.0, np.pi / 4
-#: Form -> order of the elements, and how they are solved.
+#: For each form: the order of the elements, and the settings of the solver.
 FORMS: dict[str, tuple[int, dict]] = {
     "linear": (1, {"volumetric": "element"}),
     "linear, averaged": (1, {"volumetric": "nodal"}),
@@ -51,7 +51,10 @@ FORMS: dict[str, tuple[int, dict]] = {
 
 
 def membrane(n: int, ratio: float, form: str) -> lj.Scene:
-    """Cook's membrane of n x n cells, one thick and as thick as wide, for flat cells solve badly; plane strain."""
+    """Cook's membrane of n x n cells in plane strain, with one layer of cells.
+
+    The layer is as thick as a cell is wide, because flat cells make the linear equations ill-conditioned.
+    """
     order, solve = FORMS[form]
     flat = lj.shapes.box((1.0, 1.0, 1.0), (n, n, 1))
     s, t, w = np.asarray(flat.points).T
@@ -74,39 +77,41 @@ def membrane(n: int, ratio: float, form: str) -> lj.Scene:
 
 
 def rise(scene: lj.Scene) -> Callable:
-    """Mean rise [m] of the membrane's right edge: each node counts by its share of the load."""
+    """Return a function for the mean rise [m] of the right edge of the membrane, weighted by the nodal shares of the
+    load.
+    """
     share = nodal_tractions(scene.mesh, scene.traction)[:, 1]
     return lambda x, R: jnp.sum(share * (x[-1] - scene.mesh.points)[:, 1]) / jnp.sum(share)
 
 
 def beam(n: int, form: str) -> lj.Scene:
-    """Land's beam, 10 n x n x n cells."""
+    """Land's beam with 10 n x n x n cells."""
     scene = land(n)
     order, solve = FORMS[form]
     return replace(enriched(scene) if order == 2 else scene, solve=lj.Solve(steps=2, **solve))
 
 
 def end(scene: lj.Scene) -> Callable:
-    """Height [m] of the beam's end, (10, 0.5, 1) mm at rest, or next to it."""
+    """Return a function for the height [m] of the end of the beam: of the node nearest to (10, 0.5, 1) mm at rest."""
     k = int(np.argmin(np.linalg.norm(np.asarray(scene.mesh.points) - np.array([10, 0.5, 1]) * MM, axis=1)))
     return lambda x, R: x[-1, k, 2]
 
 
 def liver(form: str) -> lj.Scene:
-    """The phantom at rest."""
+    """The liver phantom at rest."""
     order, solve = FORMS[form]
     scene = replace(models()["hyperelastic"], solve=lj.Solve(linear_solver="cg", **solve))
     return enriched(scene) if order == 2 else scene
 
 
 def largest(scene: lj.Scene) -> Callable:
-    """Largest displacement [m] of a vertex."""
+    """Return a function for the largest displacement [m] of a vertex."""
     V = scene.mesh.number_of_vertices
     return lambda x, R: jnp.max(jnp.linalg.norm(x[-1, :V] - scene.mesh.points[:V], axis=1))
 
 
 def column(n: int, ratio: float, form: str) -> lj.Scene:
-    """A column of n x n x 3 n cells, its top turned in five steps."""
+    """A column of n x n x 3 n cells whose top is turned in five steps."""
     order, solve = FORMS[form]
     mesh = lj.shapes.box((0.02, 0.02, 0.06), (n, n, 3 * n))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
@@ -124,7 +129,7 @@ def column(n: int, ratio: float, form: str) -> lj.Scene:
 
 
 def torque(scene: lj.Scene) -> Callable:
-    """Torque [N m] at the top."""
+    """Return a function for the torque [N m] at the top."""
     top = np.asarray(scene.mesh.node_sets["z_max"])
 
     def of(x: jax.Array, R: jax.Array) -> jax.Array:
@@ -135,7 +140,7 @@ def torque(scene: lj.Scene) -> Callable:
 
 
 def sheared(n: int, ratio: float, form: str) -> lj.Scene:
-    """A cube of n^3 cells whose top moves aside by a hundredth, in one step."""
+    """A cube of n^3 cells whose top is displaced sideways by a hundredth of its size, in one step."""
     order, solve = FORMS[form]
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (n, n, n))
     mesh = lj.quadratic(mesh) if order == 2 else mesh
@@ -149,7 +154,7 @@ def sheared(n: int, ratio: float, form: str) -> lj.Scene:
 
 
 def counted(scene: lj.Scene) -> dict[str, Any]:
-    """Linear iterations a Newton iteration, and the time of a run."""
+    """Return the linear iterations per Newton iteration, and the run time."""
     jax.block_until_ready(lj.simulate(scene).positions)
     begin = time.perf_counter()
     result = jax.block_until_ready(lj.simulate(scene))
@@ -165,7 +170,9 @@ def counted(scene: lj.Scene) -> dict[str, Any]:
 
 
 def ran(scene: lj.Scene, of: Callable) -> dict[str, Any]:
-    """Value, what the mesh's estimate adds to it, and times; the second run counts."""
+    """Return the value, its estimated mesh error, and run times. The times are those of a second run, without
+    compilation.
+    """
     begin = time.perf_counter()
     jax.block_until_ready(lj.simulate(scene).positions)
     first = time.perf_counter() - begin
@@ -195,7 +202,7 @@ def ran(scene: lj.Scene, of: Callable) -> dict[str, Any]:
 
 
 def judged(rows: list[dict], truth: float) -> list[dict]:
-    """With error, error of the corrected value and effectivity."""
+    """Add the error, the error of the corrected value and the effectivity to the rows."""
     for row in rows:
         missing = truth - row["value"]
         row |= {
@@ -208,7 +215,7 @@ def judged(rows: list[dict], truth: float) -> list[dict]:
 
 
 def cook() -> list[dict]:
-    """Cook's membrane by K/mu."""
+    """Cook's membrane for all K/mu."""
     rows, truths = [], json.loads((ROOT / "experiments/results/cooks_membrane.json").read_text())
     for ratio in RATIOS:
         case = []
@@ -259,7 +266,7 @@ def twisted() -> list[dict]:
 
 
 def phantom() -> list[dict]:
-    """The liver phantom, whose truth is not known."""
+    """The liver phantom, whose exact solution is not known."""
     rows = []
     for form in either(("linear", "quadratic", "quadratic, mixed"), ()):
         scene = liver(form)
@@ -278,7 +285,7 @@ def iterations() -> list[dict]:
 
 
 def sponge() -> list[dict]:
-    """Linear iterations of a wet sponge, from no flow to fast flow."""
+    """Linear iterations of a saturated porous body, from no flow to fast flow."""
     rows = []
     for form in ("linear", "quadratic"):
         for n in either((8,) if form == "quadratic" else (16,), (2,)):
@@ -294,7 +301,9 @@ def sponge() -> list[dict]:
 
 
 def thin_block(aspect: float, ratio: float, form: str) -> lj.Scene:
-    """6 x 6 x 6 cells, so many times as wide as thick; the top moves by 0.2 of the thickness aside, 0.1 down."""
+    """A plate of 6 x 6 x 6 cells, each `aspect` times as wide as thick. Its top moves by 0.2 of the thickness sideways
+    and 0.1 down.
+    """
     order, solve = FORMS[form]
     thick = 0.1 / aspect
     mesh = lj.shapes.box((0.1, 0.1, thick), either((6, 6, 6), (2, 2, 2)))
@@ -329,7 +338,7 @@ COUNTS: dict[str, Callable[[], list[dict]]] = {"iterations": iterations, "sponge
 
 
 def main(wanted: list[str]) -> None:
-    """All bodies and counts, or those that are named; what is on file of the others stays."""
+    """Run all parts, or only the named ones. The stored results of the other parts stay."""
     file = RESULTS / "elements.json"
     kept = json.loads(file.read_text()) if wanted and file.is_file() else {"rows": []}
     rows = {body: [r for r in kept["rows"] if r["body"] == body] for body in BODIES}
@@ -344,7 +353,7 @@ def main(wanted: list[str]) -> None:
 
 
 def _figure(rows: list[dict]) -> plt.Figure:
-    """Error against run time of the bodies that have a truth."""
+    """Plot error against run time for the bodies with a known solution."""
     cases = [(b, r) for b, r in dict.fromkeys((row["body"], row["ratio"]) for row in rows if "error" in row)]
     lines = -(-len(cases) // 4)
     figure, all_axes = plt.subplots(lines, 4, figsize=(12.4, 3.2 * lines), squeeze=False, layout="constrained")

@@ -1,12 +1,12 @@
-"""The chapter's row of 10, 9 and 6 frames a second, told again with every model at equal error.
+"""The chapter's comparison of 10, 9 and 6 frames per second, repeated with all models at equal error.
 
-The liver phantom falls into its supports for 1.2 s, hyperelastic, viscous and complete (porous and viscous). Each way
-to run it takes steps that are halved until its error meets the smallest of three targets; then all runs are timed in
-turn, on one core. The run time at a target lies between those of two runs, on a line through their logarithms. The
-truth of a model is its own motion with steps of 1.25 ms: the errors are those of time steps, of Newton's method, of a
-reduced basis, and of a linear or corotational body. What mesh and law leave out is in none of them.
+The liver phantom falls into its supports for 1.2 s. It is hyperelastic, viscous or complete (porous and viscous). For
+each method, the time step is halved until the error is below the smallest of three targets. Then all runs are timed in
+turn, on one core. The run time at a target is interpolated between two runs, linearly in the logarithms. The reference
+of a model is its own motion with steps of 1.25 ms. So the errors contain those of the time step, of Newton's method, of
+a reduced basis, and of a linear or corotational body. They do not contain the errors of the mesh and of the law.
 
-Reduced models are made from runs with other weights and moduli than the one that is asked.
+The reduced models are trained with other weights and moduli than those of the timed run.
 
     python -m experiments equal_error
 
@@ -15,7 +15,7 @@ takes 40 minutes and writes results/equal_error.json after each model, and resul
 
 import os
 
-# Matrices of some ten rows: threads of the BLAS cost more than they do.
+# The matrices have only tens of rows: threads of the BLAS cost more than they gain.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import json
@@ -37,26 +37,30 @@ from liverjax.core.plotting import COLOURS
 from liverjax.core.struct import replace
 
 SECONDS = 1.2
-#: Positions are compared at these times [s]; the longest step is the first of them.
+#: Times [s] at which positions are compared. The longest time step is the first of them.
 COMPARED = 0.3 * np.arange(1, 5)
 TARGETS = (0.2, 0.05, 0.01)
-#: Steps in 0.3 s.
+#: Numbers of time steps in 0.3 s.
 DIVISIONS = either((1, 2, 4, 8, 16, 32, 64, 128), (2, 6))
 FINE = either(240, 12)
-#: Newton's tolerance where it is not one iteration: it moves the motion by less than 1e-3.
+#: Newton's tolerance where more than one iteration is made. It changes the motion by less than 1e-3.
 LOOSE = {"tolerance": 1e-3}
 NEWMARK = {"integrator": "newmark"}
-#: Numbers of the rows that reduced models are made from. The asked run, 715 Pa and 2 m/s^2 along y, is not among them.
+#: Parameter ranges for the training of reduced models. The training runs do not contain the timed run (715 Pa and 2
+#: m/s^2 along y).
 RANGES = {"law.mu": (600.0, 850.0), "body.gravity": ((-0.4, 1.2, -0.4), (0.4, 2.2, 0.4))}
-#: Rows, the most modes, steps in 0.3 s, and what the points may leave out.
+#: Training runs, largest number of modes, steps in 0.3 s, and error that the choice of integration points may cause.
 ROWS, MODES, TRAINED, POINT_TOLERANCE = either((60, 60, 24, 5e-3), (6, 20, 6, 1e-1))
-#: Parts of the weight at which linear and corotational bodies are compared with the hyperelastic one.
+#: Fractions of the weight at which linear and corotational bodies are compared with the hyperelastic one.
 WEIGHTS = either((1.0, 0.5, 0.2, 0.1, 0.05, 0.02), (1.0, 0.1))
 ROUNDS = either(3, 1)
 
 
 class Way(NamedTuple):
-    """A way to run a model: of a time step [s] a function and its arguments, which give positions (T, V, 3) [m]."""
+    """A method to run a model: `at` gives, for a time step [s], a function and its arguments.
+
+    The function returns positions (T, V, 3) [m].
+    """
 
     name: str
     at: Callable[[float], tuple[Callable, tuple]]
@@ -72,31 +76,31 @@ class Timed(NamedTuple):
 
 
 def implicit(scene: lj.Scene, **solve: Any) -> Callable[[float], tuple[Callable, tuple]]:
-    """`simulate` of a scene with some settings."""
+    """Return the method `at` for `simulate`, with some settings of the solver."""
     return lambda dt: (lambda s: lj.simulate(s).positions, (with_solve(scene, SECONDS, dt, **solve),))
 
 
 def at_compared(x: Any) -> np.ndarray:
-    """Of positions in equal steps (T, V, 3) those at the times that are compared."""
+    """Return the positions at the times that are compared, from positions (T, V, 3) at equal time steps."""
     every = len(x) // len(COMPARED)
     return np.asarray(x)[every - 1 :: every]
 
 
 def off(x: Any, truth: np.ndarray, scene: lj.Scene) -> float:
-    """Largest distance of a node from the truth over the largest displacement [1]."""
+    """Return the largest distance of a node from the reference, divided by the largest displacement [1]."""
     apart = np.linalg.norm(at_compared(x) - truth, axis=-1).max()
     return float(apart / np.linalg.norm(truth - np.asarray(scene.mesh.points), axis=-1).max())
 
 
 def compiled(way: Way, dt: float) -> Callable[[], jax.Array]:
-    """The run, ready to be called."""
+    """Return the compiled run as a function without arguments."""
     function, arguments = way.at(dt)
     program = jax.jit(function).lower(*arguments).compile()
     return lambda: jax.block_until_ready(program(*arguments))
 
 
 def searched(way: Way, truth: np.ndarray, scene: lj.Scene) -> list[Timed]:
-    """Runs with shorter and shorter steps until the smallest target is met."""
+    """Run with shorter and shorter steps until the error is below the smallest target."""
     runs: list[Timed] = []
     for n in way.divisions:
         program = compiled(way, COMPARED[0] / n)
@@ -109,7 +113,7 @@ def searched(way: Way, truth: np.ndarray, scene: lj.Scene) -> list[Timed]:
 
 
 def reduced_way(scene: lj.Scene) -> tuple[Way, dict[str, Any]]:
-    """A model reduced from Newmark runs, and what making it took."""
+    """Train a reduced model with Newmark runs. Return it as a method, with the cost of its training."""
     trained = with_solve(scene, SECONDS, COMPARED[0] / TRAINED, **NEWMARK, **LOOSE)
     begin = time.perf_counter()
     model = lj.reduce_scene(trained, drawn(ROWS, 0.0, 1, RANGES), 1e-5, MODES, POINT_TOLERANCE)
@@ -126,7 +130,7 @@ def reduced_way(scene: lj.Scene) -> tuple[Way, dict[str, Any]]:
 
 
 def explicit_way(scene: lj.Scene) -> Way:
-    """Central differences: the steps are those below the critical one of the body at rest."""
+    """Central differences, with steps below the critical step of the body at rest."""
     limit = float(critical_step(replace(scene, viscosity=None)))
 
     def at(dt: float) -> tuple[Callable, tuple]:
@@ -138,9 +142,9 @@ def explicit_way(scene: lj.Scene) -> Way:
 
 
 def linear_ways(scene: lj.Scene) -> dict[str, list[Way]]:
-    """The linear body by its precomputed inverse, and the corotational one, by their integrator.
+    """The linear body with a precomputed inverse, and the corotational one, grouped by their time integrator.
 
-    One linear solve a step keeps the corotational body stable under implicit Euler only.
+    With one linear solve per step, the corotational body is stable under implicit Euler only.
     """
     few = tuple(n for n in DIVISIONS if n <= 32)
 
@@ -165,7 +169,7 @@ def linear_ways(scene: lj.Scene) -> dict[str, list[Way]]:
 
 
 def ways_of(name: str, scene: lj.Scene) -> tuple[list[Way], dict[str, Any]]:
-    """All ways of a model, and how the reduced one was made."""
+    """Return all methods for a model, and how the reduced model was trained."""
     ways = [
         Way("implicit Euler, one iteration (the chapter's)", implicit(scene, **ONE_STEP)),
         Way("Newmark, one iteration", implicit(scene, **NEWMARK, **ONE_STEP)),
@@ -180,7 +184,7 @@ def ways_of(name: str, scene: lj.Scene) -> tuple[list[Way], dict[str, Any]]:
 
 
 def in_turn(chosen: list[Timed]) -> list[float]:
-    """Median run times [s] of some runs on one core, each round all of them."""
+    """Return the median run times [s] of some runs on one core. Each round contains all runs."""
     back = one_core()
     seconds: list[list[float]] = [[] for _ in chosen]
     for _ in range(ROUNDS):
@@ -193,7 +197,7 @@ def in_turn(chosen: list[Timed]) -> list[float]:
 
 
 def one_model(name: str, scene: lj.Scene) -> dict[str, Any]:
-    """Every way: error and run time of each step length, and the longest step that meets each target."""
+    """Return the error and run time of every method for each time step, for one model."""
     exact = Way("truth", implicit(scene, **NEWMARK, tolerance=1e-6))
     fine, coarser = (at_compared(compiled(exact, COMPARED[0] / n)()) for n in (FINE, FINE // 2))
     content: dict[str, Any] = {"truth_halved": off(coarser, fine, scene)}
@@ -209,7 +213,9 @@ def one_model(name: str, scene: lj.Scene) -> dict[str, Any]:
 
 
 def model_errors(scene: lj.Scene) -> list[dict[str, float]]:
-    """Linear and corotational bodies beside the hyperelastic one, the same steps and integrator, by the weight."""
+    """Compare linear and corotational bodies with the hyperelastic one, with equal steps and integrator, at each
+    weight.
+    """
     dt, rows = COMPARED[0] / either(32, 6), []
     for part in WEIGHTS:
         assert scene.body is not None
@@ -224,7 +230,7 @@ def model_errors(scene: lj.Scene) -> list[dict[str, float]]:
 
 
 def figure(content: dict[str, Any]) -> plt.Figure:
-    """Error against run time of a simulated second, a panel for each model."""
+    """Plot error against run time per simulated second, with one panel for each model."""
     fig, panels = plt.subplots(1, 3, figsize=(12, 4.4), sharey=True, layout="constrained")
     names = list(dict.fromkeys(run["way"] for own in content["models"].values() for run in own["runs"]))
     for axes, (model, own) in zip(panels, content["models"].items(), strict=True):
@@ -244,8 +250,8 @@ def figure(content: dict[str, Any]) -> plt.Figure:
 
 
 def main() -> None:
-    """Three models, written after each; then linear and corotational bodies by the weight. What an ended run of the
-    script has written stays: delete results/equal_error.json to run all anew.
+    """Run three models and write after each, then compare linear and corotational bodies at each weight. Results that
+    an earlier run of the script has written are kept. Delete results/equal_error.json to run everything again.
     """
     file = RESULTS / "equal_error.json"
     content = json.loads(file.read_text()) if file.exists() else {"models": {}}

@@ -1,11 +1,11 @@
-"""What a gradient through a run costs: time and memory against the number of steps and what is kept, error beside.
+"""The cost of a gradient through a run: time and memory against the number of steps and stored states, and the error.
 
-Every row is a process of its own, so that its peak of memory is its own. The error is that of the derivative by mu
-against forward mode (another way to the same number), and for short runs of a small body against central differences
-of several widths: the V-shaped curve.
+Every case runs in a separate process, so that its peak memory is measured alone. The error is that of the derivative
+with respect to mu. It is measured against forward mode (another way to compute the same number). For short runs of a
+small body it is also measured against central differences with several step widths, which gives a V-shaped curve.
 
     python -m experiments gradient_cost [--quick]
-    python -m experiments.benchmarks.gradient_cost complete 1000 all    (these rows again, beside the others)
+    python -m experiments.benchmarks.gradient_cost complete 1000 all    (runs only these cases again)
 """
 
 import json
@@ -27,7 +27,7 @@ from liverjax.simulation import gradient_checkpoints, gradients
 
 
 def small() -> lj.Scene:
-    """The complete model on a block of 162 tetrahedra, in motion under its weight."""
+    """The complete model on a block of 162 tetrahedra that moves under its weight."""
     mesh = lj.shapes.box((0.03, 0.03, 0.03), (3, 3, 3))
     complete = models()["complete"]
     return replace(
@@ -40,19 +40,19 @@ def small() -> lj.Scene:
 
 
 def scene_of(model: str, steps: int) -> lj.Scene:
-    """One of the liver's models to 1e-8, or the small one to 1e-12, in steps of 0.05 s."""
+    """One of the liver's models solved to 1e-8, or the small one solved to 1e-12, with time steps of 0.05 s."""
     if model == "small":
         return with_solve(small(), 0.05 * steps, 0.05)
     return with_solve(models()[model], 0.05 * steps, 0.05, tolerance=1e-8)
 
 
 def loss(result: lj.Result) -> jax.Array:
-    """Mean square distance from the axes [m^2] over the whole run."""
+    """Return the mean square of the coordinates [m^2] over the whole run."""
     return jnp.mean(result.positions**2)
 
 
 def fastest(program, *arguments, rounds: int) -> tuple[float, object]:
-    """Least wall time of some runs, and what came out."""
+    """Return the shortest wall time of some runs, and the result."""
     seconds = []
     for _ in range(rounds):
         begin = time.perf_counter()
@@ -62,7 +62,7 @@ def fastest(program, *arguments, rounds: int) -> tuple[float, object]:
 
 
 def measure(model: str, steps: int, store: str) -> dict:
-    """One row, in this process."""
+    """Measure one case in this process."""
     scene, mu = scene_of(model, steps), jnp.asarray(770.0)
     kept = int(store) if store.isdigit() else store
     program = gradients._program_of_gradient(loss, kept, "reverse").lower(scene, {"law.mu": mu})
@@ -104,7 +104,7 @@ def measure(model: str, steps: int, store: str) -> dict:
 
 
 def main(quick: bool, words: list[str]) -> None:
-    """All rows, or those that have all `words`; table and figure."""
+    """Measure all cases, or those whose name contains all `words`, and write table and figure."""
     cases = [("small", n, s) for n in (10, 100, 1000, 10_000) for s in ("all", "sqrt")]
     cases += [("hyperelastic", 100, "all"), ("viscous", 100, "all")]
     cases += [("complete", n, s) for n in (10, 100, 1000) for s in ("all", "sqrt")]
@@ -123,7 +123,7 @@ def main(quick: bool, words: list[str]) -> None:
 
 
 def figure(rows: list[dict]) -> plt.Figure:
-    """Ratio and memory against steps, and the V-shaped curve."""
+    """Plot run time ratio and memory against the number of steps, and the V-shaped curve."""
     fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
     for model, colour in (("complete", BLUE), ("small", ORANGE)):
         for store, style in (("all", "o-"), ("sqrt", "s--")):

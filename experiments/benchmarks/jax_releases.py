@@ -1,9 +1,10 @@
-"""The same two programs with different releases of jax: what XLA makes of them, compilation, and run time.
+"""The same two programs with different releases of jax: size of the compiled program, compile time, and run time.
 
-An earlier form of the torsion program ran 1.8 times slower with 0.12 than with 0.10: XLA put 577 transposes and 654
-copies into it, where the program as written had 32. The columns of positions are now separate arrays.
+An earlier form of the torsion program ran 1.8 times slower with jax 0.12 than with 0.10. XLA had inserted 577
+transposes and 654 copies, where the program as written had 32. Therefore the columns of positions are now separate
+arrays.
 
-    python -m experiments jax_releases          once with each release: its row is added, those of others stay
+    python -m experiments jax_releases          run once with each release; the results of other releases are kept
 """
 
 import json
@@ -23,7 +24,9 @@ ROUNDS = either(7, 2)
 
 
 def program_size(function: Callable, *arguments: object) -> dict[str, int]:
-    """Transposes in the program as written; transposes and copies in the compiled one."""
+    """Return the number of transposes in the program as written, and of transposes and copies in the compiled
+    program.
+    """
     lowered = jax.jit(function).lower(*arguments)
     text, compiled = lowered.as_text(), lowered.compile().as_text()
     found = {"written_transposes": len(re.findall(r"stablehlo\.transpose", text))}
@@ -45,14 +48,14 @@ def oscillations() -> dict:
 
 
 def complete_liver() -> dict:
-    """A second of the complete liver in steps of 0.05 s."""
+    """One second of the complete liver in steps of 0.05 s."""
     scene = with_solve(models()["complete"], 1.0, 0.05)
     _, row = timed_run(scene, ROUNDS)
     return {key: row[key] for key in ("run_s", "compile_s", "steps_per_s")}
 
 
 def main() -> None:
-    """Measure with the release that is here."""
+    """Measure with the installed release."""
     file = RESULTS / "jax_releases.json"
     rows = json.loads(file.read_text())["rows"] if file.exists() else []
     begin = time.perf_counter()

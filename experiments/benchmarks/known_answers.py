@@ -1,11 +1,13 @@
-"""Three static problems with known answers, on finer and finer meshes: error against run time.
+"""Three static problems with known solutions, on finer and finer meshes: error against run time.
 
-* Cook's membrane (Miehe 1994): plane strain, 1 N dead load; rise of the middle of its right edge 14.74 mm.
-* The beam of Land et al. 2015 (problem 1): Guccione's law, a pressure of 4 Pa that follows its lower face; its end
-  rises to 4.0-4.2 mm in the codes compared there, which take it as incompressible; here the bulk modulus is 50 kPa.
-* The silicone cantilever of Mazier et al. 2021 under its own weight: the tip, against their MJED program on meshes of
-  like size (linear tetrahedra as here, too stiff until fine). Needs the optional mesher: pip install '.[mesher]'.
-  Quadratic mixed elements, with the mesh's error estimated, tell what the model has for the measured 116 mm.
+* Cook's membrane (Miehe 1994): plane strain, dead load of 1 N; the middle of its right edge rises by 14.74 mm.
+* The beam of Land et al. 2015 (problem 1): Guccione's law, and a pressure of 4 Pa that follows the lower face. The
+  codes compared there find the end at a height of 4.0-4.2 mm for an incompressible beam. Here the bulk modulus is 50
+  kPa.
+* The silicone cantilever of Mazier et al. 2021 under its own weight: position of the tip, compared with their MJED
+  program on meshes of similar size. (Both use linear tetrahedra, which are too stiff on coarse meshes.) Needs the
+  optional mesher: pip install '.[mesher]'. Quadratic mixed elements with an estimate of the mesh error show the
+  converged value of the model; the measured value is 116 mm.
 
     python -m experiments known_answers [--quick]
 
@@ -30,7 +32,7 @@ MM = 1e-3
 
 
 def cook(n: int) -> lj.Scene:
-    """n x n x 1 cells of the membrane, 48 mm long, 44 mm high at its left edge and 16 mm at its right one."""
+    """Cook's membrane of n x n x 1 cells, 48 mm long, 44 mm high at its left edge and 16 mm high at its right edge."""
     flat = lj.shapes.box((1.0, 1.0, 1.0), (n, n, 1))
     s, t, w = np.asarray(flat.points).T
     points = np.stack([48 * s, 44 * s + t * (44 - 28 * s), w], axis=1) * MM
@@ -47,14 +49,14 @@ def cook(n: int) -> lj.Scene:
 
 
 def cook_rise(scene: lj.Scene, x: np.ndarray) -> float:
-    """Vertical displacement [mm] of the middle of the right edge."""
+    """Return the vertical displacement [mm] of the middle of the right edge."""
     X = np.asarray(scene.mesh.points)
     k = np.argmin(np.linalg.norm(X - np.array([48, 52, 0]) * MM, axis=1))
     return float((x - X)[k, 1] / MM)
 
 
 def land(n: int) -> lj.Scene:
-    """10 n x n x n cells of the beam, 10 x 1 x 1 mm, held at x = 0."""
+    """Land's beam of 10 x 1 x 1 mm with 10 n x n x n cells, fixed at x = 0."""
     mesh = lj.shapes.box((10 * MM, MM, MM), (10 * n, n, n))
     below = boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])
     return lj.Scene(
@@ -66,14 +68,14 @@ def land(n: int) -> lj.Scene:
 
 
 def land_end(scene: lj.Scene, x: np.ndarray) -> float:
-    """Height [mm] of the end of the beam's middle line of its upper face, (10, 0.5, 1) mm at rest."""
+    """Return the height [mm] of the beam's end, at the middle of the upper face: the point (10, 0.5, 1) mm at rest."""
     X = np.asarray(scene.mesh.points)
     k = np.argmin(np.linalg.norm(X - np.array([10, 0.5, 1]) * MM, axis=1))
     return float(x[k, 2] / MM)
 
 
 def rod(cell: float, radius: float = 4.25, length: float = 182.0) -> lj.TetMesh:
-    """Delaunay tetrahedra of about `cell` mm in a polygonal rod [mm], by the optional mesher."""
+    """Return a mesh of Delaunay tetrahedra of about `cell` mm in a polygonal rod [mm], made by the optional mesher."""
     import tetgen
 
     n, layers = max(8, round(2 * np.pi * radius / cell)), round(length / cell)
@@ -96,9 +98,9 @@ def rod(cell: float, radius: float = 4.25, length: float = 182.0) -> lj.TetMesh:
 
 
 def cantilever(cell: float, volumetric: str = "element", order: int = 1) -> lj.Scene:
-    """A rod of 4.25 mm radius and 182 mm length along z, clamped at z = 0, its weight along -y.
+    """A rod of 4.25 mm radius and 182 mm length along z, clamped at z = 0, with its weight along -y.
 
-    Quadratic elements lie in rings and layers, in polygons that have the area of the circle.
+    Quadratic elements are arranged in rings and layers. The cross-section is a polygon with the area of the circle.
     """
     rings = lj.shapes.cylinder(4.25 * MM, 182 * MM, cell * MM, match_area=True) if order == 2 else None
     mesh = rod(cell) if rings is None else lj.quadratic(rings)
@@ -112,12 +114,12 @@ def cantilever(cell: float, volumetric: str = "element", order: int = 1) -> lj.S
 
 
 def tip(scene: lj.Scene, x: np.ndarray) -> list[float]:
-    """Mean position (y, z) [m] of the free end."""
+    """Return the mean position (y, z) [m] of the free end."""
     return np.asarray(x)[np.asarray(scene.mesh.node_sets["top"])].mean(axis=0)[1:].tolist()
 
 
 def solved(scene: lj.Scene) -> tuple[np.ndarray, dict]:
-    """Last positions, and what the run took."""
+    """Return the last positions, and run time, iterations and residual of the run."""
     begin = time.perf_counter()
     program = jax.jit(lj.simulate).lower(scene).compile()
     compiled = time.perf_counter()
@@ -138,7 +140,9 @@ def solved(scene: lj.Scene) -> tuple[np.ndarray, dict]:
 
 
 def corrected_cantilevers(cells: tuple[float, ...]) -> list[dict]:
-    """Quadratic mixed elements: the tip, and what the mesh's estimate adds to its height."""
+    """Return the tip of the cantilever with quadratic mixed elements, and the correction of its height by the error
+    estimate.
+    """
     rows = []
     for cell in cells:
         scene = cantilever(cell, "mixed", order=2)
@@ -154,12 +158,12 @@ def corrected_cantilevers(cells: tuple[float, ...]) -> list[dict]:
     return rows
 
 
-#: The authors' tips (y, z) [m] by tetrahedra (`mathematics.md`'s source: Mazier et al. 2021).
+#: Number of tetrahedra: tip (y, z) [m] of Mazier et al. 2021 (the source named in `mathematics.md`).
 MAZIER = {7675: (-0.1039, 0.1438), 12724: (-0.1067, 0.1415), 23665: (-0.1116, 0.1369), 52979: (-0.1141, 0.1344)}
 
 
 def main(quick: bool, wanted: list[str]) -> None:
-    """Three tables and a figure."""
+    """Compute three tables and a figure."""
     quadratic = (6.0,) if quick else (4.25, 2.125)
     if wanted == ["cantilever"]:
         kept = json.loads((RESULTS / "known_answers.json").read_text())
@@ -190,13 +194,16 @@ def main(quick: bool, wanted: list[str]) -> None:
 
 
 def theirs(tetrahedra: int) -> float | None:
-    """Height of the end [m] that Mazier et al. have for as many tetrahedra; None outside their meshes."""
+    """Return the height [m] of the end that Mazier et al. find with this number of tetrahedra, by interpolation.
+
+    Returns None outside the range of their meshes.
+    """
     y = np.interp(np.log(tetrahedra), np.log(list(MAZIER)), [y for y, _ in MAZIER.values()], left=np.nan, right=np.nan)
     return float(y) if np.isfinite(y) else None
 
 
 def figure(out: dict) -> plt.Figure:
-    """What comes out against the size of the mesh, and the error of Cook's rise against run time."""
+    """Plot the results against the size of the mesh, and the error of Cook's rise against run time."""
     fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
     cook_rows = out["cook"]
     error = [abs(r["rise_mm"] / 14.74 - 1) * 100 for r in cook_rows]

@@ -1,7 +1,7 @@
-"""Error against run time for the liver phantom: time step and integrator, recursion, Newton's tolerance, porous scheme,
-explicit against implicit.
+"""Error against run time for the liver phantom, for several choices: time step and integrator, update of the viscous
+memory (recursion), Newton's tolerance, porous scheme, and explicit against implicit integration.
 
-The error is the largest distance of a node from a fine run at 0.6, 1.2 and 1.8 s, relative to the largest displacement.
+The error is the largest distance of a node from a fine run at 0.6, 1.2 and 1.8 s, divided by the largest displacement.
 
     python -m experiments liver_choices
 """
@@ -21,13 +21,13 @@ SECONDS, AT = either((1.8, (0.6, 1.2, 1.8)), (0.6, (0.6,)))
 
 
 class Table:
-    """Rows of one question, with the fine run they are compared to."""
+    """The runs for one question, and the fine run that they are compared with."""
 
     def __init__(self, scene, fine):
         self.scene, self.fine, self.series = scene, fine, {}
 
     def add(self, name, scene):
-        """One more run."""
+        """Add one run to the table."""
         result, row = timed_run(scene)
         off = error(result.times, result.positions, self.fine[0], self.fine[1], AT)
         self.series.setdefault(name, []).append({"error": off} | row)
@@ -35,13 +35,13 @@ class Table:
 
 
 def fine_run(scene, dt):
-    """Newmark with small steps."""
+    """Return times and positions of a run with Newmark and small steps."""
     result, _ = timed_run(with_solve(scene, SECONDS, dt, integrator="newmark", tolerance=1e-8), rounds=1)
     return np.asarray(result.times), np.asarray(result.positions)
 
 
 def time_steps(scene) -> Table:
-    """Viscous: implicit Euler and Newmark, and the chapter's recursion."""
+    """Viscous model: implicit Euler and Newmark, and Newmark with the chapter's recursion."""
     table = Table(scene, fine_run(scene, either(0.0025, 0.01)))
     chapter = replace(scene, viscosity=replace(scene.viscosity, scheme="chapter"))
     for dt in either((0.3, 0.15, 0.05, 0.02, 0.01), (0.05,)):
@@ -53,7 +53,7 @@ def time_steps(scene) -> Table:
 
 
 def newton(scene) -> Table:
-    """Against the same time step solved to 1e-10."""
+    """Newton's tolerance: error relative to the same time step solved to 1e-10."""
     exact, _ = timed_run(with_solve(scene, SECONDS, 0.05, tolerance=1e-10), rounds=1)
     table = Table(scene, (np.asarray(exact.times), np.asarray(exact.positions)))
     for tolerance in either((1e-2, 1e-4, 1e-6, 1e-8), (1e-2,)):
@@ -63,7 +63,7 @@ def newton(scene) -> Table:
 
 
 def porous(scene) -> Table:
-    """Complete: the implicit pressure and the chapter's."""
+    """Complete model: the implicit pressure and the chapter's scheme."""
     table = Table(scene, fine_run(scene, either(0.005, 0.02)))
     chapter = replace(scene, porosity=replace(scene.porosity, scheme="chapter"))
     for dt in either((0.15, 0.05, 0.02), (0.05,)):
@@ -73,7 +73,7 @@ def porous(scene) -> Table:
 
 
 def explicit_or_implicit(scene) -> Table:
-    """Hyperelastic: total Lagrangian explicit at 0.9 of its critical step, corotational, and `simulate`."""
+    """Hyperelastic model: total Lagrangian explicit with 0.9 of its critical step, corotational, and `simulate`."""
     limit = float(critical_step(scene))
     steps = int(np.ceil(SECONDS / (0.9 * limit) / 90)) * 90
     dt, keep = SECONDS / steps, steps // 90
@@ -103,7 +103,7 @@ def explicit_or_implicit(scene) -> Table:
 
 
 def main() -> None:
-    """Four questions, one figure."""
+    """Run four tables and plot one figure."""
     scenes = models()
     tables = {
         "time step, integrator, recursion (viscous)": time_steps(scenes["viscous"]),

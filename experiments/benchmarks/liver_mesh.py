@@ -1,10 +1,10 @@
-"""How far the liver phantom's answer is known: finer meshes, two orders, and a load that is followed.
+"""Mesh error of the liver phantom at rest: finer meshes, elements of two orders, and the load in one or eight steps.
 
-The phantom hangs under 2 m/s^2 (hyperelastic). Its 5,351 tetrahedra are cut into eight once. The load grows in eight
-steps, and once in one: both must end at the same place, if the answers are one branch.
+The phantom hangs under 2 m/s^2 (hyperelastic). Each of its 5,351 tetrahedra is cut into eight once. The load is applied
+in eight steps, and in one. Both must end in the same equilibrium if they follow the same solution branch.
 
-Under a quarter of that load, 0.5 m/s^2, its quadratic meshes are refined at the edges of its clamps alone, where the
-strain has no bound: each refinement adds two to three fifths of what the one before added.
+Under a quarter of that load, 0.5 m/s^2, its quadratic meshes are refined only at the edges of its clamps, where the
+strain is singular. Each refinement changes the result by two to three fifths of the change before.
 
 ``python -m experiments liver_mesh`` (15 minutes) writes results/liver_mesh.json;
 ``python -m experiments.benchmarks.liver_mesh clamps`` runs the second part again.
@@ -44,7 +44,7 @@ def phantom(level: int, order: int, steps: int) -> lj.Scene:
 
 
 def row(level: int, order: int, steps: int, vertices: int) -> dict[str, Any]:
-    """One run: displacements of the phantom's own vertices [mm], smallest J, Newton's and linear iterations."""
+    """Run one case. Return displacements of the phantom's own vertices [mm], smallest J, and numbers of iterations."""
     scene = phantom(level, order, steps)
     begin = time.perf_counter()
     result = jax.block_until_ready(lj.simulate(scene))
@@ -68,7 +68,7 @@ def row(level: int, order: int, steps: int, vertices: int) -> dict[str, Any]:
 
 
 def light(rims: int) -> lj.Scene:
-    """Quadratic elements under 0.5 m/s^2, the mesh refined so often at the edges of the clamps."""
+    """Quadratic elements under 0.5 m/s^2, on a mesh refined `rims` times at the edges of the clamps."""
     scene = phantom(0, 1, 1)
     for _ in range(rims):
         mesh = scene.mesh
@@ -82,7 +82,7 @@ def light(rims: int) -> lj.Scene:
 
 
 def clamps(vertices: int) -> list[dict[str, Any]]:
-    """Values and run times of meshes refined at the clamps [mm, s]."""
+    """Return results [mm] and run times [s] of meshes refined at the clamps."""
     rows = []
     for rims in either((0, 1, 2, 3), (0, 1)):
         scene = light(rims)
@@ -108,7 +108,7 @@ def clamps(vertices: int) -> list[dict[str, Any]]:
 
 
 def main(wanted: list[str]) -> None:
-    """All runs."""
+    """Run all cases."""
     vertices = models()["hyperelastic"].mesh.number_of_vertices
     if wanted == ["clamps"]:
         file = RESULTS / "liver_mesh.json"

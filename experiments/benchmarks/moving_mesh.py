@@ -1,13 +1,15 @@
-"""How near the estimate of the mesh's error comes while a body moves.
+"""Accuracy of the estimated mesh error while a body moves.
 
-* A free body falls: all its points fall alike, so the answer is that of the time steps alone, in closed form.
-* A cantilever of 100 x 20 x 20 mm is let go under a weight along its axis (it stretches) or across it (it bends), small
-  and large. The truth is 864 quadratic elements with consistent masses and the same time steps, with nothing added;
-  quadratic elements on a coarser mesh tell how far off that is.
+* A free body falls. All its points move equally, so the exact result depends only on the time steps and has a closed
+  form.
+* A cantilever of 100 x 20 x 20 mm is released under a weight along its axis (it stretches) or perpendicular to it (it
+  bends). Both motions are run with a small and a large weight. The reference has 864 quadratic elements with consistent
+  masses and the same time steps, without correction. Quadratic elements on a coarser mesh show the error of this
+  reference.
 
-All are let go at once. Errors are those of the middle of the free end along the weight, root mean square over all
-steps. Effectivity is the size of the estimate over that of the true error; corrected: the error with the estimate
-added, over the error without.
+All bodies are released at t = 0. Errors are those of the middle of the free end along the weight, as root mean square
+over all steps. Effectivity is the size of the estimate divided by the size of the true error. "Corrected" is the error
+with the estimate added, divided by the error without it.
 
 ``python -m experiments moving_mesh`` (15 minutes beside other work) writes results/moving_mesh.json.
 """
@@ -23,10 +25,10 @@ from experiments.common import either, save
 from liverjax.core.struct import replace
 
 LENGTH, WIDTH, MU, DENSITY = 0.1, 0.02, 4000.0, 1000.0
-#: Order of the elements and cells along the body; as many across as make them nearly cubes.
+#: Order of the elements, and cells along the body. The number of cells across it makes them nearly cubes.
 MESHES = either(((1, 5), (1, 10), (2, 2), (2, 5)), ((1, 5), (2, 2)))
 TRUTHS = either((10, 16), (8, 10))
-#: Weights [m/s^2], axis, integrator and time step [s]: a fortieth or less of the slowest period.
+#: Weight [m/s^2], its axis, integrator and time step [s]: at most a fortieth of the longest period.
 CASES: dict[str, tuple[float, int, str, float]] = {
     "bends by 4 mm": (0.05, 2, "newmark", 0.01),
     "bends by 60 mm": (1.0, 2, "newmark", 0.01),
@@ -38,7 +40,7 @@ FALLS = ((1, "lumped", "newmark"), (2, "lumped", "newmark"), (2, "lumped", "eule
 
 
 def body(order: int, cells: int, case: str, mass: str = "lumped") -> lj.Scene:
-    """The cantilever."""
+    """The cantilever for one of the CASES."""
     weight, axis, integrator, dt = CASES[case]
     across = max(1, round(cells * WIDTH / LENGTH))
     mesh = lj.shapes.box((LENGTH, WIDTH, WIDTH), (cells, across, across))
@@ -53,24 +55,26 @@ def body(order: int, cells: int, case: str, mass: str = "lumped") -> lj.Scene:
 
 
 def end(scene: lj.Scene, u: np.ndarray, axis: int) -> np.ndarray:
-    """Displacement (T,) [m] of the free end along an axis, the mean of its corners, from all (T, V, 3)."""
+    """Return the displacement (T,) [m] of the free end along an axis: the mean of its corners, from all `u` (T,
+    V, 3).
+    """
     points = np.asarray(scene.mesh.points)
     corners = [np.argmin(np.linalg.norm(points - (LENGTH, y, z), axis=1)) for y in (0, WIDTH) for z in (0, WIDTH)]
     return np.asarray(u)[:, corners, axis].mean(axis=1)
 
 
 def moved(scene: lj.Scene, axis: int) -> np.ndarray:
-    """`end` of a run."""
+    """Run a scene and return the displacement of its `end`."""
     return end(scene, lj.simulate(scene).check().positions - scene.mesh.points, axis)
 
 
 def size(values: np.ndarray) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 def judged(scene: lj.Scene, truth: np.ndarray, axis: int) -> dict[str, Any]:
-    """The error of a run and what its estimate says of it."""
+    """Return the error of a run and the quality of its estimate."""
     begin = time.perf_counter()
     result = lj.simulate(scene, mesh_error=True).check()
     off = truth - end(scene, result.positions - scene.mesh.points, axis)
@@ -88,11 +92,11 @@ def judged(scene: lj.Scene, truth: np.ndarray, axis: int) -> dict[str, Any]:
 
 
 def moving(case: str) -> list[dict[str, Any]]:
-    """Rows of all meshes of a case."""
+    """Return the results of all meshes for one case."""
     axis = CASES[case][1]
     coarse, fine = (moved(body(2, cells, case, "consistent"), axis) for cells in TRUTHS)
     rows = []
-    # Implicit Euler has programs of its own.
+    # Implicit Euler needs separately compiled programs, so it runs on every second mesh only.
     for order, cells in MESHES if CASES[case][2] == "newmark" else MESHES[::2]:
         row = judged(body(order, cells, case), fine, axis)
         rows.append({"case": case, "motion_m": size(fine), "truth_m": size(fine - coarse)} | row)
@@ -111,7 +115,7 @@ def falling(order: int, integrator: str, mass: str = "lumped") -> dict[str, Any]
 
 
 def main() -> None:
-    """All rows."""
+    """Run all cases."""
     fall = []
     for order, mass, integrator in FALLS:
         fall.append(falling(order, integrator, mass))

@@ -1,7 +1,8 @@
-"""float32 beside float64: force and stiffness of every law, a static cube, the liver's steps; error and floor.
+"""float32 compared with float64: force and stiffness of every law, a static cube, the liver's steps; error and floor.
 
-The error of force and stiffness is that against float64 at the same positions, over the largest entry. The floor is the
-least residual (over the forces at work) that Newton still meets; asked for less it says that it has stalled.
+The error of force and stiffness is the difference from float64 at the same positions, divided by the largest entry. The
+floor is the smallest residual (relative to the acting forces) that Newton's method can reach. With a smaller tolerance
+it reports that it has stalled.
 
     python -m experiments precision [--quick]
 """
@@ -26,17 +27,17 @@ PRECISIONS = {"float64": jnp.float64, "float32": jnp.float32}
 
 
 def cast(tree, dtype):
-    """Every floating-point leaf in another precision."""
+    """Return the tree with every floating-point array in another precision."""
     return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(jnp.asarray(a).dtype, jnp.floating) else a, tree)
 
 
 def force_and_stiffness(mesh: lj.TetMesh, law: lj.Law, x: jax.Array) -> tuple:
-    """What Newton's step needs of the elements."""
+    """Return the force and stiffness of the elements that a Newton step needs."""
     return mjed.internal_force(mesh, law, x), jnp.stack(jnp.broadcast_arrays(*contracted(mesh, law, x)[1]))
 
 
 def laws(cells: int, names: list[str]) -> list[dict]:
-    """A row a law: stretched and sheared by up to 20 %, no element inverted."""
+    """Return one row for each law: a cube stretched and sheared by up to 20 %, without inverted elements."""
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (cells, cells, cells))
     X, rows = mesh.points, []
     F = jnp.array([[1.15, 0.1, 0.0], [0.0, 0.9, 0.05], [0.08, 0.0, 1.05]])
@@ -56,7 +57,9 @@ def laws(cells: int, names: list[str]) -> list[dict]:
 
 
 def static(cells: int) -> list[dict]:
-    """The cube pulled by 20 % to several tolerances: time, and the largest error of a node over the pull."""
+    """Solve the cube stretched by 20 % to several tolerances. Return run time, and largest error of a node over the
+    stretch.
+    """
     exact, rows = np.asarray(lj.simulate(cube(cells, tolerance=1e-12)).positions[-1]), []
     for precision, tolerances in (
         ("float64", (1e-2, 1e-4, 1e-6, 1e-8, 1e-12)),
@@ -72,12 +75,15 @@ def static(cells: int) -> list[dict]:
 
 
 def code(result: lj.Result) -> str:
-    """The worst of the steps'."""
+    """Return the worst status of all steps."""
     return status.NAMES[int(np.max(np.asarray(result.status)))]
 
 
 def liver(steps: int) -> list[dict]:
-    """The phantom's three models at 0.05 s: float64 to 1e-6 and 1e-4, float32 to 1e-4; the largest error of a node."""
+    """Run the phantom's three models with steps of 0.05 s: float64 to 1e-6 and 1e-4, float32 to 1e-4.
+
+    Returns run times and the largest error of a node.
+    """
     rows = []
     for name, scene in either(models(), {"viscous": models()["viscous"]}).items():
         scene = with_solve(scene, 0.05 * steps, 0.05, tolerance=1e-6)
@@ -94,7 +100,7 @@ def liver(steps: int) -> list[dict]:
 
 
 def figure(rows: dict) -> plt.Figure:
-    """Time of force and stiffness, and error against run time of the cube."""
+    """Plot the time of force and stiffness, and error against run time of the cube."""
     fig, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     names = [r["law"] for r in rows["laws"]]
     for k, (precision, colour) in enumerate(zip(PRECISIONS, (BLUE, ORANGE), strict=True)):
@@ -115,7 +121,7 @@ def figure(rows: dict) -> plt.Figure:
 
 
 def main(quick: bool) -> None:
-    """Three tables, one figure."""
+    """Compute three tables and one figure."""
     names = ["neo_hookean", "costa"] if quick else list(lj.laws.LAWS)
     cells = 6 if quick else 15
     rows = {"laws": laws(cells, names), "cube": static(cells), "liver": liver(4 if quick else 40)}

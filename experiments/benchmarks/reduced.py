@@ -1,12 +1,12 @@
-"""A reduced model of the viscous liver phantom: error, stated error, and run time, beside the full model.
+"""A reduced model of the viscous liver phantom: error, stated error, and run time, compared with the full model.
 
-Gravity, a pull on a patch of the tip, the modulus, one ratio and one relaxation time are free. The training rows are
-drawn in a box of them, and some are corners of it, where a first model stated the largest errors. The unseen runs are
-drawn in a box 10 % wider. The full model on the same mesh is the truth: what the mesh leaves out is in neither. The
-tables give one core's times, compilation apart.
+Free parameters are gravity, a load on a patch of the tip, the modulus, one ratio and one relaxation time. Most training
+runs have parameters drawn at random in a box. The others are at corners of the box, where a first model stated the
+largest errors. The test runs are drawn in a box 10 % wider. The reference is the full model on the same mesh, so no
+error contains the mesh error. The run times are those of one core, without compilation.
 
-Modulus, ratio and time are identified from five unseen full runs through the reduced model, and one more full run
-each states the bias of that.
+Modulus, ratio and time are identified with the reduced model from five full test runs. For each of them, one more full
+run gives an estimate of the bias.
 
 ``python -m experiments reduced`` (18 minutes) writes results/reduced.json.
 """
@@ -15,7 +15,7 @@ import argparse
 import itertools
 import os
 
-# Matrices of 80 x 80: threads of the BLAS cost more than they do.
+# With matrices of 80 x 80, threads of the BLAS cost more than they gain.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import sys
@@ -36,18 +36,18 @@ from liverjax.mesh.selection import boundary_triangles
 
 SECONDS, DT = 1.2, 0.05
 MM = 1e-3
-#: Number of unseen runs.
+#: Number of test runs.
 UNSEEN = either(200, 6)
-#: Of them, those whose error is asked of the full mesh too.
+#: Number of test runs for which the error on the full mesh is computed too.
 MESH_CHECKS = either(20, 1)
-#: Tolerance of Newton's method of the reduced runs; the full ones have 1e-6. It moves the answer by 1e-4 at most.
+#: Newton's tolerance of the reduced runs; that of the full runs is 1e-6. It changes the result by at most 1e-4.
 REDUCED_TOLERANCE = 1e-3
-#: Unseen runs from which numbers are identified, and these numbers.
+#: Number of test runs from which parameters are identified, and names of these parameters.
 IDENTIFIED = either(5, 1)
 NAMES = ("law.mu", "viscosity.ratios.0", "viscosity.relaxation_times.0")
-#: Part of the largest displacement above which the full model would run.
+#: Error, relative to the largest displacement, above which the full model would be run.
 TOLERANCE = 0.01
-#: Lowest and highest number of the training rows.
+#: Lowest and highest value of each parameter in the training runs.
 RANGES = {
     "law.mu": (600.0, 900.0),
     "viscosity.ratios.0": (0.2, 0.3),
@@ -57,8 +57,8 @@ RANGES = {
 }
 
 
-#: Corners of these ranges (of 512, in the order of `itertools.product`): the 72 of the largest error that a model of
-#: the drawn rows stated, and 8 others.
+#: Corners of these ranges (of 512, in the order of `itertools.product`). For 72 of them, a model trained with the drawn
+#: runs stated the largest errors; 8 are others.
 CORNERS = (
     128,
     178,
@@ -156,13 +156,13 @@ def pulled_phantom() -> lj.Scene:
 
 
 def ends(ranges: dict = RANGES) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest values of all n numbers (n,)."""
+    """Return the lowest and the highest values of all n numbers, each (n,)."""
     low, high = zip(*ranges.values(), strict=True)
     return np.concatenate([np.ravel(a) for a in low]), np.concatenate([np.ravel(b) for b in high])
 
 
 def named(unit: np.ndarray, ranges: dict = RANGES) -> dict[str, np.ndarray]:
-    """Rows of numbers from places (N, n) in the ranges, 0 to 1."""
+    """Return parameter sets by name, from positions (N, n) between 0 and 1 in the ranges."""
     low, high = ends(ranges)
     table, rows, k = low + unit * (high - low), {}, 0
     for name, (a, _) in ranges.items():
@@ -173,7 +173,9 @@ def named(unit: np.ndarray, ranges: dict = RANGES) -> dict[str, np.ndarray]:
 
 
 def drawn(count: int, wider: float, seed: int, ranges: dict = RANGES) -> dict[str, np.ndarray]:
-    """Rows of all numbers: a Latin hypercube in the ranges, stretched by a part about their middles."""
+    """Return parameter sets from a Latin hypercube in the ranges, which are widened by a fraction about their
+    middles.
+    """
     from scipy.stats import qmc
 
     places = qmc.LatinHypercube(len(ends(ranges)[0]), seed=seed).random(count)
@@ -181,19 +183,21 @@ def drawn(count: int, wider: float, seed: int, ranges: dict = RANGES) -> dict[st
 
 
 def with_corners(count: int, corners: Any, ranges: dict = RANGES) -> dict[str, np.ndarray]:
-    """A Latin hypercube of rows, then some corners of the ranges, by their numbers."""
+    """Return parameter sets from a Latin hypercube, followed by those of some corners of the ranges, given by
+    number.
+    """
     every = np.array(list(itertools.product((0.0, 1.0), repeat=len(ends(ranges)[0]))))
     more = named(every[np.asarray(corners, int)], ranges)
     return {name: np.concatenate([rows, more[name]]) for name, rows in drawn(count, 0.0, 1, ranges).items()}
 
 
 def row_of(rows: dict[str, np.ndarray], k: int) -> dict[str, Any]:
-    """The numbers of one run."""
+    """Return the parameters of run k."""
     return {name: jnp.asarray(value[k]) for name, value in rows.items()}
 
 
 def one_core() -> Callable[[], None]:
-    """Put all threads of this process on one core, where the system can; the function puts them back."""
+    """Put all threads of this process on one core, where the system supports it. The returned function undoes this."""
     if not hasattr(os, "sched_setaffinity"):
         return lambda: None
     before = os.sched_getaffinity(0)
@@ -207,7 +211,7 @@ def one_core() -> Callable[[], None]:
 
 
 def truths(scene: lj.Scene, rows: dict) -> list[np.ndarray | None]:
-    """Positions (T, V, 3) [m] of full runs with the rows; None where a step failed."""
+    """Return positions (T, V, 3) [m] of full runs, one for each parameter set; None where a step failed."""
     found = []
     for k in range(len(rows["law.mu"])):
         full = lj.simulate(lj.with_parameters(scene, row_of(rows, k)))
@@ -216,17 +220,17 @@ def truths(scene: lj.Scene, rows: dict) -> list[np.ndarray | None]:
 
 
 def loosely(scene: lj.Scene) -> lj.Scene:
-    """The scene as reduced models run it."""
+    """Return the scene with Newton's tolerance of the reduced runs."""
     return replace(scene, solve=replace(scene.solve, tolerance=REDUCED_TOLERANCE))
 
 
 def farthest(u: Any) -> float:
-    """Largest length of vectors (..., 3), in mm."""
+    """Return the largest length of vectors (..., 3), in mm."""
     return float(np.linalg.norm(np.asarray(u), axis=-1).max()) / MM
 
 
 def unseen(scene: lj.Scene, model: lj.ReducedModel, rows: dict) -> dict[str, Any]:
-    """True and stated errors of runs with the rows, with and without the correction."""
+    """Return true and stated errors of runs with all parameter sets, with and without the correction."""
     found, mesh = [], []
     for k, full in enumerate(truths(scene, rows)):
         if full is None:
@@ -257,12 +261,12 @@ def unseen(scene: lj.Scene, model: lj.ReducedModel, rows: dict) -> dict[str, Any
 
 
 def summary(errors: np.ndarray) -> dict[str, Any]:
-    """Median, 95 % and largest."""
+    """Return median, 95 % quantile and maximum."""
     return {"median": float(np.median(errors)), "95": float(np.quantile(errors, 0.95)), "largest": float(errors.max())}
 
 
 def ratios(found: np.ndarray) -> dict[str, Any]:
-    """Of stated over true errors."""
+    """Summarise the ratios of stated to true errors."""
     return {
         "effectivity_median": float(np.median(found)),
         "effectivity_range": [float(found.min()), float(found.max())],
@@ -272,9 +276,9 @@ def ratios(found: np.ndarray) -> dict[str, Any]:
 
 
 def tip_of(scene: lj.Scene, names: Iterable[str]) -> Callable[[list, lj.ReducedModel], jax.Array]:
-    """A function to differentiate: squares of the last coordinates, of the values of some numbers.
+    """Return a function for gradients: the sum of squares of the last coordinates, as a function of some parameters.
 
-    The model is an argument: what a program is closed over, XLA computes with while it compiles.
+    The model is an argument of the function, because XLA evaluates constants of a closure during compilation.
     """
 
     def tip(values: list, model: lj.ReducedModel) -> jax.Array:
@@ -285,13 +289,13 @@ def tip_of(scene: lj.Scene, names: Iterable[str]) -> Callable[[list, lj.ReducedM
 
 
 def answer(scene: lj.Scene, model: lj.ReducedModel, corrected: bool = True) -> tuple[jax.Array, jax.Array]:
-    """Motion of all nodes, and its stated error."""
+    """Return the motion of all nodes, and its stated error."""
     found = lj.simulate_reduced(model, scene)
     return lj.reduced_positions(model, scene, found, corrected), lj.stated_error(model, scene, found, corrected)
 
 
 def times(scene: lj.Scene, model: lj.ReducedModel) -> dict[str, Any]:
-    """Milliseconds a step on one core: reduced run, its gradient, 64 at once, and the full run."""
+    """Return milliseconds per step on one core: reduced run, its gradient, 64 runs at once, and the full run."""
     back, steps, small = one_core(), scene.solve.steps, loosely(scene)
     start = [jnp.asarray(v, float) for v in (715.0, 0.235, 0.27)]
 
@@ -316,7 +320,9 @@ def times(scene: lj.Scene, model: lj.ReducedModel) -> dict[str, Any]:
 
 
 def identified(scene: lj.Scene, model: lj.ReducedModel, rows: dict) -> dict[str, Any]:
-    """Errors of numbers identified through the reduced model, before and after their stated bias is taken off."""
+    """Return errors of parameters identified with the reduced model, before and after subtraction of the stated
+    bias.
+    """
     from scipy.optimize import least_squares
 
     low, high = (np.array([RANGES[name][k] for name in NAMES]) for k in (0, 1))
@@ -357,7 +363,7 @@ def identified(scene: lj.Scene, model: lj.ReducedModel, rows: dict) -> dict[str,
 def trained(
     scene: lj.Scene, drawn_rows: int, corners: Any, modes: int, tolerance: float
 ) -> tuple[lj.ReducedModel, dict[str, Any]]:
-    """A model from drawn rows and corners, and what it took."""
+    """Train a model with drawn parameter sets and corners. Return the model and the cost of training."""
     rows, begin, cpu = with_corners(drawn_rows, corners), time.perf_counter(), time.process_time()
     model = lj.reduce_scene(scene, rows, 1e-5, modes, tolerance)
     took = {"training_s": time.perf_counter() - begin, "training_cpu_s": time.process_time() - cpu}
@@ -366,7 +372,7 @@ def trained(
 
 
 def main() -> None:
-    """All of it, written after each model."""
+    """Run all parts, and write the results after each model."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--keep", type=Path, help="file for the model, as `accelerator.py` takes it")
     parser.add_argument("--quick", action="store_true", help="fewer runs")

@@ -1,17 +1,19 @@
 """A reduced model of the complete liver phantom, porous and viscous: error, stated error, and run time.
 
-Gravity, a pull on a patch of the tip, the modulus, one ratio and one relaxation time are free as in `reduced.py`; the
-permeability and the bulk modulus of the sponge are free beside them. The training rows are drawn in a box of them and
-at some of its corners, the unseen runs in a box 10 % wider. The full model on the same mesh is the truth.
+Free parameters are gravity, a load on a patch of the tip, the modulus, one ratio and one relaxation time as in
+`reduced.py`, and in addition permeability and bulk modulus of the porous body. The training runs are drawn in a box of
+parameters and at some of its corners. The test runs are drawn in a box 10 % wider. The reference is the full model on
+the same mesh.
 
 ``python -m experiments reduced_porous`` (25 minutes on one core) writes results/reduced_porous.json after each part,
-and the trained model into out/reduced_porous.h5. If the script is ended, it goes on from there; delete the model to run
-all anew. Times are the processor's, of one core: other work beside it counts less than on a clock.
+and the trained model into out/reduced_porous.h5. If the script is interrupted, the next call continues from there.
+Delete the model to run everything again. Times are processor times of one core, which depend less on other work than
+wall times.
 """
 
 import os
 
-# Matrices of 72 x 72: threads of the BLAS cost more than they do.
+# With matrices of 72 x 72, threads of the BLAS cost more than they gain.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import json
@@ -30,15 +32,16 @@ from experiments.common import RESULTS, ROOT, either, save
 from experiments.liver import models
 from liverjax.core.struct import replace
 
-#: Lowest and highest number of the training rows, beside those of `reduced.py`.
+#: Lowest and highest value of each parameter in the training runs: those of `reduced.py` and two more.
 RANGES = reduced.RANGES | {"porosity.permeability": (1e-5, 4e-5), "porosity.bulk": (300.0, 500.0)}
-#: Drawn rows, and corners: those of `reduced.py`, with the sponge's two numbers at their four pairs of ends in turn.
+#: Number of drawn training runs, and of corners: those of `reduced.py`. The two porous parameters take the four pairs
+#: of their limits in turn.
 ROWS, CORNERS = either((420, 60), (8, 2))
-#: Unseen runs, and those of these whose error is asked of the full mesh too.
+#: Number of test runs, and of those for which the error on the full mesh is computed too.
 UNSEEN, MESH_CHECKS = either((100, 6), (2, 1))
-#: The most modes, and what the points may leave out.
+#: Largest number of modes, and error that the choice of integration points may cause.
 MODES, POINT_TOLERANCE = either((72, 7e-3), (20, 1e-1))
-#: Lanes of vmap.
+#: Number of runs in one batch of vmap.
 LANES = either(64, 4)
 KEPT = ROOT / "out" / f"{either('', 'quick_')}reduced_porous.h5"
 
@@ -49,7 +52,7 @@ def pulled_sponge() -> lj.Scene:
 
 
 def trained(scene: lj.Scene) -> tuple[lj.ReducedModel, dict]:
-    """The model, and what it took."""
+    """Train the model. Return it and the cost of training."""
     corners = [4 * corner + k % 4 for k, corner in enumerate(reduced.CORNERS[:CORNERS])]
     rows, begin, cpu = reduced.with_corners(ROWS, corners, RANGES), time.perf_counter(), time.process_time()
     model = lj.reduce_scene(scene, rows, 1e-5, MODES, POINT_TOLERANCE)
@@ -60,7 +63,7 @@ def trained(scene: lj.Scene) -> tuple[lj.ReducedModel, dict]:
 
 
 def unseen(scene: lj.Scene, model: lj.ReducedModel, rows: dict) -> dict:
-    """True and stated errors of runs with the rows."""
+    """Return true and stated errors of runs with all parameter sets."""
     found, failed = [], 0
     mesh: list[tuple[float, float]] = []
     for k in range(UNSEEN):
@@ -90,7 +93,7 @@ def unseen(scene: lj.Scene, model: lj.ReducedModel, rows: dict) -> dict:
 
 
 def times(scene: lj.Scene, model: lj.ReducedModel) -> dict:
-    """Milliseconds a step on one core: reduced run, its gradient, many lanes, and the full run."""
+    """Return milliseconds per step on one core: reduced run, its gradient, many runs at once, and the full run."""
     back, steps, small = one_core(), scene.solve.steps, loosely(scene)
     start = [jnp.asarray(v, float) for v in (715.0, 2e-5)]
     tip = reduced.tip_of(small, ("law.mu", "porosity.permeability"))
@@ -114,7 +117,7 @@ def times(scene: lj.Scene, model: lj.ReducedModel) -> dict:
 
 
 def processor_s(function: Callable, *arguments: object, rounds: int) -> tuple:
-    """Result, and processor time [s] of a jitted function after a first run: the median of some rounds."""
+    """Return the result and the processor time [s] of a jitted function: the median of some runs after a first one."""
     compiled = jax.jit(function).lower(*arguments).compile()
     result, seconds = jax.block_until_ready(compiled(*arguments)), []
     for _ in range(rounds):
@@ -125,7 +128,7 @@ def processor_s(function: Callable, *arguments: object, rounds: int) -> tuple:
 
 
 def main() -> None:
-    """All parts that are not there yet, written after each."""
+    """Run all parts whose results are not stored yet, and write after each."""
     scene, rows = pulled_sponge(), reduced.drawn(UNSEEN, 0.1, 2, RANGES)
     results = RESULTS / "reduced_porous.json"
     if KEPT.exists() and results.exists():

@@ -1,21 +1,22 @@
 """A reduced model of the viscous liver phantom on quadratic elements: error, stated error, and run time.
 
-The motion of the modes alone has an error of some thousandths, which the size of the learnt correction states well. The
-corrected motion is more exact, and its error is known less well. Both are shown.
+The motion computed with the modes alone has an error of some thousandths. The size of the learnt correction is a good
+estimate of this error. The corrected motion is more accurate, but its error is known less well. Both are shown.
 
-As `reduced.py`, but the truth is the full model of 10-node tetrahedra on the same mesh. Weight and pull are a tenth of
-those of `reduced.py`: from an eighth on, quadratic elements at the clamps turn inside out in the softest rows, and the
-full model refuses its own answer. The rows of the second part of the training are those for which a first model states
-the largest errors. The unseen runs are drawn in a box 10 % wider.
+The script follows `reduced.py`, but the reference is the full model of 10-node tetrahedra on the same mesh. Weight and
+load are a tenth of those of `reduced.py`. From an eighth on, quadratic elements at the clamps invert in the softest
+bodies, and the full model reports a failure. In the second part of the training, the parameter sets are those for which
+a first model states the largest errors. The test runs are drawn in a box 10 % wider.
 
 ``python -m experiments reduced_quadratic`` (50 minutes on two cores) writes results/reduced_quadratic.json after each
-part, and the trained model into out/reduced_quadratic.h5. If the script is ended, it goes on from there; delete the
-model to run all anew. Times of steps are the processor's, of one core: other work counts less than on a clock.
+part, and the trained model into out/reduced_quadratic.h5. If the script is interrupted, the next call continues from
+there. Delete the model to run everything again. Times of steps are processor times of one core, which depend less on
+other work than wall times.
 """
 
 import os
 
-# Matrices of 70 x 70: threads of the BLAS cost more than they do.
+# With matrices of 70 x 70, threads of the BLAS cost more than they gain.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import json
@@ -34,24 +35,24 @@ from experiments.common import RESULTS, ROOT, either, save
 from liverjax.core.struct import replace
 from liverjax.scenes.enriched import enriched
 
-#: Weight and pull, over those of `reduced.py`.
+#: Weight and load as a fraction of those of `reduced.py`.
 SHARE = 0.1
 LOADS = ("body.gravity", "traction.0.value")
 RANGES = {
     name: tuple(tuple(SHARE * np.asarray(end)) for end in ends) if name in LOADS else ends
     for name, ends in reduced.RANGES.items()
 }
-#: Rows, those of them that are run in full, and unseen runs.
+#: Number of parameter sets, of those that are run in full, and of test runs.
 ROWS, RUNS, UNSEEN = either((900, 160, 200), (12, 9, 3))
-#: The most modes, and what the points may leave out.
+#: Largest number of modes, and error that the choice of integration points may cause.
 MODES, POINT_TOLERANCE = either((70, 4e-3), (20, 1e-1))
-#: Newton's tolerance of the training runs; the truth has 1e-6.
+#: Newton's tolerance of the training runs; that of the reference runs is 1e-6.
 TRAINING_TOLERANCE = 1e-4
 KEPT = ROOT / "out" / f"{either('', 'quick_')}reduced_quadratic.h5"
 
 
 def trained(scene: lj.Scene) -> tuple[lj.ReducedModel, dict[str, Any]]:
-    """The model, and what it took."""
+    """Train the model. Return it and the cost of training."""
     rows, begin, cpu = reduced.drawn(ROWS, 0.0, 1, RANGES), time.perf_counter(), time.process_time()
     scene = replace(scene, solve=replace(scene.solve, tolerance=TRAINING_TOLERANCE))
     model = lj.reduce_scene(scene, rows, 1e-5, MODES, POINT_TOLERANCE, runs=RUNS)
@@ -61,7 +62,7 @@ def trained(scene: lj.Scene) -> tuple[lj.ReducedModel, dict[str, Any]]:
 
 
 def times(scene: lj.Scene, model: lj.ReducedModel) -> dict[str, float]:
-    """Milliseconds a step on one core: reduced run, with the motion of all nodes and its error, gradient, full run."""
+    """Return milliseconds per step on one core: reduced run, with motion and error of all nodes, gradient, full run."""
     back, steps, small = one_core(), scene.solve.steps, loosely(scene)
     start = [jnp.asarray(v, float) for v in (715.0, 0.235, 0.27)]
     tip = reduced.tip_of(small, NAMES)
@@ -83,7 +84,7 @@ def times(scene: lj.Scene, model: lj.ReducedModel) -> dict[str, float]:
 
 
 def main() -> None:
-    """All parts that are not there yet, written after each."""
+    """Run all parts whose results are not stored yet, and write after each."""
     scene, rows = enriched(pulled_phantom()), reduced.drawn(UNSEEN, 0.1, 2, RANGES)
     results = RESULTS / "reduced_quadratic.json"
     if KEPT.exists() and results.exists():

@@ -1,8 +1,8 @@
-"""How time and memory grow with the mesh: cubes of 1,000 to 1,000,000 tetrahedra.
+"""Growth of time and memory with the size of the mesh: cubes of 1,000 to 1,000,000 tetrahedra.
 
-``python -m experiments scaling`` (5 minutes) writes results/scaling.json and .png: force and stiffness of all elements,
-a dynamic step and a static load step, with iterations and residual, and the bytes that XLA plans for a step. Exponents
-are of a straight line through the logarithms.
+``python -m experiments scaling`` (5 minutes) writes results/scaling.json and .png. Measured are force and stiffness of
+all elements, and a dynamic step and a static load step, with iterations and residual, and the memory that XLA plans for
+a step. Exponents are those of a straight line through the logarithms.
 """
 
 import argparse
@@ -24,7 +24,9 @@ SIZE = 0.1
 
 
 def scenes(cells: int) -> dict[str, lj.Scene]:
-    """A cube that hangs and swings, five steps of 0.05 s; and one that is pulled by 10 % in one load step."""
+    """Return two scenes: a cube that hangs and oscillates, five steps of 0.05 s; and a cube stretched by 10 % in one
+    load step.
+    """
     mesh = lj.shapes.box((SIZE, SIZE, SIZE), (cells, cells, cells))
     top = (lj.Fixed(nodes=mesh.node_sets["z_max"]),)
     law = lj.laws.NeoHookean(mu=1000.0, bulk=10000.0)
@@ -38,7 +40,7 @@ def scenes(cells: int) -> dict[str, lj.Scene]:
 
 
 def fastest(program, *arguments, rounds: int) -> tuple:
-    """Result and least seconds of some runs after a first one."""
+    """Return the result and the shortest time [s] of some runs after a first one."""
     result, seconds = jax.block_until_ready(program(*arguments)), []
     for _ in range(rounds):
         begin = time.perf_counter()
@@ -48,7 +50,7 @@ def fastest(program, *arguments, rounds: int) -> tuple:
 
 
 def measure(cells: int) -> dict:
-    """One size."""
+    """Measure one size."""
     begin = time.perf_counter()
     made = scenes(cells)
     mesh = made["dynamic step"].mesh
@@ -76,14 +78,14 @@ def measure(cells: int) -> dict:
 
 
 def exponent(rows: list[dict], name: str, least: float = 5e3, most: float = 5.2e5) -> float:
-    """Of time with the number of tetrahedra, between these sizes."""
+    """Return the exponent of time against the number of tetrahedra, between these sizes."""
     chosen = [r for r in rows if least <= r["tetrahedra"] <= most or r["tetrahedra"] == 4374]
     n, t = (np.log([f(r) for r in chosen]) for f in (lambda r: r["tetrahedra"], lambda r: r[name]["seconds"]))
     return float(np.polyfit(n, t, 1)[0])
 
 
 def main() -> None:
-    """All sizes, the exponents, the figure."""
+    """Measure all sizes, compute the exponents, and plot the figure."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--cells", type=int, nargs="*", default=list(CELLS))
     parser.add_argument("--quick", action="store_true", help="two small sizes")
@@ -99,7 +101,7 @@ def main() -> None:
 
 
 def draw(rows: list[dict], exponents: dict):
-    """Time on the left, with residuals and iterations; memory an element on the right."""
+    """Plot time on the left, with residuals and iterations; on the right the memory per element."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     n = [r["tetrahedra"] for r in rows]
     for (name, e), colour in zip(exponents.items(), (GREEN, BLUE, ORANGE), strict=True):

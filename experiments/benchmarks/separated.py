@@ -1,7 +1,7 @@
-"""The liver phantom at rest as a function of three numbers: separated form against reduced basis and full model.
+"""The liver phantom at rest as a function of three parameters: separated form, reduced basis and full model.
 
-Modulus, bulk modulus and weight are free. The unseen runs are drawn in the same box; the full model on the same mesh is
-the truth, so what the mesh leaves out is in no number here. Times are of one core, compilation apart.
+Modulus, bulk modulus and weight are free. The test runs are drawn in the same box. The reference is the full model on
+the same mesh, so no number here contains the mesh error. Times are those of one core, without compilation.
 
 ``python -m experiments separated`` writes results/separated.json.
 """
@@ -23,12 +23,12 @@ CHECKS = either(20, 2)
 
 
 def phantom() -> lj.Scene:
-    """The hyperelastic phantom, its weight in two load steps."""
+    """The hyperelastic phantom with its weight in two load steps."""
     return replace(models()["hyperelastic"], solve=lj.Solve(steps=2))
 
 
 def unseen(scene: lj.Scene) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Rows of numbers, and the displacements (k, V, 3) [m] of the full model there."""
+    """Return parameter sets for tests, and the displacements (k, V, 3) [m] of the full model for them."""
     rng = np.random.default_rng(7)
     rows = {name: rng.uniform(*limits, CHECKS) for name, limits in RANGES.items()}
     result = lj.simulate_batch(scene, rows).result
@@ -37,18 +37,18 @@ def unseen(scene: lj.Scene) -> tuple[dict[str, np.ndarray], np.ndarray]:
 
 
 def errors(u: np.ndarray, exact: np.ndarray) -> dict[str, float]:
-    """Farthest node over the largest displacement of each run."""
+    """Return the largest error of a node divided by the largest displacement, for each run."""
     off = np.linalg.norm(u - exact, axis=-1).max(axis=1) / np.linalg.norm(exact, axis=-1).max(axis=1)
     return {"error_median": float(np.median(off)), "error_largest": float(off.max())}
 
 
 def at(rows: dict[str, np.ndarray], k: int) -> dict[str, Any]:
-    """The numbers of one run."""
+    """Return the parameters of run k."""
     return {name: jnp.asarray(value[k]) for name, value in rows.items()}
 
 
 def separated(scene: lj.Scene, points: int, rows: dict, exact: np.ndarray) -> dict[str, Any]:
-    """A separated form of so many points a parameter."""
+    """Build and test a separated form with `points` grid points for each parameter."""
     begin = time.perf_counter()
     model = lj.separate(scene, RANGES, points=points, tolerance=1e-5, most_terms=100)
     training = time.perf_counter() - begin
@@ -66,7 +66,7 @@ def separated(scene: lj.Scene, points: int, rows: dict, exact: np.ndarray) -> di
 
 
 def basis(scene: lj.Scene, runs: int, rows: dict, exact: np.ndarray) -> dict[str, Any]:
-    """A reduced basis from as many runs."""
+    """Build and test a reduced basis from `runs` full runs."""
     from scipy.stats import qmc
 
     limits = np.array(list(RANGES.values()))
@@ -86,7 +86,7 @@ def basis(scene: lj.Scene, runs: int, rows: dict, exact: np.ndarray) -> dict[str
 
 
 def main() -> None:
-    """Make the models and compare them."""
+    """Build the models and compare them."""
     back, scene = one_core(), phantom()
     rows, exact = unseen(scene)
     _, full = timed(lambda values: lj.simulate(lj.with_parameters(scene, values)).positions, at(rows, 0), rounds=3)

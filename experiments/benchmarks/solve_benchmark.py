@@ -1,7 +1,7 @@
 """Solves: a static cube in one load step and its gradient, dynamic steps of the liver, preconditioners, factorisation.
 
 ``python -m experiments solve_benchmark`` (6 minutes) writes results/solve_benchmark.json and .png. Times are medians of
-interleaved rounds without compilation; every time stands beside the error or residual that it buys.
+interleaved rounds without compilation. Each time is listed together with the error or residual that was reached.
 """
 
 import statistics
@@ -26,12 +26,14 @@ from liverjax.solvers.preconditioner import Coarse
 
 ROUNDS = either(5, 1)
 CELLS, RATIOS, STIFFER = either((15, (10.0, 50.0, 500.0), (1e1, 1e3, 1e5)), (8, (50.0,), (1e1,)))
-STEPS = either(((0.01, 60), (0.05, 40), (0.3, 20)), ((0.05, 10),))  # of which size, and how many
+STEPS = either(((0.01, 60), (0.05, 40), (0.3, 20)), ((0.05, 10),))  # size [s] and number of the steps
 SIZE = 0.1
 
 
 def medians(programs: dict, rounds: int = ROUNDS) -> tuple[dict, dict]:
-    """Results and median seconds of {name: (function, *arguments)}, all in turn, compiled first."""
+    """Return results and median seconds of {name: (function, *arguments)}. All are compiled first and then run
+    in turn.
+    """
     compiled = {n: (jax.jit(f).lower(*a).compile(), a) for n, (f, *a) in programs.items()}
     results = {n: jax.block_until_ready(p(*a)) for n, (p, a) in compiled.items()}
     seconds = {n: [] for n in compiled}
@@ -44,12 +46,12 @@ def medians(programs: dict, rounds: int = ROUNDS) -> tuple[dict, dict]:
 
 
 def finite(x: float) -> float | None:
-    """The number, or None, for JSON."""
+    """Return the number, or None if it is not finite, because JSON has no such numbers."""
     return float(x) if np.isfinite(x) else None
 
 
 def cube(cells: int = CELLS, bulk: float = 10000.0, **solve: Any) -> lj.Scene:
-    """Both ends held, the upper one moved by 20 %."""
+    """A cube with both ends fixed, the upper one displaced by 20 %."""
     mesh = lj.shapes.box((SIZE, SIZE, SIZE), (cells, cells, cells))
     return lj.Scene(
         mesh=mesh,
@@ -61,7 +63,7 @@ def cube(cells: int = CELLS, bulk: float = 10000.0, **solve: Any) -> lj.Scene:
 
 
 def static_cube() -> dict:
-    """One load step to 20 %, and the derivative of the upper end's force by mu."""
+    """Measure one load step to 20 %, and the derivative of the upper end's force with respect to mu."""
     scene = cube()
     top = jnp.asarray(scene.mesh.node_sets["z_max"])
 
@@ -90,7 +92,10 @@ def static_cube() -> dict:
 
 
 def liver_steps() -> list[dict]:
-    """Steps a second of the hyperelastic liver: one Newton iteration and Newton to 1e-8, mild and full gravity."""
+    """Measure steps per second of the hyperelastic liver, with one Newton iteration and with Newton to 1e-8.
+
+    Both run under mild and under full gravity.
+    """
     base = models()["hyperelastic"]
     programs, scenes = {}, {}
     for load, part in (("mild", 0.2), ("full", 1.0)):
@@ -125,7 +130,7 @@ def liver_steps() -> list[dict]:
 
 
 def preconditioners() -> list[dict]:
-    """Conjugate gradients to 1e-8 on the liver's tangent at rest, with and without the coarse space."""
+    """Solve with the liver's tangent at rest by conjugate gradients to 1e-8, with and without the coarse space."""
     base, rows = models()["hyperelastic"], []
     mask = boundary.free_degrees(base.mesh, base.fixed, ())
     mass = base.body.density * boundary.nodal_volumes(base.mesh)
@@ -151,7 +156,9 @@ def preconditioners() -> list[dict]:
 
 
 def factorisation() -> list[dict]:
-    """A smaller cube, ever stiffer in volume: conjugate gradients against a factorisation on the host."""
+    """Solve a smaller cube with larger and larger bulk modulus: conjugate gradients against a factorisation on the
+    host.
+    """
     rows = []
     for ratio in STIFFER:
         results, seconds = medians(
@@ -172,7 +179,7 @@ def factorisation() -> list[dict]:
 
 
 def draw(steps: list[dict], ways: list[dict]):
-    """Steps a second beside error, and iterations with and without the coarse space."""
+    """Plot steps per second with their error, and iterations with and without the coarse space."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     for load, marker in (("mild", "o"), ("full", "s")):
         for newton, colour in (("one", ORANGE), ("to 1e-8", BLUE)):
@@ -205,7 +212,7 @@ def draw(steps: list[dict], ways: list[dict]):
 
 
 def main() -> None:
-    """All of it."""
+    """Run all parts."""
     static = static_cube()
     print(static, flush=True)
     steps, ways, direct = liver_steps(), preconditioners(), factorisation()

@@ -1,7 +1,8 @@
-"""Rows a minute of `python -m liverjax sweep`: one and two devices, against a loop by hand, memory as the rows grow.
+"""Runs per minute of `python -m liverjax sweep`: one and two devices, a loop written by hand, and growth of memory.
 
-``python -m experiments sweep_benchmark`` (4 minutes) writes results/sweep_benchmark.json: whole processes, the time of
-starting and compiling taken out by the difference of two numbers of rows; the largest difference of the results beside.
+``python -m experiments sweep_benchmark`` (4 minutes) writes results/sweep_benchmark.json. Whole processes are timed.
+The time of start and compilation is removed by the difference between two numbers of runs. The largest difference of
+the results is listed too.
 """
 
 import resource
@@ -42,7 +43,7 @@ CHUNK = 50
 
 
 def swept(folder: Path, rows: int, devices: int) -> tuple[float, Path]:
-    """Seconds of the whole process, and its results."""
+    """Return the seconds of the whole process, and its results."""
     table, out = folder / f"rows_{rows}.csv", folder / f"{rows}_{devices}.h5"
     if not table.exists():
         command(["design", str(table), "law.mu=500:1000", "law.bulk=1500:3000", "--rows", str(rows)])
@@ -53,7 +54,7 @@ def swept(folder: Path, rows: int, devices: int) -> tuple[float, Path]:
 
 
 def looped(folder: Path, rows: int) -> float:
-    """Seconds a row of a compiled function called row after row."""
+    """Return the seconds per run of a compiled function that is called for one parameter set after the other."""
     scene = lj.load_scene(folder / "scene.toml")
     program = jax.jit(lambda scene, v: lj.simulate(lj.with_parameters(scene, v)).positions[-1])
     values = np.loadtxt(folder / f"rows_{rows}.csv", delimiter=",", skiprows=2)
@@ -65,7 +66,7 @@ def looped(folder: Path, rows: int) -> float:
 
 
 def main() -> None:
-    """All of it."""
+    """Run all parts."""
     with tempfile.TemporaryDirectory() as made:
         folder, content = Path(made), {"chunk": CHUNK}
         (folder / "scene.toml").write_text(SCENE)

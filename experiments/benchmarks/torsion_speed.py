@@ -1,8 +1,9 @@
-"""The torsion fit as it is, against the one with the derivative of the whole simulation on the finer mesh.
+"""The current torsion fit, compared with a fit that differentiates the whole simulation on the finer mesh.
 
-``python -m experiments torsion_speed [--quick]`` (10 minutes) writes results/torsion_speed.json: for both shipped
-sweeps the largest difference of a modulus at any frequency and of a parameter, in standard errors; compile and run
-time of both; for other plates the difference of the two meshes; the error of the Jacobian against strain.
+``python -m experiments torsion_speed [--quick]`` (10 minutes) writes results/torsion_speed.json. For both shipped
+sweeps: the largest difference of a modulus at any frequency, and of a parameter in units of its standard error; compile
+time and run time of both. For other plates: the difference between the two meshes. In addition, the error of the
+Jacobian against strain.
 """
 
 from typing import Any
@@ -18,19 +19,21 @@ from fitting.fits.simulated_rheometer import Simulation
 from fitting.readers.rheometer import Sweep, read_sweep
 from fitting.rigs import torsion
 
-#: Plates [m]: radius and height of the two data sets, of a tall sample, of a flat one.
+#: Plates [m]: radius and height of the two data sets, of a tall sample, and of a flat one.
 PLATES = either(((0.010, 0.004), (0.004, 0.0092), (0.010, 0.041), (0.020, 0.001)), ((0.010, 0.004),))
 STRAINS = either((1e-3, 1e-2), (1e-3,))
 
 
 def largest_difference(a: torsion.Moduli, b: torsion.Moduli) -> float:
-    """Of G' or G'' at any frequency, relative."""
+    """Return the largest relative difference of G' or G'' at any frequency."""
     pairs = ((a.storage, b.storage), (a.loss, b.loss))
     return float(max(np.max(np.abs(np.asarray(x) / np.asarray(y) - 1)) for x, y in pairs))
 
 
 def simulated(sweep: Sweep, u: jax.Array, simulation: Simulation, rig: torsion.Rig, whole: bool) -> Any:
-    """Residuals, Jacobian and moduli at u with their timing; `whole`: the derivative goes through the simulation."""
+    """Return residuals, Jacobian and moduli at u, with run times. With `whole`, the derivative goes through the
+    simulation.
+    """
     law = lj.laws.typical(simulation.law)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
@@ -51,7 +54,7 @@ def simulated(sweep: Sweep, u: jax.Array, simulation: Simulation, rig: torsion.R
 
 
 def fits(name: str) -> dict[str, Any]:
-    """Both ways at the minimum of one data set."""
+    """Compare both methods at the minimum of one data set."""
     sweep = read_sweep(ROOT / "data" / f"{name}_frequency_sweep.csv")
     dense = viscoelastic.generalised_maxwell.spectrum(sweep)
     closed = viscoelastic.choose_modes(sweep, dense)[0]
@@ -60,7 +63,7 @@ def fits(name: str) -> dict[str, Any]:
     fine, coarse = torsion.make_rig(), simulated_rheometer.rig_of(simulation)
     (_, J, m), now = simulated(sweep, u, simulation, coarse, whole=False)
     (r, J_whole, m_whole), before = simulated(sweep, u, simulation, fine, whole=True)
-    # Where Gauss-Newton with all derivatives would go from here, in standard errors of the parameters.
+    # Gauss-Newton step from here with the complete derivatives, in standard errors of the parameters.
     step, *_ = np.linalg.lstsq(np.asarray(J_whole), -np.asarray(r), rcond=None)
     spread = found.uncertainty.noise * np.sqrt(np.diag(np.linalg.inv(np.asarray(J_whole).T @ np.asarray(J_whole))))
     size = np.linalg.norm(np.asarray(J_whole), axis=0)
@@ -76,7 +79,7 @@ def fits(name: str) -> dict[str, Any]:
 
 
 def meshes(radius: float, height: float) -> dict[str, Any]:
-    """Moduli of Table 2's liver on the coarse mesh and on the finer one."""
+    """Return the moduli of Table 2's liver on the coarse mesh and on the finer one."""
     sweep = read_sweep(ROOT / "data" / "porcine_liver_frequency_sweep.csv")
     law, prony = lj.laws.typical("neo_hookean"), lj.Prony(ratios=(0.235, 0.333), relaxation_times=(0.27, 0.03))
     cells = [torsion.linear_cell_for(radius, height), torsion.cell_size_for(radius, height)]
@@ -93,7 +96,7 @@ def meshes(radius: float, height: float) -> dict[str, Any]:
 
 
 def strains() -> list[dict[str, float]]:
-    """Error of the linear rig's Jacobian against that of the simulation on the same mesh."""
+    """Return the error of the linear rig's Jacobian, against that of the simulation on the same mesh."""
     sweep = read_sweep(ROOT / "data" / "porcine_liver_frequency_sweep.csv")
     u = jnp.asarray(viscoelastic.closed_form(sweep, 2).solution.u)
     rows = []
@@ -108,7 +111,7 @@ def strains() -> list[dict[str, float]]:
 
 
 def main() -> None:
-    """All of it."""
+    """Run all parts."""
     content = {name: fits(name) for name in either(("lions_mane", "porcine_liver"), ("porcine_liver",))}
     content |= {"meshes": [meshes(*plate) for plate in PLATES], "strains": strains()}
     for name, row in content.items():

@@ -1,1 +1,1 @@
-"""What the chapter shows and claims, reproduced."""
+"""Reproductions of what the chapter shows and claims."""

@@ -1,9 +1,10 @@
-"""Other ways to the same numbers, for comparison: force and the 45 entries of every element's stiffness.
+"""Other methods that compute the same numbers, for comparison: force and the 45 entries of every element's stiffness.
 
-All in the layout of `liverjax.elements.mjed` (the element index last, every scalar written out), except the vmapped
-Hessian. With `write` a rival writes what its blocks share to memory (`liverjax.tensors.matrices.stored`), as the
-contracted way does; without, it is as books have it and the compiler chooses. Which is faster depends on the way, so
-both are measured. A vmapped Hessian has no parts that could be written.
+All use the layout of `liverjax.elements.mjed` (the element index last, every scalar written out), except the vmapped
+Hessian. With `write`, a method writes intermediate results that several blocks need to memory
+(`liverjax.tensors.matrices.stored`), as the contracted method does. Without it, the formulas are those of textbooks,
+and the compiler decides. Which variant is faster depends on the method, so both are measured. The vmapped Hessian has
+no intermediate results that could be written.
 """
 
 from collections.abc import Callable
@@ -31,7 +32,7 @@ from liverjax.tensors.matrices import (
     transpose,
 )
 
-#: The blocks that are written: nodes 1 to 3 of an element, by shape vector.
+#: The blocks that are written, for nodes 1 to 3 of an element, by indices of the shape vectors.
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 ENTRIES = [(k, r, c) for k, (a, b) in enumerate(PAIRS) for r in range(3) for c in range(r if a == b else 0, 3)]
 
@@ -45,7 +46,7 @@ def _entries(mesh: TetMesh, blocks: list) -> list:
 
 
 def contracted(mesh: TetMesh, law: Any, x: jax.Array) -> tuple:
-    """The way of `liverjax`: all terms of the energy at once."""
+    """The method of `liverjax`: all terms of the energy are added before the contraction with the shape vectors."""
     F = stored(deformation_gradient(mesh, x))
     shared = invariant_terms.state(law, F)
     force = mjed.nodal_force(mesh, invariant_terms.piola(F, shared.cof, invariant_terms.stress(shared)))
@@ -53,7 +54,7 @@ def contracted(mesh: TetMesh, law: Any, x: jax.Array) -> tuple:
 
 
 def chapter(mesh: TetMesh, law: Any, x: jax.Array, constant: list | None = None, write: bool = False) -> tuple:
-    """Six terms for every product, section 4.1.2, with `constant` matrices stored or computed on the fly."""
+    """Six terms for every product, section 4.1.2. The `constant` matrices are stored, or computed on the fly."""
     F = _kept(write)(deformation_gradient(mesh, x))
     force = mjed.nodal_force(mesh, chapter_terms.first_piola(law, F))
     layout = chapter_terms.Layout(constant, write)
@@ -61,7 +62,7 @@ def chapter(mesh: TetMesh, law: Any, x: jax.Array, constant: list | None = None,
 
 
 def stored_matrices(mesh: TetMesh) -> list:
-    """What `chapter` may be given: 60 numbers an element."""
+    """Return the constant matrices for `chapter`: 60 numbers per element."""
     return chapter_terms.constant_matrices(_shape_vectors(mesh), PAIRS)
 
 
@@ -102,12 +103,12 @@ def _sum(values: Any) -> Any:
 
 
 def _strain_displacement(F: Matrix, D: tuple) -> list:
-    """(6, 3): Green's strain, shears doubled, by the displacement of a node."""
+    """Return the matrix (6, 3) from the displacement of a node to Green's strain, with doubled shear components."""
     return [[F[k][i] * D[i] if i == j else F[k][i] * D[j] + F[k][j] * D[i] for k in range(3)] for i, j in SIX]
 
 
 def _elasticity(law: Any, F: Matrix, FA: Matrix) -> tuple[Matrix, list]:
-    """Second Piola-Kirchhoff stress and dS/dE (6, 6), in the axes of the material."""
+    """Return the second Piola-Kirchhoff stress and dS/dE (6, 6), in the material axes."""
     first, second = law.energy_derivatives(law.measures(F))
     C = right_cauchy_green(FA)
     I1, J = C[0][0] + C[1][1] + C[2][2], determinant(FA)
@@ -134,7 +135,7 @@ def _elasticity(law: Any, F: Matrix, FA: Matrix) -> tuple[Matrix, list]:
 
 
 def _parts(first: dict, second: dict, slopes: dict, inverse: Matrix, J: Any, p: int, q: int) -> list:
-    """Contributions to 4 d2W/dC_p dC_q."""
+    """Return the contributions to 4 d2W/dC_p dC_q."""
     (i, j), (k, l) = SIX[p], SIX[q]
     parts = [0.0 * J]
     for (a, b), W in second.items():
@@ -151,7 +152,7 @@ def _parts(first: dict, second: dict, slopes: dict, inverse: Matrix, J: Any, p: 
 
 
 def autodiff(mesh: TetMesh, law: Any, x: jax.Array, write: bool = False) -> tuple:
-    """dP/dF, 9 x 9, by forward over reverse mode of the energy, then contracted with the shape vectors."""
+    """dP/dF, 9 x 9, by forward-over-reverse differentiation of the energy, then contracted with the shape vectors."""
     F, D = _kept(write)(deformation_gradient(mesh, x)), _shape_vectors(mesh)
     ones, zeros = jnp.ones_like(F[0][0]), jnp.zeros_like(F[0][0])
 
@@ -186,10 +187,10 @@ def vmapped(mesh: TetMesh, law: Any, x: jax.Array) -> tuple:
 
 
 def entries_of(hessians: jax.Array) -> list:
-    """The 45 entries (E,) of full element matrices (E, 4, 3, 4, 3)."""
+    """Return the 45 entries (E,) of full element matrices (E, 4, 3, 4, 3)."""
     return [hessians[:, PAIRS[k][0] + 1, r, PAIRS[k][1] + 1, c] for k, r, c in ENTRIES]
 
 
 def floor(mesh: TetMesh, law: Any, x: jax.Array) -> list:
-    """Nothing but the 45 rows written."""
+    """Write the 45 entries and do nothing else: a lower bound of the run time."""
     return [mesh.volumes * (k + 1.0) for k in range(45)]

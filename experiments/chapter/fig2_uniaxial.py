@@ -1,9 +1,9 @@
 """Fig. 2 of the chapter: the laws of Table 1 in tension and compression, and stiffness against strain rate.
 
 ``python -m experiments fig2_uniaxial`` writes results/fig2_uniaxial.json and .png. All laws have the ground-state shear
-modulus of Table 2, 770 Pa; nothing here is fitted to the measurements that the chapter's figure collects. Fig. 2B and C
-show that the liver's stiffness below 10 % strain grows with the strain rate: what Table 2's viscosity gives of that,
-and its porosity in a cube of 5 cm with drained sides.
+modulus of Table 2, 770 Pa. Nothing here is fitted to the measurements that the chapter's figure collects. Fig. 2B and C
+show that the liver's stiffness below 10 % strain grows with the strain rate. The right panel shows how much of this
+growth follows from Table 2's viscosity, and from its porosity in a cube of 5 cm with drained sides.
 """
 
 import jax
@@ -18,8 +18,8 @@ from liverjax.laws import homogeneous
 from liverjax.physics import viscosity
 from liverjax.tensors.matrices import pack, unpack
 
-#: The chapter's Table 1, and Costa's law (fibres along 1). It and St Venant-Kirchhoff are no isochoric forms: taken at
-#: det F = 1.
+#: The chapter's Table 1, and Costa's law (fibres along 1). This law and St Venant-Kirchhoff are not isochoric; they are
+#: evaluated at det F = 1.
 TABLE_1 = (
     "saint_venant_kirchhoff",
     "neo_hookean",
@@ -39,7 +39,9 @@ STRAIN = 0.1
 
 
 def chord_moduli(law: laws.Law, sign: float, steps: int) -> jax.Array:
-    """Nominal stress over strain at 10 % [Pa], one for each of RATES, of an incompressible sample at constant rate."""
+    """Return the nominal stress over strain at 10 % strain [Pa] of an incompressible sample, for each strain rate in
+    RATES.
+    """
     law = laws.isochoric_part(law)
 
     def at_rate(rate):
@@ -49,7 +51,7 @@ def chord_moduli(law: laws.Law, sign: float, steps: int) -> jax.Array:
             F = homogeneous.deformation_gradient("uniaxial", 1 + sign * STRAIN * (k + 1) / steps)
             Ft = unpack(F[None])
             P = pack(viscosity.first_piola(TABLE_2, viscosity.recall(TABLE_2, history, dt), law, Ft))[0]
-            pressure = P[2, 2] * F[2, 2]  # the side is free
+            pressure = P[2, 2] * F[2, 2]  # the side is free of stress
             return viscosity.advance(TABLE_2, history, law, Ft, dt), P[0, 0] - pressure / F[0, 0]
 
         _, stress = jax.lax.scan(step, viscosity.initial_history(TABLE_2, 1), jnp.arange(steps))
@@ -59,7 +61,9 @@ def chord_moduli(law: laws.Law, sign: float, steps: int) -> jax.Array:
 
 
 def porous_sample(viscous: bool, steps: int) -> lj.Scene:
-    """A cube of 5 cm between lubricated plates, its sides drained: Table 2's sponge, with or without viscosity."""
+    """A cube of 5 cm between lubricated plates, with drained sides: Table 2's porous body, with or without
+    viscosity.
+    """
     size = 0.05
     mesh = lj.shapes.box((size,) * 3, (5, 5, 5))
     sides = np.unique(np.concatenate([np.asarray(mesh.node_sets[f"{a}_{e}"]) for a in "xy" for e in ("min", "max")]))
@@ -67,7 +71,7 @@ def porous_sample(viscous: bool, steps: int) -> lj.Scene:
     edge = int(np.argmax(np.asarray(mesh.points) @ np.array([1.0, -1.0, -1.0])))
     return lj.Scene(
         mesh=mesh,
-        law=lj.laws.NeoHookean(mu=770.0, bulk=1.0),  # its own bulk is off beside the sponge
+        law=lj.laws.NeoHookean(mu=770.0, bulk=1.0),  # the law's own bulk term is switched off in a porous body
         viscosity=TABLE_2 if viscous else None,
         porosity=lj.Porosity(
             bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5, drained=jnp.asarray(sides)
@@ -83,7 +87,7 @@ def porous_sample(viscous: bool, steps: int) -> lj.Scene:
 
 
 def porous_moduli(scene: lj.Scene, rates: np.ndarray) -> jax.Array:
-    """Chord moduli [Pa] of a porous sample in compression."""
+    """Return the chord moduli [Pa] of a porous sample in compression."""
     steps, top, area = scene.solve.steps, scene.displaced[0].nodes, 0.05**2
 
     def at_rate(rate):
@@ -94,14 +98,17 @@ def porous_moduli(scene: lj.Scene, rates: np.ndarray) -> jax.Array:
 
 
 def linear_moduli() -> np.ndarray:
-    """The same of linear viscoelasticity: 3 G0 (1 - sum g (1 - x (1 - exp(-1/x)))), x = tau rate / strain."""
+    """Return the chord moduli [Pa] of linear viscoelasticity, with x = tau rate / strain.
+
+    The formula is 3 G0 (1 - sum g (1 - x (1 - exp(-1/x)))).
+    """
     g, tau = np.asarray(TABLE_2.ratios)[:, None], np.asarray(TABLE_2.relaxation_times)[:, None]
     x = tau * RATES[None] / STRAIN
     return 3 * 770.0 * (1 - np.sum(g * (1 - x * (1 - np.exp(-1 / x))), axis=0))
 
 
 def stress_stretch(named: dict[str, laws.Law]) -> tuple[np.ndarray, dict]:
-    """Nominal stress of every law at stretches 0.7 to 1.4, its error against autodiff, and the time it takes."""
+    """Return the nominal stress of every law at stretches 0.7 to 1.4, its error against autodiff, and its run time."""
     stretch = np.linspace(0.7, 1.4, 141)
     table = {}
     for name, law in named.items():
@@ -118,7 +125,7 @@ def stress_stretch(named: dict[str, laws.Law]) -> tuple[np.ndarray, dict]:
 
 
 def main() -> None:
-    """Both halves of the figure."""
+    """Compute both halves of the figure."""
     named = {name: laws.typical(name) for name in TABLE_1}
     stretch, table = stress_stretch(named)
     rates = {}
@@ -149,7 +156,7 @@ def main() -> None:
 
 
 def draw(stretch: np.ndarray, table: dict, rates: dict, linear: np.ndarray) -> None:
-    """Left: the laws; right: stiffness against strain rate."""
+    """Plot the laws on the left, and stiffness against strain rate on the right."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained")
     for k, (name, row) in enumerate(table.items()):
         style, colour = ("-", "--")[k // len(COLOURS)], COLOURS[k % len(COLOURS)]

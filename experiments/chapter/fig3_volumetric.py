@@ -1,4 +1,4 @@
-"""Fig. 3, right: the sponge's volumetric stress before and after the logarithm is replaced by its tangent line.
+"""Fig. 3, right: volumetric stress of the porous body before and after its logarithm is replaced by a tangent line.
 
 python -m experiments fig3_volumetric
 """
@@ -13,7 +13,7 @@ from liverjax.physics import porosity
 
 
 def main() -> None:
-    """Two fluid fractions: 0.8 as drawn in the chapter, 0.5 of Table 2."""
+    """Plot two fluid fractions: 0.8 as drawn in the chapter, and 0.5 from Table 2."""
     fig, all_axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained", sharey=True)
     rows = []
     for axes, r_w in zip(all_axes, (0.8, 0.5), strict=True):

@@ -1,9 +1,9 @@
-"""The chapter's Fig. 4: force and stiffness of a cube of 20,250 tetrahedra, every law, every way.
+"""The chapter's Fig. 4: force and stiffness of a cube of 20,250 tetrahedra, for every law and every method.
 
 ``python -m experiments fig4_assembly`` (25 minutes) writes results/fig4_assembly.json and .png; with ``--laws NAME …``
-it replaces those laws in them. Medians of interleaved rounds of each way, its error against the vmapped Hessian, its
-compile time, and the floor: the 45 rows written and nothing else, and the time to copy as many bytes as the chapter's
-full matrices have.
+it replaces only these laws in the results. For each method, the results contain the median time of interleaved rounds,
+the error against the vmapped Hessian, and the compile time. Two lower bounds are listed too: the time to write the 45
+entries and do nothing else, and the time to copy as many bytes as the chapter's full matrices have.
 """
 
 import argparse
@@ -37,7 +37,8 @@ WAYS = {
     "autodiff 9 x 9, parts written": partial(assembly_rivals.autodiff, write=True),
     "vmapped Hessian": assembly_rivals.vmapped,
 }
-#: What the pages compare: the faster of a rival as books have it and with its parts written to memory.
+#: Methods in the comparison. Each has a textbook variant, and one that writes intermediate results; the faster one
+#: counts.
 RIVALS = {
     "chapter": ("chapter, on the fly", "chapter, parts written"),
     "standard FEM": ("standard FEM", "standard FEM, parts written"),
@@ -49,7 +50,10 @@ COPIED = 23_000_000  # bytes: about 20,250 full matrices of 144 numbers
 
 
 def programs(mesh: lj.mesh.TetMesh, law: lj.laws.Law, x: jax.Array, stored: list) -> tuple[dict, dict]:
-    """Compiled ways with their arguments, and how long each took to compile; laws that a way cannot do are left out."""
+    """Compile all methods. Return the programs with their arguments, and the compile times.
+
+    A method that does not support the law is left out.
+    """
     made, compiling = {}, {}
     every = WAYS | {"force only": mjed.internal_force, "into the solver's rows": into_rows}
     for name, function in every.items():
@@ -64,15 +68,16 @@ def programs(mesh: lj.mesh.TetMesh, law: lj.laws.Law, x: jax.Array, stored: list
 
 
 def into_rows(mesh: lj.mesh.TetMesh, law: lj.laws.Law, x: jax.Array) -> tuple:
-    """Force, and the stiffness assembled into the padded rows that the solver multiplies with."""
+    """Return the force, and the stiffness assembled into the padded rows that the solver multiplies with."""
     scene = lj.Scene(mesh=mesh, law=law)
     return mjed.internal_force(mesh, law, x), tangent.stiffness(equations(scene, initial_state(scene), 1.0), None, x)
 
 
 def medians(made: dict, rounds: int) -> dict[str, float]:
-    """Seconds of each program: medians over rounds that take all of them in turn.
+    """Return the median seconds of each program. Each round contains all programs.
 
-    Each runs twice and the second run counts, as in a loop: the first pays for the memory that its neighbour gave back.
+    In each round a program runs twice, and the second run counts, as in a loop. The first run must request the memory
+    that the program before has released.
     """
     seconds = {name: [] for name in made}
     for _ in range(rounds + 1):
@@ -85,9 +90,9 @@ def medians(made: dict, rounds: int) -> dict[str, float]:
 
 
 def errors(made: dict) -> dict[str, float | None]:
-    """Largest difference of the 45 entries from those of the vmapped Hessian, over the largest entry; None: not finite.
+    """Return the largest difference of the 45 entries from those of the vmapped Hessian, divided by the largest entry.
 
-    Where the Hessian itself is not finite, from the contracted ones.
+    The value is None if it is not finite. If the Hessian itself is not finite, the contracted method is the reference.
     """
 
     def entries(name):
@@ -104,7 +109,7 @@ def errors(made: dict) -> dict[str, float | None]:
 
 
 def main() -> None:
-    """All laws, the table and the figure."""
+    """Measure all laws and write the table and the figure."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--rounds", type=int, default=either(15, 3))
     parser.add_argument("--laws", nargs="*", default=either(list(laws.LAWS), ["neo_hookean", "mooney_rivlin", "costa"]))
@@ -129,7 +134,9 @@ def main() -> None:
 
 
 def compared(rows: dict) -> None:
-    """How many times as long as contracted terms every way takes, and every rival the way that is faster for it."""
+    """Add to each row the run time of every method over that of contracted terms, also for the faster variant of each
+    rival.
+    """
     neo = rows.get("neo_hookean", next(iter(rows.values())))["seconds"]["contracted"]
     for row in rows.values():
         s = row["seconds"]
@@ -140,11 +147,11 @@ def compared(rows: dict) -> None:
 
 
 def draw(rows: dict) -> plt.Figure:
-    """Time of every way on the left, how often contracted terms fit into it on the right."""
+    """Plot the run time of every method on the left, and its ratio to that of contracted terms on the right."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 7.5), sharey=True, layout="constrained")
     at = np.arange(len(rows))
     for k, way in enumerate(WAYS):
-        written = way.endswith(", parts written")  # hollow
+        written = way.endswith(", parts written")  # hollow symbol
         family = next((r for r, ways in RIVALS.items() if way in ways), way)
         look = {"ms": 5, "color": COLOUR[family], "mfc": "none" if written else COLOUR[family]}
         for j, row in enumerate(rows.values()):

@@ -1,7 +1,8 @@
-"""Fig. 5 of the chapter: moduli of the simulated rheometer against the data, and where a 5 % error can come from.
+"""Fig. 5 of the chapter: moduli of the simulated rheometer against the data, and possible sources of a 5 % error.
 
 ``python -m experiments fig5_dma [--quick]`` writes results/fig5_dma.json and .png: moduli for two laws and both
-recursions; error against run time for steps a cycle and for mesh size; the shares of recursion, mesh and modes.
+recursions (updates of the viscous memory from step to step); error against run time, for the number of steps per cycle
+and for the mesh size; the contributions of recursion, mesh and number of modes to the error.
 """
 
 import sys
@@ -25,7 +26,7 @@ SCHEMES = {"exponential": BLUE, "chapter": ORANGE}
 
 
 def simulate(sweep, law_name: str, scheme: str, steps: int = 50, cell_size: float | None = None, rounds: int = 3):
-    """Corrected and raw moduli of Table 2's liver at the sweep's frequencies, with timing and the rig."""
+    """Return corrected and raw moduli of Table 2's liver at the sweep's frequencies, with run times and the rig."""
     rig = torsion.make_rig(cell_size=cell_size)
     law = lj.laws.typical(law_name)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), 1e-3)
@@ -39,13 +40,13 @@ def simulate(sweep, law_name: str, scheme: str, steps: int = 50, cell_size: floa
 
 
 def error(sweep, storage, loss) -> dict[str, float]:
-    """Relative errors against the continuous model: mean over G' and G'', and the largest of G''."""
+    """Return relative errors against the continuous model: the mean over G' and G'', and the largest of G''."""
     e = np.abs(np.concatenate([np.asarray(storage) / sweep.storage, np.asarray(loss) / sweep.loss]) - 1)
     return {"mean": float(e.mean()), "largest_loss": float(e[len(e) // 2 :].max())}
 
 
 def moduli_table(sweep) -> list[dict]:
-    """Two laws, both recursions, 50 steps a cycle."""
+    """Return moduli for two laws and both recursions, with 50 steps per cycle."""
     rows = []
     for law in ("saint_venant_kirchhoff", "neo_hookean"):
         for scheme in SCHEMES:
@@ -60,7 +61,7 @@ def moduli_table(sweep) -> list[dict]:
 
 
 def steps_table(sweep, steps: tuple[int, ...]) -> list[dict]:
-    """Error against steps a cycle and run time."""
+    """Return error and run time for several numbers of steps per cycle."""
     rows = []
     for scheme in SCHEMES:
         for n in steps:
@@ -71,7 +72,7 @@ def steps_table(sweep, steps: tuple[int, ...]) -> list[dict]:
 
 
 def mesh_table(sweep, cells: tuple[float, ...]) -> list[dict]:
-    """Error of the mesh alone (against the recursion's own discrete formula), raw and corrected."""
+    """Return the error of the mesh alone, raw and corrected. The reference is the discrete formula of the recursion."""
     omega = jnp.asarray(sweep.angular_frequency)
     dt = 2 * jnp.pi / omega / 50
     G = 770 * (1 - lj.viscosity.complex_ratios(TABLE_2, omega, dt).sum(axis=0))
@@ -89,7 +90,10 @@ def mesh_table(sweep, cells: tuple[float, ...]) -> list[dict]:
 
 
 def modes_table() -> list[dict]:
-    """What a finite number of modes costs on a real tissue (the chapter's measured points exist only as a picture)."""
+    """Return the error of a finite number of modes for a real tissue.
+
+    The chapter's measured points are published only as a picture, so the data are those of lion's mane.
+    """
     sweep = read_sweep(DATA / "lions_mane_frequency_sweep.csv")
     dense = generalised_maxwell.spectrum(sweep)
     rows = []
@@ -103,7 +107,9 @@ def modes_table() -> list[dict]:
 
 
 def figure(sweep, content) -> plt.Figure:
-    """Four panels: moduli; error against run time for steps; for meshes; modes."""
+    """Plot four panels: moduli; error against run time for steps; the same for meshes; error against number of
+    modes.
+    """
     fig, axes = plt.subplots(2, 2, figsize=(10, 7.2), layout="constrained")
     f = sweep.angular_frequency / (2 * np.pi)
     top = axes[0, 0]
@@ -162,7 +168,7 @@ def figure(sweep, content) -> plt.Figure:
 
 
 def main(quick: bool) -> None:
-    """Run all tables and write them."""
+    """Compute all tables and write them."""
     sweep = read_sweep(DATA / "porcine_liver_frequency_sweep.csv")
     content = {
         "moduli": moduli_table(sweep),

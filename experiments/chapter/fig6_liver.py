@@ -1,9 +1,8 @@
-"""Fig. 6: the liver phantom (no anatomy) falls into its supports under a fifth of gravity.
+"""Fig. 6: the liver phantom (not an anatomy) falls into its supports under a fifth of gravity.
 
-Bottom: the tip's motion, hyperelastic, viscous, complete and porohyperelastic. Top: the fluid's pressure during the
-first oscillation of the porohyperelastic model, as the chapter shows it.
-Table: steps a second beside the error against a run with steps of 5 ms, for the chapter's scheme (one Newton iteration)
-and for Newton to 1e-6.
+Bottom: motion of the tip for the hyperelastic, viscous, complete and porohyperelastic model. Top: fluid pressure during
+the first oscillation of the porohyperelastic model, as shown in the chapter. Table: steps per second, and error
+relative to a run with steps of 5 ms, for the chapter's scheme (one Newton iteration) and for Newton to 1e-6.
 
     python -m experiments fig6_liver
 """
@@ -23,7 +22,7 @@ PICTURES = (0.05, 0.15, 0.25, 0.4, 0.8)
 
 
 def main() -> None:
-    """Runs, table, two figures."""
+    """Compute the runs, the table and two figures."""
     rows, curves, tip = [], {}, None
     for name, scene in models().items():
         fine = exact(scene)
@@ -45,18 +44,18 @@ def main() -> None:
 
 
 def exact(scene: lj.Scene) -> lj.simulation.Result:
-    """Steps that are so short that their error does not show."""
+    """Run with steps so short that their error is not visible."""
     return timed_run(with_solve(scene, SECONDS, either(0.005, 0.02), integrator="newmark"), rounds=1)[0]
 
 
 def curve(scene: lj.Scene, result: lj.simulation.Result, tip: int) -> dict:
-    """The path of node `tip` along gravity."""
+    """Return the displacement of node `tip` along gravity over time."""
     path = (np.asarray(result.positions)[:, tip] - np.asarray(scene.mesh.points)[tip])[:, 1]
     return {"times": np.asarray(result.times).tolist(), "tip_m": path.tolist()}
 
 
 def summary(curves: dict) -> dict:
-    """Of every curve its swing after a quarter of the time, its peak and its end."""
+    """Return for every curve its range after a quarter of the time, its peak and its last value."""
     return {
         name: {
             "amplitude_m": float(np.ptp(np.array(c["tip_m"])[len(c["tip_m"]) // 4 :])),
@@ -68,13 +67,13 @@ def summary(curves: dict) -> dict:
 
 
 def motion(curves: dict, rows: list) -> plt.Figure:
-    """The tip's path, and what a step costs beside its error."""
+    """Plot the path of the tip, and the error of positions against the ratio of simulated time to run time."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
     for (name, curve), colour in zip(curves.items(), COLOURS, strict=False):
         left.plot(curve["times"], 100 * np.array(curve["tip_m"]), color=colour, label=name)
         for newton, marker in ((1, "o"), (25, "s")):
             own = [r for r in rows if r["model"] == name and r["newton"] == newton and r["converged"]]
-            if not own:  # not timed
+            if not own:  # this model was not timed
                 continue
             right.loglog(
                 [r["steps_per_s"] * r["dt"] for r in own],
@@ -102,13 +101,13 @@ def _at(result) -> list[int]:
 
 
 def pressure_content(result) -> dict:
-    """Least and greatest pressure at the pictures' times."""
+    """Return the smallest and largest pressure at the times of the pictures."""
     P = np.asarray(result.pressure)[_at(result)]
     return {"times": PICTURES, "least_Pa": P.min(axis=1).tolist(), "greatest_Pa": P.max(axis=1).tolist()}
 
 
 def pressure_row(mesh, result) -> plt.Figure:
-    """The surface, coloured by the fluid's pressure, at five times of the first oscillation."""
+    """Plot the surface, coloured by the fluid pressure, at five times of the first oscillation."""
     triangles = boundary_triangles(mesh)
     P = np.asarray(result.pressure)[_at(result)]
     most = np.abs(P).max()

@@ -1,7 +1,7 @@
-"""How near to collapse is a liver under its own weight? Static load steps up to full gravity, by law.
+"""Distance of a liver under its own weight from collapse: static load steps up to full gravity, for several laws.
 
-rho g H is 1.7 kPa for 16 cm, between Young's modulus at once (3 G0 = 2.3 kPa by Table 2) and at rest (1.0 kPa). In the
-body the organ is held all around; here it hangs by two patches.
+rho g H is 1.7 kPa for 16 cm. This is between the instantaneous Young's modulus (3 G0 = 2.3 kPa by Table 2) and the
+long-term one (1.0 kPa). In the body the organ is supported all around; here it hangs by two patches.
 
     python -m experiments gravity_path
 """
@@ -23,7 +23,7 @@ RELAXED = 1 - 0.235 - 0.333
 
 
 def main() -> None:
-    """The load path of three laws."""
+    """Compute the load path of three laws."""
     scene = models()["hyperelastic"]
     law = scene.law
     named = {

@@ -1,4 +1,4 @@
-"""Every law: how right its hand-derived terms are, beside what they cost.
+"""Every law: errors of its hand-derived terms, and their run time.
 
 ``python -m experiments laws_table`` writes results/laws_table.json and .png: error of stress and tangent against
 automatic differentiation of the energy at 2,000 deformation gradients, time of force and stiffness of 20,250 tetrahedra
@@ -22,7 +22,7 @@ ROUNDS = either(15, 3)
 
 
 def gradients(n: int) -> jax.Array:
-    """Stretches 0.5 to 2 between random rotations."""
+    """Return n deformation gradients: stretches 0.5 to 2 between random rotations."""
     rng = np.random.default_rng(3)
     Q1, Q2 = (np.linalg.qr(rng.standard_normal((n, 3, 3)))[0] for _ in range(2))
     F = Q1 @ (np.exp(rng.uniform(np.log(0.5), np.log(2.0), (n, 3)))[:, :, None] * Q2)
@@ -30,14 +30,14 @@ def gradients(n: int) -> jax.Array:
 
 
 def error(ours: jax.Array, exact: jax.Array, size: float) -> float:
-    """Largest error of a matrix relative to its largest entry (or the modulus), where the energy exists."""
+    """Return the largest error of a matrix relative to its largest entry plus `size`, where the energy is finite."""
     ours, exact = (np.asarray(v).reshape(len(ours), -1) for v in (ours, exact))
     keep = np.isfinite(ours).all(axis=1)
     return float((np.abs(ours - exact).max(axis=1) / (np.abs(exact).max(axis=1) + size))[keep].max())
 
 
 def main() -> None:
-    """The table and its figure."""
+    """Compute the table and its figure."""
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (15, 15, 15))
     x = mesh.points + 0.004 * jnp.asarray(np.random.default_rng(0).standard_normal(mesh.points.shape))
     F = gradients(2000)
@@ -72,12 +72,12 @@ def main() -> None:
 
 
 def force_and_stiffness(mesh, law, x):
-    """Nodal forces, and the six blocks of every element from which the others follow."""
+    """Return nodal forces, and the six blocks of every element from which the other blocks follow."""
     return mjed.internal_force(mesh, law, x), mjed.element_stiffness(mesh, law, x)
 
 
 def draw(rows: dict):
-    """Error on the left, time on the right, one line a law."""
+    """Plot the errors on the left and the run times on the right, with one line for each law."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4.6), sharey=True, layout="constrained")
     at = np.arange(len(rows))
     left.semilogx([r["stress_error"] for r in rows.values()], at, "o", color=BLUE, label="stress")

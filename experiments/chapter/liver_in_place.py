@@ -1,18 +1,20 @@
-"""The liver phantom as it lies in a body: capsule, ligaments, vessels, a plane below it, and its unloaded shape.
+"""The liver phantom as in a body: capsule, ligaments, vessels, a plane below it, and its unloaded shape.
 
-The phantom is held at its vena cava and its suspensory ligament and lies on its back. Its weight is a fifth of gravity
-as in Fig. 6. What each part changes in the displacement of the tip (the node that moves most by itself) is told beside
-the run time and the mesh's error; quadratic elements on the same mesh stand beside it. The motion of four models, with
-and without viscosity and fluid, is run with all parts and without: the tip's peak and the fluid's pressure. The
-complete model asks for the mesh's estimate, whose linear solve fails in some steps: a capsule that is pressed together
-wrinkles between the vertices, as quadratic functions can. It can be run with quadratic elements as well (``finer``).
-Held at two places, these are pressed inside out at the edges of the clamps (``clamps`` says where and why).
-The capsule's numbers (8 MPa, 50 um) are in the range of the literature; those of ligaments, vessels and plane are
-chosen: no measurement of one liver has them all.
+The phantom is fixed at its vena cava and its suspensory ligament and lies on its back. Its weight is a fifth of gravity
+as in Fig. 6. The table shows how each part changes the displacement of the tip (the node that moves most without these
+parts), with run time and mesh error, and the same for quadratic elements on the same mesh. The motion of four models,
+with and without viscosity and fluid, is run with all parts and without them. Its results are the tip's peak and the
+fluid pressure.
+
+For the complete model the mesh error is estimated. The linear solve for this estimate fails in some steps, because a
+compressed capsule wrinkles between the vertices, as quadratic functions can. The model can be run with quadratic
+elements as well (``finer``). If the phantom is fixed only at the two regions, these elements invert at the edges of the
+clamps (``clamps`` shows where and why). Stiffness and thickness of the capsule (8 MPa, 50 um) are in the range of the
+literature. The values for ligaments, vessels and plane are assumed, because no measurement of one liver has them all.
 
 ``python -m experiments liver_in_place`` (20 minutes) writes results/liver_in_place.json. ``python -m
-experiments.chapter.liver_in_place motion`` (or ``rest``, ``unloaded``, ``clamps``, ``finer``) makes that part again and
-leaves the others.
+experiments.chapter.liver_in_place motion`` (or ``rest``, ``unloaded``, ``clamps``, ``finer``) runs that part again and
+keeps the results of the others.
 """
 
 import json
@@ -39,13 +41,14 @@ from liverjax.scenes.enriched import enriched
 from liverjax.simulation.mesh_error import BAR, mesh_error_of
 from liverjax.simulation.run import prepared
 
-#: Young's modulus [Pa] and thickness [m] of Glisson's capsule; of a vessel's wall; of a ligament [N/m], [N].
+#: Young's modulus [Pa] and thickness [m] of Glisson's capsule; the same of a vessel's wall; stiffness [N/m] and
+#: pre-tension [N] of a ligament.
 CAPSULE, VESSEL, LIGAMENT = (8e6, 5e-5), (3e5, 1e-3), (50.0, 0.05)
 SECONDS, DT = either(1.5, 0.3), 0.05
 
 
 def parts(mesh: lj.TetMesh) -> dict[str, tuple[Physics, ...]]:
-    """What holds the phantom beside its two fixed places, by name."""
+    """Return what supports the phantom in addition to its two fixed regions, by name."""
     surface = jnp.asarray(lj.boundary.boundary_triangles(mesh), jnp.int32)
     skin = Membrane(triangles=surface, thickness=CAPSULE[1], law=lj.laws.NeoHookean(mu=CAPSULE[0] / 3, bulk=None))
     cables = []
@@ -74,7 +77,9 @@ def parts(mesh: lj.TetMesh) -> dict[str, tuple[Physics, ...]]:
 
 
 def with_mesh_error(scene: lj.Scene, result: lj.Result, tip: int, step: int) -> dict[str, Any]:
-    """Displacement [m] of a node at a step, what a mesh without end would add, and how long the estimate takes."""
+    """Return the displacement [m] of a node at a step, its correction for the mesh error, and the run time of the
+    estimate.
+    """
     begin = time.perf_counter()
     error = mesh_error_of(prepared(scene), result.positions, result.reactions)
 
@@ -91,7 +96,7 @@ def with_mesh_error(scene: lj.Scene, result: lj.Result, tip: int, step: int) -> 
 
 
 def at_rest(name: str, scene: lj.Scene, tip: int) -> dict[str, Any]:
-    """Displacements [m] of a scene and run time; of linear elements the mesh error too."""
+    """Return displacements [m] and run time of a static scene, and for linear elements also the mesh error."""
     lj.check_scene(scene)
     result, took = timed_run(scene, rounds=1)
     rest = np.asarray(scene.mesh.points)
@@ -107,7 +112,7 @@ def at_rest(name: str, scene: lj.Scene, tip: int) -> dict[str, Any]:
 
 
 def there_and_back(name: str, scene: lj.Scene) -> dict[str, Any]:
-    """The shape without its weight, and how far the run from it ends from the given one."""
+    """Compute the shape without weight, and the distance of the loaded shape from the given one after a run back."""
     lj.check_scene(replace(scene, points_are="loaded"))
     begin = time.perf_counter()
     found = jax.block_until_ready(lj.unloaded(scene))
@@ -129,7 +134,9 @@ def there_and_back(name: str, scene: lj.Scene) -> dict[str, Any]:
 
 
 def in_motion(name: str, scene: lj.Scene, tip: int) -> dict[str, Any]:
-    """Largest displacement of any node in a run [m], that of the tip with its mesh error, and pressures [Pa]."""
+    """Return the largest displacement of any node in a run [m], that of the tip with its mesh error, and pressures
+    [Pa].
+    """
     scene = with_solve(scene, SECONDS, DT)
     result, took = timed_run(scene, rounds=1)
     far = np.linalg.norm(np.asarray(result.positions) - np.asarray(scene.mesh.points), axis=2)
@@ -145,8 +152,10 @@ def in_motion(name: str, scene: lj.Scene, tip: int) -> dict[str, Any]:
 
 
 def pressed_at_clamps(name: str, scene: lj.Scene) -> dict[str, Any]:
-    """When the first element of a run is inside out, how far from a held node [m], and the pressures [Pa] there: that
-    of a held place on average, and the one at which the law's volume is gone."""
+    """Return the time at which the first element inverts, and its distance from a fixed node [m].
+
+    Two pressures [Pa] follow: the mean pressure on a fixed region, and the pressure at which the law's volume is zero.
+    """
     scene = with_solve(scene, SECONDS / 3, DT)
     result, held = lj.simulate(scene), np.unique(np.concatenate([np.asarray(f.nodes) for f in scene.fixed]))
     rest, tets = np.asarray(scene.mesh.points), np.asarray(scene.mesh.tetrahedra)
@@ -172,7 +181,9 @@ def pressed_at_clamps(name: str, scene: lj.Scene) -> dict[str, Any]:
 
 
 def scenes() -> tuple[dict[str, lj.Scene], dict[str, lj.Scene], dict[str, lj.Scene]]:
-    """At rest by what holds them; loaded ones; in motion by model and by what holds them."""
+    """Return three groups of scenes: at rest with each support; loaded; moving, for each model with and without
+    supports.
+    """
     livers = models()
     livers["porohyperelastic"] = replace(livers["complete"], viscosity=None)
     solve = lj.Solve(steps=4, tolerance=1e-8)
@@ -192,13 +203,13 @@ def scenes() -> tuple[dict[str, lj.Scene], dict[str, lj.Scene], dict[str, lj.Sce
 
 
 def tip_of(scene: lj.Scene) -> int:
-    """The node that moves most."""
+    """Return the node with the largest displacement."""
     result = lj.simulate(scene).check()
     return int(np.linalg.norm(np.asarray(result.positions[-1] - scene.mesh.points), axis=1).argmax())
 
 
 def main() -> None:
-    """All rows, or those of the parts on the command line, and a figure of what each part changes."""
+    """Run all parts, or those on the command line, and plot what each support changes."""
     held, loaded, moved = scenes()
     asked = [part for part in ("rest", "unloaded", "motion", "clamps", "finer") if part in sys.argv[1:]]
     file = RESULTS / "liver_in_place.json"
@@ -223,7 +234,7 @@ def main() -> None:
 
 
 def shown(rows: dict[str, list[dict]]) -> None:
-    """The result, with its figure."""
+    """Write the results, with their figure."""
     rest = rows["rest"]
     figure, axes = plt.subplots(figsize=(6.5, 3), layout="constrained")
     names = [f"{r['name']}, {'linear' if r['order'] == 1 else 'quadratic'}" for r in rest]

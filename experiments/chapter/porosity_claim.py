@@ -1,9 +1,10 @@
-"""Does porosity prevent large deformations (chapter, section 5.4, iii)? Fig. 6's loading, with and without the sponge.
+"""Does porosity prevent large deformations (chapter, section 5.4, iii)? Fig. 6's loading with and without porosity.
 
-The liver phantom under a fifth of gravity: hyperelastic, viscous, porohyperelastic and complete. Then the sponge's K0,
-K_lim and permeability, the law's own bulk (`keep_bulk`), the rate of loading and the mesh are varied. Every run stands
-beside the same body without the sponge: the claim holds where the ratio of their largest displacements is below 1.
-All numbers are of linear tetrahedra, which are too stiff in bending: compare them with each other, not with a liver.
+The liver phantom under a fifth of gravity: hyperelastic, viscous, porohyperelastic and complete. Then K0, K_lim and
+permeability of the porous body, the law's own bulk (`keep_bulk`), the rate of loading and the mesh are varied. Every
+run is compared with the same body without porosity. The claim holds if the ratio of their largest displacements is
+below 1. All numbers are those of linear tetrahedra, which are too stiff in bending: compare them with each other, not
+with a liver.
 
     python -m experiments porosity_claim
 """
@@ -25,20 +26,23 @@ from liverjax.simulation import equations, run
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
 SECONDS, DT = either(1.8, 0.2), either(0.02, 0.05)
-#: What is varied in the complete model, one number after the other; K_lim must stay above K0.
+#: Parameters of the complete model that are varied, one at a time. K_lim must stay above K0.
 VARIED = {
     "bulk": either((200.0, 800.0, 1600.0, 2100.0), (1600.0,)),
     "limit_bulk": either((600.0, 8800.0, 35200.0), (35200.0,)),
     "permeability": either((0.0, 2e-8, 2e-7, 2e-6, 2e-4), (0.0,)),
 }
 RAMPS = either((0.3, 1.0, 3.0), (0.3,))
-#: The first peak of the viscous and of the complete body lies before this time [s]: enough for the finer mesh.
+#: The first peak of the viscous and of the complete body is before this time [s], so the finer mesh is run up to it
+#: only.
 FIRST_PEAK = either(0.8, 0.1)
 
 
 @jax.jit
 def one_step(scene: lj.Scene, state: Any, k: Any, part: Any) -> tuple:
-    """The state after step k with a part of gravity, the largest displacement, the least J and the status."""
+    """Return the state after step k with a fraction of gravity, the largest displacement, the smallest J and the
+    status.
+    """
     now = replace(scene, body=replace(scene.body, gravity=part * scene.body.gravity))
     result, state = run.simulate_part(now, state, k, 1)
     moved = jnp.linalg.norm(result.positions[0] - scene.mesh.points, axis=-1).max()
@@ -46,7 +50,7 @@ def one_step(scene: lj.Scene, state: Any, k: Any, part: Any) -> tuple:
 
 
 def path(scene: lj.Scene, ramp: float = 0.0, seconds: float = SECONDS) -> dict[str, Any]:
-    """Largest displacement over time; gravity acts at once, or grows over `ramp` seconds."""
+    """Return the largest displacement over time. Gravity acts at once, or grows linearly over `ramp` seconds."""
     scene = run.prepared(with_solve(scene, 1e4, DT, integrator="newmark"))
     begin = scene if ramp == 0 else lj.with_parameters(scene, {"body.gravity": jnp.zeros(3)})
     state, moved, least, codes = equations.initial_state(begin), [], [], []
@@ -66,7 +70,7 @@ def path(scene: lj.Scene, ramp: float = 0.0, seconds: float = SECONDS) -> dict[s
 
 
 def finer(scene: lj.Scene) -> lj.Scene:
-    """The scene with every tetrahedron cut into eight; between held nodes the new ones are held."""
+    """Return the scene with every tetrahedron cut into eight. New nodes between fixed nodes are fixed too."""
     n = scene.mesh.number_of_nodes
     points, tets, edges = refined(np.asarray(scene.mesh.points), np.asarray(scene.mesh.tetrahedra))
     held = [np.asarray(f.nodes) for f in scene.fixed]
@@ -75,7 +79,7 @@ def finer(scene: lj.Scene) -> lj.Scene:
 
 
 def beside(what: str, value: Any, complete: dict, without: dict) -> dict[str, Any]:
-    """A row: a run with the sponge, the run without it, and the ratio of their largest displacements."""
+    """Return a row with a run with porosity, the run without it, and the ratio of their largest displacements."""
     row = {k: v for k, v in complete.items() if k != "moved_m"}
     row |= {"without_m": without["largest_m"], "ratio": complete["largest_m"] / without["largest_m"]}
     row["converged"] = complete["converged"] and without["converged"]
@@ -84,7 +88,7 @@ def beside(what: str, value: Any, complete: dict, without: dict) -> dict[str, An
 
 
 def variations(scenes: dict[str, lj.Scene], viscous: dict) -> list[dict]:
-    """The complete model with other numbers, each beside the viscous model under the same load."""
+    """Vary parameters of the complete model. Each run is compared with the viscous model under the same load."""
     complete, rows = scenes["complete"], []
     for name, values in VARIED.items():
         for value in values:
@@ -102,7 +106,7 @@ def variations(scenes: dict[str, lj.Scene], viscous: dict) -> list[dict]:
 
 
 def main() -> None:
-    """Four models, what is varied, a figure."""
+    """Run four models and the variations, and plot a figure."""
     scenes = models()
     scenes["porohyperelastic"] = replace(scenes["complete"], viscosity=None)
     found = {name: path(scene) for name, scene in scenes.items()}
@@ -126,7 +130,9 @@ def main() -> None:
 
 
 def draw(found: dict, rows: list) -> plt.Figure:
-    """Largest displacement over time, and the ratio with over without the sponge in every row."""
+    """Plot the largest displacement over time, and the ratio of displacements with and without porosity for
+    every row.
+    """
     fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained", width_ratios=(1, 1.2))
     for (name, r), colour in zip(found.items(), COLOURS, strict=False):
         moved = 100 * np.array(r["moved_m"])
@@ -145,7 +151,7 @@ def draw(found: dict, rows: list) -> plt.Figure:
 
 
 def named(row: dict) -> str:
-    """What a row varies, in words."""
+    """Return a description of the varied parameter of a row."""
     value = row["value"]
     return {
         "Table 2": "complete / viscous, Table 2",

@@ -1,4 +1,4 @@
-"""Dynamic strain sweep of section 5.2 on the simulated rheometer: where does linearity end?
+"""Dynamic strain sweep of section 5.2 on the simulated rheometer: at which strain does linearity end?
 
 ``python -m experiments strain_sweep`` writes results/strain_sweep.json and .png. The chapter measured 1-2 % on liver.
 """
@@ -25,7 +25,9 @@ TABLE_2 = lj.Prony(ratios=jnp.array([0.235, 0.333]), relaxation_times=jnp.array(
 
 
 def main() -> None:
-    """Sweep every law at 1 Hz with the viscosity of Table 2; error against a run with twice the steps."""
+    """Sweep every law at 1 Hz with the viscosity of Table 2. The error is relative to a run with twice as many
+    steps.
+    """
     rig = torsion.make_rig()
     rows = []
     for name in either(list(STYLES), list(STYLES)[:2]):

@@ -1,13 +1,14 @@
-"""How often do 95 % intervals cover the truth, and does the model chosen predict the decade that was left out?
+"""Coverage of 95 % intervals, and prediction of a decade of frequency that the fit does not contain (synthetic data).
 
-1,000 synthetic sweeps with what laboratories have: noise of 2 %, an inertia that is subtracted 0.05 % wrong, a gap off
-by 50 um, a sample trimmed under a compression of 0 to 20 %. Truths are Prony modes, springpots, and a wide spectrum.
-For the intervals all sweeps are fitted side by side in NumPy, by the residuals, the iteration and the criterion of the
-program, to Prony modes and to a springpot beside a spring. Some are fitted by the program itself, with all its models;
-it chooses the models of the predictions too.
+1,000 synthetic sweeps contain typical errors of laboratories: noise of 2 %, an inertia correction that is 0.05 % wrong,
+a gap that is wrong by 50 um (standard deviations), and a sample trimmed under a compression of 0 to 20 %. The true
+materials are Prony modes, springpots, and a wide spectrum. For the intervals, all sweeps are fitted at once in NumPy,
+with the residuals, the iteration and the criterion of the program. The models there are Prony modes, and a springpot in
+parallel with a spring. Some sweeps are fitted by the program itself with all its models. The program also chooses the
+models of the predictions.
 
     python -m experiments coverage [--quick]
-    python -m experiments.identification.coverage program prediction    (these parts again, beside the others)
+    python -m experiments.identification.coverage program prediction    (runs only these parts again)
 """
 
 import json
@@ -32,10 +33,11 @@ from fitting.readers.frequency_sweep import Sweep
 from liverjax.core.plotting import BLUE, GREY, ORANGE
 
 SWEEPS, STARTS, NOISE = either(1000, 40), 6, 0.02
-#: Sweeps whose first decade is left out (of all the last one is), and those of each truth that the program itself fits.
+#: Number of sweeps whose first decade is left out (the last decade is left out of all), and number of sweeps of each
+#: kind that the program itself fits.
 FIRST, OWN = either(300, 40), either(200, 2)
 OMEGA = np.geomspace(0.1, 100, 31)
-#: Frequencies [rad/s] at which intervals of the fitted moduli are looked at, and the ones that are left out at the end.
+#: Frequencies [rad/s] at which the intervals of the fitted moduli are tested, and those of the last decade.
 LOOKED_AT, LAST_DECADE = np.geomspace(0.1, 100, 7), OMEGA > 10 * (1 + 1e-9)
 #: Plates [m], inertia of the instrument [N m s^2] and its error, error of the gap [m], largest compression.
 RADIUS, HEIGHT, INERTIA, INERTIA_OFF, GAP_OFF, COMPRESSION = 0.010, 0.004, 22.5e-6, 5e-4, 50e-6, 0.2
@@ -44,22 +46,25 @@ TRUTHS = ("prony", "fractional", "spectrum")
 
 
 class Truth(NamedTuple):
-    """Moduli of every sweep at any frequencies, and the modes where the truth has few."""
+    """Parameters of the true material of every sweep.
+
+    Prony modes and the wide spectrum are in `strengths` and `times`, a springpot is in `pot`.
+    """
 
     kind: np.ndarray  # (S,) index of TRUTHS
     strengths: np.ndarray  # (S, K) [Pa]; the first is the equilibrium modulus
     times: np.ndarray  # (S, K - 1) [s]
-    pot: np.ndarray  # (S, 2) springpot [Pa s^a] and exponent; 0 where there is none
+    pot: np.ndarray  # (S, 2) springpot [Pa s^a] and its exponent; 0 for materials without a springpot
 
     def moduli(self, omega: np.ndarray) -> np.ndarray:
-        """G* (S, n) [Pa]."""
+        """Return G* (S, n) [Pa]."""
         x = 1j * omega[:, None] * self.times[:, None, :]
         modes = self.strengths[:, :1] + np.sum(self.strengths[:, None, 1:] * x / (1 + x), axis=-1)
         return modes + self.pot[:, :1] * (1j * omega) ** self.pot[:, 1:]
 
 
 def truths(rng: np.random.Generator, count: int) -> Truth:
-    """Tissue-like materials: about 300 Pa at rest and some hundred Pa that relax."""
+    """Return tissue-like materials: about 300 Pa at rest, and some hundred Pa that relax."""
     kind = np.arange(count) % 3
     strengths, times, pot = np.zeros((count, 25)), np.ones((count, 24)), np.zeros((count, 2))
     strengths[:, 0] = rng.uniform(200, 600, count)
@@ -78,14 +83,14 @@ def truths(rng: np.random.Generator, count: int) -> Truth:
 
 
 def measured(rng: np.random.Generator, truth: Truth, disturbance: int) -> np.ndarray:
-    """G' then G'' (S, 2n) with noise and the disturbances up to this one."""
+    """Return G' then G'' (S, 2n) with noise and with all disturbances up to number `disturbance`."""
     G, count = truth.moduli(OMEGA), len(truth.kind)
     noise = 1 + NOISE * rng.standard_normal((2, *G.shape))
     inertia, gap, squeezed = rng.standard_normal((count, 1)), rng.standard_normal((count, 1)), rng.random((count, 1))
     scale = np.ones((count, 1))
     if disturbance >= 2:
         scale = scale * (1 + GAP_OFF / HEIGHT * gap)
-    if disturbance >= 3:  # trimmed to the plates when compressed: torque over twist is lambda^2 mu (neo-Hookean)
+    if disturbance >= 3:  # trimmed to the plates under compression: torque over twist is lambda^2 mu (neo-Hookean)
         scale = scale * (1 - COMPRESSION * squeezed) ** 2
     storage = scale * G.real
     if disturbance >= 1:
@@ -93,16 +98,16 @@ def measured(rng: np.random.Generator, truth: Truth, disturbance: int) -> np.nda
     return np.concatenate([storage * noise[0], scale * G.imag * noise[1]], axis=1)
 
 
-# -- models: Prony modes and springpots, of real arithmetic, so that complex steps differentiate them ------------------
+# -- models: Prony modes and springpots, in real arithmetic, so that complex steps can differentiate them --------------
 
 
 def prony(u: np.ndarray, omega: np.ndarray) -> np.ndarray:
-    """G' then G'' of u (…, 2N + 1)."""
+    """Return G' then G'' for the unknowns u (…, 2N + 1)."""
     return np.concatenate(generalised_maxwell.moduli(generalised_maxwell.natural(u), omega), axis=-1)
 
 
 def kelvin_voigt(u: np.ndarray, omega: np.ndarray) -> np.ndarray:
-    """A spring beside a springpot: u = log E, log V, logit of the exponent."""
+    """Return G' then G'' of a spring in parallel with a springpot, for u = log E, log V, logit of the exponent."""
     alpha = 1 / (1 + np.exp(-u[..., 2:3]))
     power = np.exp(u[..., 1:2] + alpha * np.log(omega))
     angle = 0.5 * np.pi * alpha
@@ -114,16 +119,19 @@ MODELS["fractional Kelvin-Voigt"] = (3, kelvin_voigt)
 
 
 class Fits(NamedTuple):
-    """One model fitted to every sweep."""
+    """Results of one model fitted to every sweep."""
 
     u: np.ndarray  # (S, P)
-    jacobian: np.ndarray  # (S, m, P) of relative residuals
+    jacobian: np.ndarray  # (S, m, P) derivatives of the relative residuals
     square: np.ndarray  # (S,) sum of squares
     converged: np.ndarray  # (S,)
 
 
 def first_places(name: str, data: np.ndarray, omega: np.ndarray) -> np.ndarray:
-    """Starts (S, STARTS, P): one for sweeps of one level, with times spread over the band."""
+    """Return starting points (S, STARTS, P).
+
+    The first has relaxation times spread over the band, or the first of several exponents.
+    """
     rng, half = np.random.default_rng(1), data.shape[1] // 2
     top, low = data[:, half - 1] * 1.05, data[:, 0] * 0.95
     if name.startswith("frac"):
@@ -145,7 +153,10 @@ def first_places(name: str, data: np.ndarray, omega: np.ndarray) -> np.ndarray:
 
 
 def fitted(name: str, data: np.ndarray, omega: np.ndarray) -> Fits:
-    """Levenberg-Marquardt of the program for all sweeps and starts at once; the best minimum of each sweep."""
+    """Fit all sweeps from all starting points at once by the program's Levenberg-Marquardt method.
+
+    Returns the best minimum of each sweep.
+    """
     size, model = MODELS[name]
     starts = first_places(name, data, omega).reshape(-1, size)
     scales = [np.concatenate(Sweep(omega, *np.split(row, 2)).deviations) for row in data]
@@ -171,9 +182,10 @@ def fitted(name: str, data: np.ndarray, omega: np.ndarray) -> Fits:
 
 
 def intervals(name: str, fits: Fits, of: Callable, scale_error: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (S, K) of u and the halves of their 95 % intervals, as the program reports them (delta method, t).
+    """Return functions (S, K) of u and half the widths of their 95 % intervals, as the program reports them.
 
-    `scale_error` is the relative error of the gap where it is known; it is one of every modulus (--gap-error).
+    The intervals use the delta method and Student's t. `scale_error` is the relative error of the gap if it is known
+    (--gap-error). It changes every modulus by the same relative amount.
     """
     values, slope = host.with_jacobian(of, fits.u)
     m, size = fits.jacobian.shape[1:]
@@ -186,25 +198,30 @@ def intervals(name: str, fits: Fits, of: Callable, scale_error: float = 0.0) -> 
 
 
 def criterion(name: str, fits: Fits, count: int) -> np.ndarray:
-    """Of the program; a model with a number that the data leave free takes no part, where another does not."""
+    """Return the program's information criterion.
+
+    A model with a parameter that the data do not determine is taken only if all models have one.
+    """
     size, _ = MODELS[name]
     found = count * np.log(fits.square / count) + size * np.log(count)
     own = generalised_maxwell.natural if name.startswith("prony") else None
     vector = (lambda u: np.concatenate([own(u).ratios, own(u).relaxation_times], axis=-1)) if own else np.exp
     values, half = intervals(name, fits, vector)
-    free = np.any(half > np.abs(values), axis=1)  # a standard error of half the value, twice
+    free = np.any(half > np.abs(values), axis=1)  # half the width is about two standard errors
     return found + np.where(free | ~fits.converged, 1e6, 0.0)
 
 
 def ranked(data: np.ndarray, omega: np.ndarray) -> tuple[list[str], dict[str, Fits], np.ndarray]:
-    """Names, fits of each model, and places of the models in the order of the criterion (S, M)."""
+    """Return the names, the fits of each model, and the models in the order of the criterion (S, M)."""
     fits = {name: fitted(name, data, omega) for name in MODELS}
     table = np.stack([criterion(name, f, data.shape[1]) for name, f in fits.items()], axis=1)
     return list(MODELS), fits, np.argsort(table, axis=1)
 
 
 def study(disturbance: int, truth: Truth, rng: np.random.Generator) -> dict:
-    """Coverage of the chosen model's intervals for the moduli, and of the parameters where it has the truth's form."""
+    """Return the coverage of the moduli by the chosen model's intervals, and of the parameters if the chosen model is
+    the true one.
+    """
     data = measured(rng, truth, disturbance)
     names, fits, order = ranked(data, OMEGA)
     true = truth.moduli(LOOKED_AT)
@@ -229,7 +246,9 @@ def study(disturbance: int, truth: Truth, rng: np.random.Generator) -> dict:
 
 
 def parameters(truth: Truth, names: list[str], fits: dict[str, Fits], order: np.ndarray) -> dict[str, float]:
-    """Coverage of G0, ratios and times (two modes), and of E, V and exponent (springpot), where these were chosen."""
+    """Return the coverage of G0, ratios and times (two modes), and of E, V and exponent (springpot), for chosen
+    models.
+    """
 
     def vector(u: np.ndarray) -> np.ndarray:
         found = generalised_maxwell.natural(u)
@@ -255,9 +274,10 @@ def parameters(truth: Truth, names: list[str], fits: dict[str, Fits], order: np.
 
 
 def by_the_program(truth: Truth) -> dict:
-    """Coverage of the moduli by the program's choices on sweeps with noise alone.
+    """Return the coverage of the moduli by the program's choices, for sweeps with noise alone.
 
-    N modes, a spectrum, the model chosen from all with its own errors, and with the choice among them, as reported.
+    There are four choices: N modes; a spectrum; the best of all models with its own errors; and the best of all models
+    with the errors of the choice included, as reported.
     """
     data, out = measured(np.random.default_rng(10), truth, 0), {}
     for k, kind in enumerate(TRUTHS):
@@ -283,7 +303,7 @@ def by_the_program(truth: Truth) -> dict:
 
 
 def beyond(fit: Fit, omega: np.ndarray) -> np.ndarray:
-    """G* (n,) [Pa] of a fit at frequencies outside its band, by its own model."""
+    """Return G* (n,) [Pa] of a fit at frequencies outside its band, from its own model."""
     if fit.kind.moduli is not None:
         storage, loss = fit.kind.moduli(fit.solution.u, omega)
     else:
@@ -292,17 +312,20 @@ def beyond(fit: Fit, omega: np.ndarray) -> np.ndarray:
 
 
 class Predicted(NamedTuple):
-    """Models fitted to two decades, in the third: root mean squares of ln(G* / true), of G' and G''."""
+    """Errors of models that are fitted to two decades, in the third decade.
+
+    An error is the root mean square of ln(G' / true) and ln(G'' / true).
+    """
 
     chosen: float
-    second: float  # the next by the criterion, whatever it is
-    rival: float  # the next that does not contain the chosen one as a special case
+    second: float  # the second-best model by the criterion
+    rival: float  # the best model that does not contain the chosen one as a special case
     decided: bool  # the criterion is strong evidence against the rival
-    best: float  # the closest of all models
+    best: float  # the smallest error of all models
 
 
 def predicted(truth: Truth, data: np.ndarray, k: int, kept: np.ndarray) -> Predicted:
-    """The choice of the program (`--model auto`) for sweep k without the frequencies that are not `kept`."""
+    """Let the program choose a model (`--model auto`) for sweep k, from the frequencies that are `kept`."""
     sweep, out = Sweep(OMEGA[kept], *(half[kept] for half in np.split(data[k], 2))), OMEGA[~kept]
     true = Truth(*(field[k : k + 1] for field in truth)).moduli(out)[0]
     dense = generalised_maxwell.spectrum(sweep)
@@ -323,7 +346,7 @@ def predicted(truth: Truth, data: np.ndarray, k: int, kept: np.ndarray) -> Predi
 
 
 def prediction(truth: Truth, rng: np.random.Generator) -> dict:
-    """Does the model chosen on two decades predict the last or the first one better than the next model?"""
+    """Compare predictions of the last or first decade by the model chosen on the other two, and by the next model."""
     data, out = measured(rng, truth, 0), {}
     for name, left_out, count in (("last", LAST_DECADE, len(data)), ("first", OMEGA < 1 - 1e-9, FIRST)):
         rows, kinds = [], truth.kind[:count]
@@ -347,7 +370,7 @@ def prediction(truth: Truth, rng: np.random.Generator) -> dict:
 
 
 def figure(rows: list[dict]) -> plt.Figure:
-    """Coverage by disturbance."""
+    """Plot the coverage for each disturbance."""
     fig, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharey=True)
     x = np.arange(len(rows))
     for kind, colour in zip(TRUTHS, (BLUE, ORANGE, GREY), strict=True):
@@ -365,7 +388,7 @@ def figure(rows: list[dict]) -> plt.Figure:
 
 
 def intervals_of(truth: Truth) -> list[dict]:
-    """A row for each disturbance."""
+    """Return one row for each disturbance."""
     rows = []
     for k in range(len(DISTURBANCES)):
         rows.append(study(k, truth, np.random.default_rng(10 + k)))
@@ -381,7 +404,7 @@ PARTS: dict[str, Callable[[Truth], object]] = {
 
 
 def main(parts: list[str] | None = None) -> None:
-    """Run all, or some parts beside the others' results."""
+    """Run all parts, or some parts and keep the results of the others."""
     truth = truths(np.random.default_rng(0), SWEEPS)
     content = json.loads((RESULTS / "coverage.json").read_text()) if parts else {"sweeps": SWEEPS, "noise": NOISE}
     seconds = content.setdefault("seconds_of_parts", {})

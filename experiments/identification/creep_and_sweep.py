@@ -1,8 +1,9 @@
-"""How much narrower do the intervals become if a creep test, or a pull, is fitted together with a sweep? (synthetic)
+"""Intervals of a sweep alone, and of a sweep fitted together with a creep or tension test (synthetic data).
 
-A soft tissue of three modes (30, 1 and 0.05 s). The sweep sees 0.1 to 10 Hz, so the slow mode lies outside its band; a
-creep test of 120 s sees it, but neither the fast one nor, through one number, G0 so well. A pull held for 30 s is the
-third. Noise: 2 % of every reading. Data are made with half the time step of the fit and on a finer mesh.
+The material is a soft tissue with three modes (30, 1 and 0.05 s). The sweep covers 0.1 to 10 Hz, so the slow mode is
+outside its band. A creep test of 120 s shows the slow mode. It does not show the fast mode, and determines G0 less
+well, because it gives only one number for it. The third test is a stretch held for 30 s. Noise is 2 % of every reading.
+The data are computed with half the time step of the fit and on a finer mesh.
 
     python -m experiments creep_and_sweep [--quick]
 """
@@ -23,12 +24,12 @@ from liverjax.core.plotting import COLOURS
 TRUE = generalised_maxwell.Maxwell(jnp.asarray(770.0), jnp.array([0.2, 0.2, 0.25]), jnp.array([30.0, 1.0, 0.05]))
 LAW = lj.laws.NeoHookean(mu=1.0, bulk=20.0)
 RADIUS, HEIGHT, NOISE = 0.01, 0.01, 0.02
-#: Of the data: cells half as long at the rims, that grow more slowly, and a rounder polygon.
+#: Mesh of the data: cells half as large at the rims, with slower growth, and a polygon with more corners.
 FINE = glued.Cells(rim=0.02, edge=0.01, growth=0.5, corners=32)
 
 
 def sweep(rng: np.random.Generator) -> joint.Test:
-    """Seventeen frequencies."""
+    """A sweep with seventeen frequencies."""
     omega = 2 * np.pi * np.logspace(-1, 1, 17)
     pure = [np.asarray(m) for m in generalised_maxwell.moduli(TRUE, jnp.asarray(omega))]
     noisy = [m * (1 + NOISE * rng.normal(size=m.shape)) for m in pure]
@@ -36,20 +37,20 @@ def sweep(rng: np.random.Generator) -> joint.Test:
 
 
 def readings(fine: glued.Rig, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """What a rig of half the time step shows at every second step, with noise, and its standard deviation."""
+    """Return noisy readings and their standard deviations: every second step of a rig with half the time step."""
     viscosity = lj.Prony(ratios=TRUE.ratios, relaxation_times=TRUE.relaxation_times)
     pure = np.asarray(glued.read(fine, lj.laws.scaled(LAW, TRUE.shear_modulus), viscosity)[0])[1::2]
     return pure + NOISE * abs(pure) * rng.normal(size=pure.shape), NOISE * abs(pure)
 
 
 def creep(rng: np.random.Generator, seconds: float, dt: float = 1.0) -> joint.Test:
-    """A pull of 20 Pa."""
+    """A creep test with a tensile stress of 20 Pa."""
     made = [glued.creep(RADIUS, HEIGHT, h, round(seconds / h), 20.0, c) for h, c in ((dt, None), (dt / 2, FINE))]
     return joint.through("creep", made[0], *readings(made[1], rng))
 
 
 def pull(rng: np.random.Generator, seconds: float, dt: float = 0.5) -> joint.Test:
-    """5 % within a step, then held."""
+    """A tension test: 5 % within one step, then constant."""
     made = [
         glued.tension(RADIUS, HEIGHT, h, 0.05 * np.minimum(1, h / dt * np.arange(1, round(seconds / h) + 1)), c)
         for h, c in ((dt, None), (dt / 2, FINE))
@@ -58,7 +59,7 @@ def pull(rng: np.random.Generator, seconds: float, dt: float = 0.5) -> joint.Tes
 
 
 def main(quick: bool) -> None:
-    """A row a choice of tests; figure of intervals."""
+    """Fit each combination of tests, and plot the intervals."""
     rng = np.random.default_rng(0)
     tests = {"sweep": sweep(rng), "creep": creep(rng, 10 if quick else 120), "pull": pull(rng, 5 if quick else 30)}
     start = generalised_maxwell.Maxwell(jnp.asarray(700.0), jnp.array([0.25, 0.2, 0.2]), jnp.array([20.0, 1.5, 0.08]))
@@ -85,7 +86,7 @@ def main(quick: bool) -> None:
 
 
 def figure(rows: list[dict], true: np.ndarray) -> plt.Figure:
-    """Standard errors over the true values; what no test determines is cut off at 1."""
+    """Plot standard errors over true values. Errors of undetermined parameters are cut off at 1."""
     fig, axis = plt.subplots(figsize=(8, 3.4), layout="constrained")
     shown = [r for r in rows if r["tests"] != "creep"]
     for k, (row, colour) in enumerate(zip(shown, COLOURS, strict=False)):

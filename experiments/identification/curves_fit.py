@@ -1,7 +1,7 @@
-"""Which laws follow tension, compression and shear at once: fits of every law to brain and to rubber.
+"""Fits of every law to brain and to rubber: which laws describe tension, compression and shear at once?
 
 ``python -m experiments curves_fit`` writes results/curves_brain.json, .png and curves_rubber.json, .png. Liver is not
-in these data: the chapter's liver curves exist in print only as pictures.
+in these data, because the chapter's liver curves are published only as pictures.
 """
 
 from experiments.common import ROOT, either, save
@@ -16,7 +16,7 @@ LAWS = either(("all",), ("neo_hookean", "veronda_westmann"))
 
 
 def main() -> None:
-    """Both materials, every law."""
+    """Fit every law to both materials."""
     for name, file in (("brain", "brain_cortex_curves.csv"), ("rubber", "rubber_curves.csv")):
         found, _ = curves.read_curves([DATA / file])
         candidates = [candidate for law in LAWS for candidate in hyperelastic.candidates(law)]

@@ -1,9 +1,10 @@
-"""Four stiff cylinders in a soft plate, found from its waves (synthetic; the plate of a published benchmark).
+"""Four stiff cylinders in a soft plate, reconstructed from waves (synthetic; the plate of a published benchmark).
 
-80 x 100 x 10 mm of 3 kPa, cylinders of 10 kPa with radii 10, 5, 3 and 2 mm along the short side, 1 Pa s, 50 to 100 Hz.
-Shear waves of the same amplitude enter at two neighbouring sides; the motion stays in the plane. The data are the exact
-series of an unbounded medium (`experiments.sources.cylinders_in_waves`), so no wave comes back from the other sides.
-The voxels have 2 mm (the published ones 1 mm), with noise of 2 % of the motion's root mean square.
+The plate of 80 x 100 x 10 mm has 3 kPa, and cylinders of 10 kPa with radii 10, 5, 3 and 2 mm along the short side. The
+viscosity is 1 Pa s, the frequencies are 50 to 100 Hz. Shear waves of the same amplitude enter at two neighbouring
+sides; the motion stays in the plane. The data are the exact series of an unbounded medium
+(`experiments.sources.cylinders_in_waves`), so the other sides do not reflect waves. The voxels have 2 mm (the published
+ones 1 mm), with noise of 2 % of the root mean square of the motion.
 
 ``python -m experiments elastography`` (5 minutes) writes results/elastography.json and elastography.png.
 """
@@ -25,34 +26,35 @@ CYLINDERS = (((0.025, 0.07), 0.010), ((0.055, 0.07), 0.005), ((0.025, 0.03), 0.0
 HERTZ = np.array(either([50.0, 75.0, 100.0], [100.0]))
 VOXEL, NOISE = 2e-3, 0.02
 VOXELS = either((39, 49, 5), (19, 25, 5))
-#: Ends [m] of the distances from the nearest edge for which intervals are looked at, inside negative.
+#: Limits [m] of the classes of distance from the nearest edge, for the coverage; negative inside a cylinder.
 ENDS = (-np.inf, -4e-3, -2e-3, 0.0, 2e-3, 4e-3, 8e-3, np.inf)
 
 
 def stiff_part(xy: np.ndarray) -> np.ndarray:
-    """1 in the cylinders and 0 outside, of points (..., 2) [m]."""
+    """Return 1 in the cylinders and 0 outside, for points (..., 2) [m]."""
     return np.sum([np.hypot(*np.moveaxis(xy - np.array(c), -1, 0)) < r for c, r in CYLINDERS], axis=0).astype(float)
 
 
 def motion(points: np.ndarray) -> np.ndarray:
-    """The motion (F, n, 3) at points (n, 2) [m]."""
+    """Return the motion (F, n, 3) at points (n, 2) [m]."""
     out = np.zeros((len(HERTZ), len(points), 3), complex)
     for f, omega in enumerate(2 * np.pi * HERTZ):
         loss = 1j * omega * VISCOSITY
         medium = cylinders_in_waves.Medium(SOFT + loss, STIFF + loss, omega, DENSITY)
-        # From y = 0, and from the largest x backwards.
+        # One wave starts at y = 0, the other at the largest x in the direction -x.
         waves = [(np.pi / 2, 1e-5), (np.pi, 1e-5 * np.exp(-1j * medium.number(True) * SIZE[0]))]
         out[f, :, :2] = cylinders_in_waves.motion(points, list(CYLINDERS), medium, waves)
     return out
 
 
 def measured() -> tuple[WaveField, np.ndarray]:
-    """Voxels with noise, and the part of each voxel (nx, ny, nz) that is stiff."""
+    """Return the noisy voxels, and the stiff fraction of each voxel (nx, ny, nz)."""
     x, y = (VOXEL / 2 + 2e-4 + VOXEL * np.arange(n) for n in VOXELS[:2])
     points = np.stack(np.meshgrid(x, y, [SIZE[2] / 2], indexing="ij"), axis=-1)
     flat = motion(points[..., :2].reshape(-1, 2)).reshape(len(HERTZ), *VOXELS[:2], 1, 3)
     U = np.repeat(flat, VOXELS[2], axis=3)
-    sd = NOISE * np.sqrt(np.mean(np.sum(np.abs(U) ** 2, axis=-1), axis=(1, 2, 3)) / 4)  # two components of two parts
+    # two components, each with real and imaginary part
+    sd = NOISE * np.sqrt(np.mean(np.sum(np.abs(U) ** 2, axis=-1), axis=(1, 2, 3)) / 4)
     rng = np.random.default_rng(3)
     noise = rng.normal(size=U.shape) + 1j * rng.normal(size=U.shape)
     number = np.ones(VOXELS, int)
@@ -75,8 +77,10 @@ def measured() -> tuple[WaveField, np.ndarray]:
 
 
 def held(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the true storage and loss modulus are in the 90 % interval (2, F, known voxels), and those voxels' (n, 2)
-    places [m]."""
+    """Test whether the true storage and loss modulus are in the 90 % interval.
+
+    Returns the results (2, F, n) of the n voxels with a modulus, and the positions (n, 2) [m] of these voxels.
+    """
     sds, out = [maps.at_voxels(organ, own) for own in drawn.sd], []
     known = np.isfinite(sds[0])
     for f, hertz in enumerate(HERTZ):
@@ -89,8 +93,11 @@ def held(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.ndarr
 
 
 def covered(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.ndarray) -> dict:
-    """Part of the voxels whose true modulus is in the 90 % interval: of all at every frequency, and by the distance
-    from the nearest edge of all frequencies."""
+    """Return the fraction of voxels whose true modulus is in the 90 % interval.
+
+    It is given for all voxels at every frequency, and for classes of distance from the nearest edge over all
+    frequencies.
+    """
     inside, places = held(organ, drawn, part)
     distance = np.min([np.hypot(*(places - np.array(c)).T) - r for c, r in CYLINDERS], axis=0)
     rows = []
@@ -103,7 +110,7 @@ def covered(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.nd
 
 
 def rows_of(organ, found, drawn, usual) -> list[dict]:
-    """A row a cylinder and one for the plate: by regions, by the map, by direct inversion."""
+    """Return one row for each cylinder and one for the plate: results of regions, map and direct inversion."""
     rows, every = [], [maps.at_voxels(organ, own) for own in drawn.sd]
     for k, label in enumerate(found.labels):
         place = organ.field.labels == label
@@ -128,7 +135,7 @@ def rows_of(organ, found, drawn, usual) -> list[dict]:
 
 
 def main() -> None:
-    """Make the data, fit them, and write what came out."""
+    """Compute the data, fit them, and write the results."""
     begin = time.perf_counter()
     field, part = measured()
     made = time.perf_counter() - begin

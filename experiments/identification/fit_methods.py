@@ -1,7 +1,8 @@
-"""Error of the parameters against run time: closed form or torsion simulation, optimizer, recursion, steps a cycle.
+"""Error of the parameters against run time for several fitting methods.
 
-The porcine liver's sweep is computed from a model, so its parameters are known; with 1 % of (synthetic) noise on it the
-noise, not the method, is the error of every way but the coarsest.
+Compared are closed form and torsion simulation, optimizer, recursion (update of the viscous memory from step to step),
+and steps per cycle. The porcine liver's sweep is computed from a model, so its true parameters are known. With 1 % of
+synthetic noise, the noise dominates the error of every method except the coarsest.
 
     python -m experiments fit_methods [--quick]
 """
@@ -20,7 +21,7 @@ TRUE = np.array([770.0, 0.235, 0.333, 0.27, 0.03])
 
 
 def row(name: str, found: viscoelastic.Fit) -> dict:
-    """Mean relative error of G0, ratios and times, and what the fit took."""
+    """Return the mean and largest relative error of G0, ratios and times, and the run time of the fit."""
     off = found.uncertainty.values / TRUE - 1
     return {
         "name": name,
@@ -33,7 +34,7 @@ def row(name: str, found: viscoelastic.Fit) -> dict:
 
 
 def ways(sweep: Sweep, quick: bool) -> list[dict]:
-    """A row a way."""
+    """Return one row for each method."""
     closed = viscoelastic.closed_form(sweep, 2)
     rows = [
         row("closed form, Levenberg-Marquardt", closed),
@@ -52,7 +53,7 @@ MARKERS = {"closed form": "D", "torsion, exponential": "o", "torsion, chapter": 
 
 
 def figure(tables: dict[str, list[dict]]) -> plt.Figure:
-    """Error against run time; beside a point the steps a cycle, or the method."""
+    """Plot error against run time. Labels at the points show the steps per cycle, or the method."""
     fig, axes = plt.subplots(figsize=(7.5, 4), layout="constrained")
     for (data, rows), colour in zip(tables.items(), (BLUE, ORANGE), strict=True):
         for way, marker in MARKERS.items():
@@ -74,7 +75,7 @@ def figure(tables: dict[str, list[dict]]) -> plt.Figure:
 
 
 def main(quick: bool) -> None:
-    """Exact and noisy data."""
+    """Fit exact and noisy data."""
     exact = read_sweep(DATA)
     rng = np.random.default_rng(0)
     noisy = exact._replace(

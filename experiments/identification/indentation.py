@@ -1,10 +1,10 @@
-"""Indentation of a bonded layer: what a half-space and the published series make of it, and how well fits do.
+"""Indentation of a bonded layer: errors of the half-space and of a published series, and accuracy of fits.
 
 The force of a sphere on a layer comes from the integral equation of the contact (`fitting.rigs.thin_layer`). A fit that
-takes the layer for a half-space (Hertz) finds a modulus that is too high by the factor shown; the series of Dimitriadis
-et al. 2002 (Biophys. J. 82:2798, equation 12, of an incompressible layer) holds for small contacts only. Then curves
-with 5 % of noise are fitted, modulus and contact point together: median errors, how often 95 % intervals cover, and
-seconds a curve.
+assumes a half-space (Hertz) gives a modulus that is too high by the factor shown. The series of Dimitriadis et al. 2002
+(Biophys. J. 82:2798, equation 12, for an incompressible layer) is valid for small contacts only. Then curves with 5 %
+of noise are fitted for modulus and contact point. Results are median errors, coverage of the 95 % intervals, and
+seconds per curve.
 
 ``python -m experiments indentation`` (a minute) writes results/indentation.json.
 """
@@ -19,19 +19,19 @@ from fitting.rigs.thin_layer import Indenter, Layer, dimitriadis
 from liverjax.core.plotting import COLOURS
 
 RADIUS, MODULUS, DEEPEST = 5e-3, 2400.0, 5e-4
-#: Thickness over the contact radius of the half-space, sqrt(R d).
+#: Thickness divided by the contact radius of the half-space, sqrt(R d).
 THICKNESSES = (0.5, 1.0, 2.0, 4.0, 10.0)
 POISSONS = (0.3, 0.4, 0.5)
 CURVES, NOISE = either(1000, 100), 0.05
 
 
 def hertz(depth: np.ndarray, poisson: float) -> np.ndarray:
-    """Force per unit modulus [N/Pa] of a half-space."""
+    """Return the force per unit modulus [N/Pa] of a half-space."""
     return 4 / 3 / (1 - poisson**2) * np.sqrt(RADIUS) * depth**1.5
 
 
 def thin_layers() -> list[dict]:
-    """Modulus of a half-space over the true one at the deepest point, and the error of the series."""
+    """Return the modulus of a half-space over the true one at the deepest point, and the error of the series."""
     rows = []
     for poisson in POISSONS:
         for ratio in THICKNESSES:
@@ -46,7 +46,7 @@ def thin_layers() -> list[dict]:
 
 
 def fits() -> list[dict]:
-    """Modulus and contact point of noisy curves of three layers."""
+    """Fit modulus and contact point to noisy curves of three layers."""
     start, rows = 1e-4, []
     depth = np.linspace(0.0, DEEPEST + start, 80)
     for ratio in (1.0, 2.0, 10.0):
@@ -69,7 +69,7 @@ def fits() -> list[dict]:
 
 
 def main() -> None:
-    """Both tables and a figure of the factors."""
+    """Compute both tables and plot the factors."""
     layers, noisy = thin_layers(), fits()
     figure, axes = plt.subplots(figsize=(5, 3.2), layout="constrained")
     for poisson, colour in zip(POISSONS, COLOURS, strict=False):

@@ -1,11 +1,13 @@
-"""A stiff lesion of 5 cm in the liver phantom, found from noisy displacements of its surface (synthetic data).
+"""A stiff lesion of 5 cm in the liver phantom, reconstructed from noisy displacements of its surface (synthetic data).
 
-The liver is held from below and hangs in three positions under 3 m/s^2: its neighbours carry the rest of its weight,
-as the chapter's 2 m/s^2 has it, and under more the quadratic elements at the edge of what is held turn inside out. The
-truth is computed with 42,808 quadratic tetrahedra (every one of the phantom's cut into eight). Found are a smooth map
-of the shear modulus with its uncertainty (`fitting.fits.field`), with the phantom's 5,351 linear ones, and from it a
-sphere (`fitting.fits.inclusion`), with the 5,351 made quadratic. No noise, 1 % and 5 % of the largest displacement;
-what a mesh misses for a uniform body beside the finest counts as noise.
+The liver is fixed at its lower surface. Gravity of 3 m/s^2 acts in three directions. The load is below full gravity,
+because neighbouring organs carry the rest of the weight (the chapter uses 2 m/s^2). With more, the quadratic elements
+at the edge of the fixed surface invert. The true displacements are computed with 42,808 quadratic tetrahedra (each
+tetrahedron of the phantom cut into eight). From them, two things are estimated. The first is a smooth map of the shear
+modulus with its uncertainty (`fitting.fits.field`), on the phantom's 5,351 linear tetrahedra. The second is a sphere
+(`fitting.fits.inclusion`), with the map as starting point, on the 5,351 tetrahedra made quadratic. The noise is 0, 1 %
+and 5 % of the largest displacement. The mesh error counts as noise. It is the difference of a uniform body from the
+finest mesh.
 
     python -m experiments lesion [--quick]
 """
@@ -34,7 +36,9 @@ _EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
 def refined(points: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every tetrahedron cut into eight (Bey 1995); the new nodes' edges (n, 2)."""
+    """Return the mesh with every tetrahedron cut into eight (Bey 1995), and the edges (n, 2) that hold the new
+    nodes.
+    """
     ends = np.sort(np.stack([tets[:, p] for p in _EDGES], axis=1), axis=-1)
     edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
     a, b, c, d = tets.T
@@ -47,7 +51,7 @@ def refined(points: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def bodies(levels: int) -> tuple[list[lj.TetMesh], np.ndarray]:
-    """The phantom and finer meshes of it with the node set `held`, and the nodes whose displacement is measured."""
+    """Return the phantom and finer meshes with the node set `held`, and the nodes whose displacement is measured."""
     phantom = lj.read_mesh(MESH)
     X = np.asarray(phantom.points)
     surface = np.unique(boundary_triangles(phantom))
@@ -63,7 +67,7 @@ def bodies(levels: int) -> tuple[list[lj.TetMesh], np.ndarray]:
 
 
 def hung(mesh: lj.TetMesh, gravity: list, mu: np.ndarray | float) -> lj.Scene:
-    """The liver in one position; linear elements with volumes at the nodes."""
+    """The liver under gravity in one direction; linear elements with volume changes averaged at the nodes."""
     volumetric = "nodal" if mesh.order == 1 else "element"
     return lj.Scene(
         mesh=mesh,
@@ -75,19 +79,21 @@ def hung(mesh: lj.TetMesh, gravity: list, mu: np.ndarray | float) -> lj.Scene:
 
 
 def truth(mesh: lj.TetMesh) -> np.ndarray:
-    """Shear modulus of every element (E,), of quadratic ones at every point (4, E)."""
+    """Return the true shear modulus of every element (E,), or at every integration point (4, E) of quadratic
+    elements.
+    """
     corners = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)]
     points = corners.mean(axis=1) if mesh.order == 1 else np.einsum("kq,eki->qei", basis(mesh.order).L, corners)
     return np.where(np.linalg.norm(points - CENTRE, axis=-1) < RADIUS, STIFFER * MU, MU)
 
 
 def displaced(scene: lj.Scene, nodes: np.ndarray) -> np.ndarray:
-    """Displacements (n, 3) [m] of some nodes."""
+    """Return the displacements (n, 3) [m] of some nodes."""
     return np.asarray(lj.simulate(scene).check().positions[-1] - scene.mesh.points)[nodes]
 
 
 def problem_of(mesh: lj.TetMesh, seen: np.ndarray, u: list, sd: list, noise: float, seed: int) -> scene_numbers.Problem:
-    """What a user has: scenes and CSV files. Fits begin at 1.3 times the true background."""
+    """Return what a user has: scenes and CSV files. Fits begin at 1.3 times the true background."""
     rng, X = np.random.default_rng(seed), np.asarray(mesh.points)
     made, data = [], []
     for gravity, one, model in zip(GRAVITY, u, sd, strict=True):
@@ -103,7 +109,7 @@ def problem_of(mesh: lj.TetMesh, seen: np.ndarray, u: list, sd: list, noise: flo
 
 
 def mapped(problem: scene_numbers.Problem, noise: float, length: float, iterations: int) -> tuple[dict, field.Field]:
-    """The map: one row."""
+    """Estimate the map and return its results."""
     mesh = problem.scenes[0].mesh
     found = field.estimate(problem, "law.mu", length=length, max_iterations=iterations)
     volumes, log_truth = np.asarray(mesh.volumes), np.log(truth(mesh))
@@ -128,7 +134,7 @@ def mapped(problem: scene_numbers.Problem, noise: float, length: float, iteratio
 
 
 def sphere_in(problem: scene_numbers.Problem, start: np.ndarray) -> dict:
-    """The sphere: one row."""
+    """Estimate the sphere and return its results."""
     found = inclusion.estimate(problem, "law.mu", start)
     values = dict(zip(found.names, found.values.tolist(), strict=True))
     return {
@@ -147,13 +153,15 @@ def sphere_in(problem: scene_numbers.Problem, start: np.ndarray) -> dict:
 
 
 def missed(mesh: lj.TetMesh, seen: np.ndarray, uniform: list) -> list[float]:
-    """Root mean square difference [m] of a mesh from the finest, for the uniform body in each position."""
+    """Return the root mean square difference [m] of a mesh from the finest one, for the uniform body under each
+    load.
+    """
     apart = [displaced(hung(mesh, g, MU), seen) - u for g, u in zip(GRAVITY, uniform, strict=True)]
     return [float(np.sqrt(np.mean(a**2))) for a in apart]
 
 
 def main(quick: bool) -> None:
-    """Rows, table and pictures."""
+    """Run all cases, and write table and pictures."""
     begin = time.perf_counter()
     (coarse, fine), seen = bodies(1)
     truest, quadratic = lj.quadratic(fine), lj.quadratic(coarse)
@@ -184,7 +192,7 @@ def main(quick: bool) -> None:
 
 
 def circle(axis: plt.Axes, centre: np.ndarray, radius: float, style: str, colour: str) -> None:
-    """A sphere's outline on the section through the lesion's middle, if it meets that."""
+    """Plot the outline of a sphere on the section through the middle of the lesion, if the sphere meets the section."""
     squared = radius**2 - (centre[2] - CENTRE[2]) ** 2
     turn = np.linspace(0, 2 * np.pi, 100)
     outline = centre[:2, None] + np.sqrt(max(squared, 0.0)) * np.array([np.cos(turn), np.sin(turn)])
@@ -192,7 +200,7 @@ def circle(axis: plt.Axes, centre: np.ndarray, radius: float, style: str, colour
 
 
 def figure(mesh: lj.TetMesh, found: dict[float, field.Field], spheres: dict[float, dict]) -> plt.Figure:
-    """Sections through the lesion's middle: truth, maps and their uncertainty, outlines of the spheres."""
+    """Plot sections through the middle of the lesion: truth, maps and their uncertainty, outlines of the spheres."""
     fig, axes = plt.subplots(2, 4, figsize=(11, 3.8), layout="constrained", sharex=True, sharey=True)
     body, extent = section(mesh, np.full(mesh.number_of_nodes, MU), CENTRE, 2)
     x, y = np.meshgrid(*(np.linspace(extent[2 * k], extent[2 * k + 1], body.shape[1 - k]) / 100 for k in (0, 1)))

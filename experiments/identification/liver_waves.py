@@ -1,9 +1,10 @@
-"""A stiff lesion in the liver phantom, found from the waves of an external driver (synthetic).
+"""A stiff lesion in the liver phantom, reconstructed from the waves of an external driver (synthetic).
 
-The phantom at two fifths of its size, so that its elements are a sixth of a shear wave of 60 Hz. A patch of its
-surface is driven; the rest is free. The data are made by displacements on quadratic tetrahedra with a bulk modulus of
-300 times the storage modulus. The fit has voxels of 4 mm with 5 % of noise, elements of its own on them, and no bulk
-modulus. The regions are known, as from other images; the map knows nothing.
+The phantom is scaled to two fifths of its size, so that its elements are a sixth of a shear wave at 60 Hz. A patch of
+its surface is driven; the rest is free. The data are computed with displacements on quadratic tetrahedra, with a bulk
+modulus of 300 times the storage modulus. The fit uses voxels of 4 mm with 5 % of noise, and separate elements on these
+voxels. It does not use the bulk modulus. The regions are assumed to be known from other images; the map does not use
+them.
 
 ``python -m experiments liver_waves`` (4 minutes) writes results/liver_waves.json and liver_waves.png.
 """
@@ -27,7 +28,7 @@ RADIUS = 0.015
 
 
 def truth() -> tuple[lj.TetMesh, np.ndarray, np.ndarray]:
-    """The mesh of the data, the centre of the lesion [m], and the motion (V, 3) [m]."""
+    """Return the mesh of the data, the centre of the lesion [m], and the motion (V, 3) [m]."""
     mesh = lj.read_mesh(ROOT / "data" / "liver_phantom.vtu")
     mesh = with_points(mesh, SIZE * mesh.points)
     points = np.asarray(mesh.points)
@@ -59,7 +60,7 @@ def truth() -> tuple[lj.TetMesh, np.ndarray, np.ndarray]:
 
 
 def _middles(mesh: lj.TetMesh, triangles: np.ndarray) -> np.ndarray:
-    """Nodes in the middle of the edges of triangles of vertices."""
+    """Return the nodes in the middle of the edges of `triangles`, which are given by their vertices."""
     low, high = np.asarray(mesh.pattern.edges)
     pairs = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
     V = mesh.number_of_vertices
@@ -68,7 +69,7 @@ def _middles(mesh: lj.TetMesh, triangles: np.ndarray) -> np.ndarray:
 
 
 def sampled(mesh: lj.TetMesh, moved: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Motion (n, 3) at points (n, 3), and whether each is in the body."""
+    """Return the motion (n, 3) at points (n, 3), and whether each point is in the body."""
     motion, within = np.zeros(points.shape, complex), np.zeros(len(points), bool)
     for begin in range(0, len(points), 500):
         some = slice(begin, begin + 500)
@@ -83,7 +84,7 @@ def sampled(mesh: lj.TetMesh, moved: np.ndarray, points: np.ndarray) -> tuple[np
 
 
 def measured() -> tuple[WaveField, np.ndarray]:
-    """Voxels with noise, and the part of each (nx, ny, nz) that is in the lesion."""
+    """Return the noisy voxels, and the fraction of each voxel (nx, ny, nz) that is in the lesion."""
     mesh, centre, moved = truth()
     corner, far = np.asarray(mesh.points).min(axis=0), np.asarray(mesh.points).max(axis=0)
     step = either(VOXEL, 2 * VOXEL)
@@ -114,13 +115,13 @@ def measured() -> tuple[WaveField, np.ndarray]:
 
 
 def _median(values: np.ndarray) -> float | None:
-    """None where no voxel has a value."""
+    """Return the median, or None if no voxel has a value."""
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else None
 
 
 def main() -> None:
-    """Make the data, fit them, and write what came out."""
+    """Compute the data, fit them, and write the results."""
     begin = time.perf_counter()
     field, part = measured()
     made = time.perf_counter() - begin

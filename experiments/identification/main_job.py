@@ -1,7 +1,8 @@
-"""The main job on both shipped sweeps, by the README's command; where its time goes.
+"""The main task on both shipped sweeps with the README's command: where is the time spent?
 
-Each command is a process of its own, from its start to its end: with an empty cache of programs, then once more.
-``python -m experiments main_job`` writes results/main_job.json, main_job_lions_mane.png and main_job_porcine_liver.png.
+Each command is one separate process, timed from start to end. It runs with an empty cache of compiled programs, and
+then once more. ``python -m experiments main_job`` writes results/main_job.json, main_job_lions_mane.png and
+main_job_porcine_liver.png.
 """
 
 import json
@@ -20,7 +21,7 @@ DATA = ROOT / "data"
 
 
 def fit_command(sweep: Path, out: Path, cache: Path) -> tuple[int, float]:
-    """Exit code and seconds of the README's command."""
+    """Return the exit code and the seconds of the README's command."""
     begin = time.perf_counter()
     command = [sys.executable, "-m", "fitting", str(sweep), "--out", str(out)]
     code = subprocess.run(command, cwd=ROOT, env=os.environ | {SWITCH: str(cache)}).returncode

@@ -1,9 +1,10 @@
-"""From a rheometer's noise to an organ: how uncertain is the sagging of a liver, and through which parameter?
+"""From a rheometer's noise to an organ: uncertainty of the sagging of a liver, and contribution of each parameter.
 
-The model-implied porcine sweep with 5 % of noise (seeded: synthetic data) is fitted; draws from the posterior of its
-five Prony parameters, normal with the fit's covariance, run the liver phantom under a fifth of gravity. Sobol's indices
-(scipy's, Saltelli 2010) are of parameters drawn independently from their intervals: with the correlation of the
-posterior no variance belongs to one parameter alone. ``python -m experiments propagate_posterior`` (8 minutes).
+The sweep of porcine liver that follows from the chapter's model, with 5 % of synthetic noise (fixed seed), is fitted.
+The posterior of its five Prony parameters is taken as normal, with the covariance of the fit. Draws from this posterior
+are run on the liver phantom under a fifth of gravity. Sobol indices (scipy, Saltelli 2010) are those of parameters
+drawn independently from their intervals. With the correlation of the posterior, no part of the variance belongs to one
+parameter alone. ``python -m experiments propagate_posterior`` (8 minutes).
 """
 
 import time
@@ -27,11 +28,11 @@ SWEEP = "data/porcine_liver_frequency_sweep.csv"
 NOISE, SEED, DRAWS, SOBOL, SECONDS, DT, LANES = 0.05, 3, either(256, 16), either(64, 4), 1.0, 0.05, either(32, 4)
 NAMES = ("G0", "g1", "g2", "tau1", "tau2")
 LABELS = {"G0": "$G_0$", "g1": "$g_1$", "g2": "$g_2$", "tau1": r"$\tau_1$", "tau2": r"$\tau_2$"}
-GROUND_STATE = 770.0 / 715.0  # shear modulus over mu of the scene's Arruda-Boyce law
+GROUND_STATE = 770.0 / 715.0  # ground-state shear modulus of the scene's Arruda-Boyce law, divided by its parameter mu
 
 
 def posterior() -> tuple[np.ndarray, np.ndarray]:
-    """Mean (5,) and covariance (5, 5) of the parameters in the order of NAMES."""
+    """Return the mean (5,) and covariance (5, 5) of the parameters in the order of NAMES."""
     sweep, rng = read_sweep(SWEEP), np.random.default_rng(SEED)
     noisy = sweep._replace(
         storage=sweep.storage * (1 + NOISE * rng.standard_normal(len(sweep.storage))),
@@ -44,12 +45,14 @@ def posterior() -> tuple[np.ndarray, np.ndarray]:
 
 
 def possible(draws: np.ndarray) -> np.ndarray:
-    """Which draws (n, 5) are a material."""
+    """Return which draws (n, 5) are admissible materials."""
     return (draws > 0).all(axis=1) & (draws[:, 1] + draws[:, 2] < 1)
 
 
 def liver() -> tuple[Callable[[np.ndarray], np.ndarray], int, np.ndarray]:
-    """Displacement (n, steps) [m] of the tip for parameters (n, 5), the tip's node, and the times."""
+    """Return a function for the displacements (n, steps) [m] of the tip for parameters (n, 5), the node at the tip, and
+    times.
+    """
     scene = with_solve(models()["viscous"], SECONDS, DT)
     tip = int(np.argmax(np.linalg.norm(lj.simulate(scene).check().positions[-1] - scene.mesh.points, axis=1)))
 
@@ -77,14 +80,14 @@ def liver() -> tuple[Callable[[np.ndarray], np.ndarray], int, np.ndarray]:
 
 
 def main() -> None:
-    """All of it."""
+    """Run all parts."""
     jax.config.update("jax_num_cpu_devices", 2)
     mean, covariance = posterior()
     rng = np.random.default_rng(SEED)
     drawn = rng.multivariate_normal(mean, covariance, 2 * DRAWS)
     draws = drawn[possible(drawn)][:DRAWS]
     run, tip, times = liver()
-    run(draws[:1])  # compiles
+    run(draws[:1])  # compile before the times are measured
     begin = time.perf_counter()
     moved = run(draws)
     propagated = time.perf_counter() - begin

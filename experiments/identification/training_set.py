@@ -1,9 +1,10 @@
-"""A training set: 1,000 runs of the liver phantom by ``python -m liverjax sweep``, read back, and a surrogate of it.
+"""A training set of 1,000 runs of the liver phantom by ``python -m liverjax sweep``, and a surrogate trained on it.
 
-Static sagging under gravity of any direction, with shear and bulk modulus in a box of a factor of four: 1,000 rows of a
-Sobol sequence. A cubic polynomial in the parameters for the leading modes of the displacement is fitted to 800 rows and
-tried on the 200 others. The rows are of linear elements on one mesh. So 100 rows are run with quadratic elements on the
-same tetrahedra too: what linear ones miss of them is an error of the data that no surrogate can see.
+The runs are static sagging under gravity of any direction. Shear and bulk modulus vary by a factor of four. The 1,000
+parameter sets are a Sobol sequence. A cubic polynomial in the parameters for the leading modes of the displacement is
+fitted to 800 runs and tested on the 200 others. The runs use linear elements on one mesh. Therefore 100 runs are
+repeated with quadratic elements on the same tetrahedra. The difference is an error of the data that no surrogate can
+detect.
 
 ``python -m experiments training_set`` (12 minutes) writes results/training_set.json;
 ``python -m experiments.identification.training_set mesh`` runs the second part again.
@@ -40,7 +41,7 @@ MESH_ROWS = either(100, 4)
 
 
 def scene_file(folder: Path, order: int = 1) -> Path:
-    """The liver phantom, static and without viscosity and fluid."""
+    """Write the scene of the liver phantom, static and without viscosity and fluid."""
     mesh = SCENE.parent.joinpath("../../data/liver_phantom.vtu").resolve()
     text = f"""
 [mesh]
@@ -68,7 +69,9 @@ tolerance = 1e-6
 
 
 def swept(folder: Path, order: int, number: int) -> tuple[dict, str]:
-    """Rows of parameters, status and displacements (rows, V, 3) of a sweep, with what it took; and what it said."""
+    """Run a sweep. Return parameter sets, status and displacements (rows, V, 3), with times and size, and its
+    messages.
+    """
     file, table, out = scene_file(folder, order), folder / "rows.csv", folder / "rows.h5"
     command(["design", str(table), *(f"{n}={a}:{b}" for n, (a, b) in RANGES.items()), "--rows", str(number)])
     call = [sys.executable, "-m", "liverjax", "sweep", str(file), str(table), "--chunk", "50", "--devices", "2"]
@@ -86,7 +89,9 @@ def swept(folder: Path, order: int, number: int) -> tuple[dict, str]:
 
 
 def missed_by_linear() -> dict:
-    """How far rows of linear elements are from those of quadratic ones on the same tetrahedra, of those that end."""
+    """Return the difference between linear and quadratic elements on the same tetrahedra, for the runs that
+    converge.
+    """
     with tempfile.TemporaryDirectory() as made:
         linear, quadratic = (swept(Path(made), order, MESH_ROWS)[0] for order in (1, 2))
     good = linear["good"] & quadratic["good"]
@@ -103,7 +108,7 @@ def missed_by_linear() -> dict:
 
 
 def features(rows: np.ndarray) -> np.ndarray:
-    """Monomials up to DEGREE of the parameters, compliances instead of moduli, scaled to -1 … 1."""
+    """Return monomials up to DEGREE of the parameters, scaled to -1 … 1. Compliances replace the moduli."""
     low, high = np.array(list(RANGES.values())).T
     stiff = np.array([name.startswith("law") for name in RANGES])
     x = np.where(stiff, high / rows, rows)
@@ -114,7 +119,9 @@ def features(rows: np.ndarray) -> np.ndarray:
 
 
 def surrogate(rows: np.ndarray, moved: np.ndarray) -> list[dict]:
-    """Error of polynomial and modes on the rows that were not used, against the number of modes."""
+    """Return the error of polynomial and modes on the runs that were not used for the fit, for several numbers of
+    modes.
+    """
     begin = time.perf_counter()
     U, s, Vt = np.linalg.svd(moved[:TRAINED], full_matrices=False)
     weights = np.linalg.lstsq(features(rows[:TRAINED]), U * s, rcond=None)[0]
@@ -138,7 +145,7 @@ def surrogate(rows: np.ndarray, moved: np.ndarray) -> list[dict]:
 
 
 def main(wanted: list[str]) -> None:
-    """All of it, or the rows of quadratic elements alone."""
+    """Run all parts, or only the runs with quadratic elements."""
     if wanted == ["mesh"]:
         content = json.loads((RESULTS / "training_set.json").read_text())
         save("training_set", content | {"mesh": missed_by_linear()}, _figure(content))
@@ -147,7 +154,7 @@ def main(wanted: list[str]) -> None:
         found, said = swept(Path(made), 1, ROWS)
         scene, worst = lj.load_scene(scene_file(Path(made))), 0.0
     rows, moved = found["rows"], found["moved"].reshape(ROWS, -1)
-    # A row read back is the run of its numbers.
+    # Check that a stored run is equal to a single run with its parameters.
     for k in (0, ROWS // 2, ROWS - 1):
         law = replace(scene.law, mu=rows[k, 0], bulk=rows[k, 1])
         body = replace(scene.body, gravity=rows[k, 2:])

@@ -1,1 +1,1 @@
-"""Pages that quote numbers of the scripts: the front page, the guides, those of this folder, from their JSON."""
+"""Pages with numbers from the scripts' JSON files: the front page, the guides, and the pages of this folder."""

@@ -1,15 +1,15 @@
-"""Table of one GPU beside the processor of the same machine."""
+"""Table of one GPU compared with the processor of the same machine."""
 
 import textwrap
 
 from experiments.pages.results import error_text, load, short
 
-#: What the size of a part counts.
+#: What the size of a case counts, for each part.
 COUNTED = {"assembly": "tetrahedra", "static cube": "tetrahedra", "liver": "steps", "sweep": "rows", "reduced": "lanes"}
 
 
 def _by_case() -> dict[tuple, dict[tuple, dict]]:
-    """Rows of a part, a name and a size, by platform and precision."""
+    """Return the rows for each part, name and size, by platform and precision."""
     (data,) = load("accelerator")
     found: dict[tuple, dict[tuple, dict]] = {}
     for r in data["rows"]:
@@ -18,14 +18,14 @@ def _by_case() -> dict[tuple, dict[tuple, dict]]:
 
 
 def _ms(row: dict | None) -> str:
-    """Run time, or why there is none."""
+    """Return the run time, or the reason why there is none."""
     if row is None:
         return ""
     return row["failed"] if "failed" in row else f"{short(1e3 * row['run_s'])} ms"
 
 
 def table() -> str:
-    """All cases."""
+    """Table of all cases."""
     (data,) = load("accelerator")
     where = data["environment"]
     rows = [
@@ -49,7 +49,7 @@ def _seconds(part: str, name: str, size: int, platform: str) -> float:
 
 
 def came_out() -> str:
-    """One line: large bodies and many rows gain most."""
+    """One line on the gain for large bodies and for many runs."""
     gain = {
         key: _seconds(*key, "cpu") / _seconds(*key, "gpu")
         for key in (("static cube", "run", 257_250), ("sweep", "384 tetrahedra", 1000), ("liver", "complete", 40))
@@ -62,7 +62,7 @@ def came_out() -> str:
 
 
 def sentences() -> str:
-    """For the guide."""
+    """Sentences for the guide."""
     (data,) = load("accelerator")
     large, small = ("static cube", "run", 257_250), ("liver", "hyperelastic", 40)
     lanes = _seconds("reduced", "phantom, runs", 1000, "gpu")

@@ -1,10 +1,10 @@
-"""Tables of the liver in its place and of indentation."""
+"""Tables of the liver as in a body and of indentation."""
 
 from experiments.pages.results import load, percent
 
 
 def in_place() -> str:
-    """One line: what each part changes."""
+    """One line on what each support changes."""
     (data,) = load("liver_in_place")
     rest = [r for r in data["rest"] if r["order"] == 1 and r["converged"]]
     said = ", ".join(f"{r['name']} {1e3 * r['largest_m']:.1f} mm" for r in rest)
@@ -17,7 +17,7 @@ def in_place() -> str:
 
 
 def indented() -> str:
-    """One line: how wrong a half-space is, and what fits find."""
+    """One line on the error of a half-space, and on the results of fits."""
     (data,) = load("indentation")
     soft = {r["thickness"]: r for r in data["layers"] if r["poisson"] == 0.5}
     fits = data["fits"]
@@ -31,7 +31,7 @@ def indented() -> str:
 
 
 def table() -> str:
-    """Both tables."""
+    """Return both tables."""
     return "\n".join([*_liver(), "", *_layers()])
 
 
@@ -83,7 +83,7 @@ def _liver() -> list[str]:
 
 
 def _finer(data: dict) -> list[str]:
-    """What quadratic elements change in motion."""
+    """Line on what quadratic elements change in motion."""
     linear, found = {r["name"]: r for r in data["motion"]}, []
     for r in data.get("finer", []):
         if r["converged"]:
@@ -95,7 +95,7 @@ def _finer(data: dict) -> list[str]:
 
 
 def _clamps(data: dict) -> list[str]:
-    """Why quadratic elements fail where the phantom is held at two places."""
+    """Line on why quadratic elements fail where the phantom is fixed at two regions only."""
     said = [
         f"{r['name']}: {r['elements']} at {r['time_s']:.2g} s, all within {_mm(r['away_m'])} of a held node; a "
         f"place carries {r['mean_Pa']:.0f} Pa on average; the law allows a volume of 0 at {r['gone_Pa']:.0f} Pa"
@@ -114,7 +114,7 @@ def _mm(length: float) -> str:
 
 
 def _tip(r: dict) -> str:
-    """Two cells: the tip's displacement, and what the mesh's estimate adds to it."""
+    """Return two cells: the displacement of the tip, and its correction by the mesh error estimate."""
     tip = _mm(r["tip_m"]) if "tip_m" in r else ""
     if "mesh_m" not in r:
         return f"{tip} | "
@@ -126,7 +126,7 @@ def _seconds(r: dict) -> str:
 
 
 def _claim(motion: list[dict]) -> list[str]:
-    """The chapter's claim on porosity and viscosity, bare and in place."""
+    """Lines on the chapter's claim on porosity and viscosity, without and with all supports."""
     peaks = {r["name"]: r["peak_m"] for r in motion}
     said = []
     for where in ("held at two places", "with all"):

@@ -1,4 +1,4 @@
-"""Table of linear, quadratic and mixed elements: error, estimate, run time."""
+"""Table of linear, quadratic and mixed elements: error, estimated error, run time."""
 
 from experiments.pages.results import load, percent, short
 
@@ -6,7 +6,7 @@ MIXED = "quadratic, mixed"
 
 
 def came_out() -> str:
-    """One line: cheapest ways to 1 %, and how good the estimates are."""
+    """One line on the fastest runs within 1 %, and on the quality of the estimates."""
     (data,) = load("elements")
     known = [r for r in data["rows"] if "error" in r]
     good = [r["effectivity"] for r in known if r["found"] and abs(r["error"]) > 0.005]
@@ -20,7 +20,7 @@ def came_out() -> str:
 
 
 def _quickest(rows: list[dict], what: str, time: str, limit: float) -> str:
-    """Elements and seconds of the quickest row within an error, or that there is none."""
+    """Return elements and seconds of the fastest row within an error, or that there is none."""
     good = [r for r in rows if abs(r[what]) <= limit and (what == "error" or r["found"])]
     if not good:
         return "none here"
@@ -29,7 +29,7 @@ def _quickest(rows: list[dict], what: str, time: str, limit: float) -> str:
 
 
 def phantom() -> str:
-    """One line: what the phantom's meshes say."""
+    """One line with the results of the phantom's meshes."""
     (data,) = load("liver_mesh")
     said = [
         f"{r['largest_mm']:.1f} mm by {r['elements']:,} {'linear' if r['order'] == 1 else 'quadratic'} elements"
@@ -40,7 +40,7 @@ def phantom() -> str:
 
 
 def table() -> str:
-    """Every row."""
+    """Table of all rows."""
     (data,) = load("elements")
     beam = 1e3 * next(r["truth"] for r in data["rows"] if r["body"] == "Land's beam")
     rows = [
@@ -75,13 +75,13 @@ def table() -> str:
 
 
 def _last_step() -> float:
-    """Largest difference between the other program's two finest grids, of Cook's membrane."""
+    """Return the largest relative difference between the other program's two finest grids, for Cook's membrane."""
     (grids,) = load("cooks_membrane")
     return max(abs(by["32"] / by["64"] - 1) for by in grids.values())
 
 
 def _phantom() -> list[str]:
-    """The phantom on two meshes, the load followed."""
+    """Table of the phantom on two meshes, with the load in one or more steps."""
     (data,) = load("liver_mesh")
     rows = ["", "The phantom with its tetrahedra as they are and cut into eight, the load in one step or in eight:", ""]
     rows += [
@@ -115,13 +115,15 @@ def _phantom() -> list[str]:
 
 
 def _limit(values: list[float]) -> float:
-    """Of values whose differences fall by one factor: of the last two differences."""
+    """Return the limit of values whose differences fall by a constant factor, from the last two differences."""
     a, b = values[-2] - values[-3], values[-1] - values[-2]
     return values[-1] + b * (b / a) / (1 - b / a)
 
 
 def _cheapest(rows: list[dict]) -> list[str]:
-    """Where a truth is known: the quickest row of each form within 1 % and 0.1 %, raw or corrected."""
+    """Return the fastest run of each form within 1 % and 0.1 %, without and with correction, where the solution is
+    known.
+    """
     found = [
         "",
         "Quickest run within an error, by form (corrected: with the estimate added, and its time):",
@@ -142,7 +144,7 @@ def _cheapest(rows: list[dict]) -> list[str]:
 
 
 def _iterations(data: dict) -> list[str]:
-    """Of a sheared cube, mesh by mesh."""
+    """Table of linear iterations for a sheared cube on each mesh."""
     rows = ["", "A cube whose top moves aside by a hundredth, one step to 1e-8: linear iterations of all Newton's:", ""]
     rows += ["| elements | K/mu | number | unknowns of positions | Newton | linear | run |", "|---" * 7 + "|"]
     for r in data["iterations"]:
@@ -154,7 +156,7 @@ def _iterations(data: dict) -> list[str]:
 
 
 def _sponge(data: dict) -> list[str]:
-    """Of a wet sponge, from no flow to fast flow."""
+    """Table of linear iterations for a saturated porous body, from no flow to fast flow."""
     rows = ["", "The same cube as a wet sponge, drained on top, two steps of 0.05 s, by permeability:", ""]
     rows += ["| elements | number | m^4/(N s) | Newton | linear | run |", "|---" * 6 + "|"]
     for r in data["sponge"]:
@@ -166,7 +168,7 @@ def _sponge(data: dict) -> list[str]:
 
 
 def _thin_cells(data: dict) -> list[str]:
-    """Of plates of flat cells."""
+    """Table of linear iterations for plates of flat cells."""
     if "flat cells" not in data:
         return []
     rows = [
@@ -183,7 +185,7 @@ def _thin_cells(data: dict) -> list[str]:
 
 
 def rows_of(body: str, ratio: float | None) -> list[dict]:
-    """Every mesh of a body at a K/mu, as it is and corrected: size of the error, run time and name."""
+    """Return every mesh of a body at a K/mu, without and with correction: size of the error, run time and name."""
     (data,) = load("elements")
     found = []
     for r in data["rows"]:
@@ -196,12 +198,12 @@ def rows_of(body: str, ratio: float | None) -> list[dict]:
 
 
 def _is_cook(row: dict, form: str) -> bool:
-    """Whether a row is Cook's membrane of 16 cells at K/mu = 1e4."""
+    """Return whether a row is Cook's membrane of 16 cells at K/mu = 1e4."""
     return (row["body"], row["ratio"], row["form"], row["cells"]) == ("Cook's membrane", 1e4, form, 16)
 
 
 def sentences() -> str:
-    """For the guide: linear against quadratic, where both are."""
+    """Sentences for the guide that compare linear with quadratic elements."""
     (data,) = load("elements")
     rows = {(r["body"], r["ratio"], r["form"], r["elements"]): r for r in data["rows"]}
     liver = {r["form"]: r for r in data["rows"] if r["body"] == "liver phantom"}

@@ -1,4 +1,4 @@
-"""The table of all models at equal error: what a simulated second costs."""
+"""The table of all models at equal error, with the run time of a simulated second."""
 
 import math
 
@@ -6,9 +6,10 @@ from experiments.pages.results import load, percent, short
 
 
 def at_error(runs: list[dict], target: float) -> tuple[float, float] | None:
-    """Time step [s] and run time [s] at an error, between the two runs whose errors enclose it; None if none meets it.
+    """Return time step [s] and run time [s] at an error, interpolated between the two runs whose errors enclose it.
 
-    Both are on lines through the logarithms. The longest step of all is taken as it is, if it meets the error.
+    The interpolation is linear in the logarithms. If the longest step of all meets the error, its values are returned.
+    Returns None if no run meets the error.
     """
     before = None
     for run in sorted(runs, key=lambda r: -r["dt"]):
@@ -24,7 +25,7 @@ def at_error(runs: list[dict], target: float) -> tuple[float, float] | None:
 
 
 def ways(own: dict) -> dict[str, list[dict]]:
-    """Runs by the name of their way."""
+    """Return the runs, grouped by the name of their method."""
     found: dict[str, list[dict]] = {}
     for run in own["runs"]:
         found.setdefault(run["way"], []).append(run)
@@ -32,7 +33,7 @@ def ways(own: dict) -> dict[str, list[dict]]:
 
 
 def cell(found: tuple[float, float] | None, seconds: float) -> str:
-    """Step, steps a second, and simulated seconds a second."""
+    """Return step, steps per second, and simulated seconds per second."""
     if found is None:
         return "- | - | -"
     dt, run_s = found
@@ -40,7 +41,7 @@ def cell(found: tuple[float, float] | None, seconds: float) -> str:
 
 
 def came_out() -> str:
-    """Reduced, full and the chapter's way of each model at the middle error."""
+    """One line with the reduced, the full and the chapter's method for each model at the middle error."""
     (data,) = load("equal_error")
     target, told = sorted(data["targets"])[1], []
     for model, own in data["models"].items():
@@ -53,7 +54,7 @@ def came_out() -> str:
 
 
 def table() -> str:
-    """All models and ways at all targets, then what linear and corotational bodies leave out."""
+    """Table of all models and methods at all targets, then the errors of linear and corotational bodies."""
     (data,) = load("equal_error")
     targets = sorted(data["targets"], reverse=True)
     rows = [
@@ -72,7 +73,7 @@ def table() -> str:
 
 
 def reduced(data: dict) -> str:
-    """One line: how the reduced models were made, and the error of the truths."""
+    """One line on the training of the reduced models, and on the error of the reference runs."""
     made = ", ".join(
         f"{model} {r['modes']} modes and {r['points']} points from {r['rows']} runs in {r['training_s']:.0f} s"
         for model, r in ((m, own["reduced"]) for m, own in data["models"].items())
@@ -82,7 +83,7 @@ def reduced(data: dict) -> str:
 
 
 def by_weight(data: dict) -> str:
-    """What a linear and a corotational body leave out, by the weight."""
+    """Table of the errors of a linear and a corotational body, for each weight."""
     names = [name for name in data["weights"][0] if name != "weight"]
     rows = [
         "What linear and corotational bodies leave out, with the same short steps as the hyperelastic one, by the part",

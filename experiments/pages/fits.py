@@ -1,4 +1,4 @@
-"""What came out of fits and of what is learnt from runs, one line each."""
+"""One line of results for each script on fits and on learning from runs."""
 
 from experiments.pages.results import RESULTS, load, percent
 

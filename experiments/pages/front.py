@@ -1,4 +1,4 @@
-"""What the front page and the two guides quote: the main job, choices by error, a few numbers of each part."""
+"""Numbers for the front page and the two guides: the main task, choices by error, a few results of each part."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ TARGETS = (0.1, 0.01, 0.001)
 
 
 def job() -> str:
-    """The main job on measured data."""
+    """Results of the main task on measured data."""
     (jobs,) = load("main_job")
     found = jobs["lions_mane"]
     kilo, sd = found["shear_modulus"] / 1e3, found["standard_errors"]["shear_modulus"] / 1e3
@@ -30,13 +30,13 @@ def job() -> str:
 
 
 def cheapest(rows: list[dict[str, Any]], target: float) -> dict[str, Any] | None:
-    """The fastest row within an error."""
+    """Return the fastest row within an error, or None."""
     good = [r for r in rows if r["error"] is not None and r["error"] <= target and r.get("converged", True)]
     return min(good, key=lambda r: r["run_s"], default=None)
 
 
 def questions() -> dict[str, tuple[list[dict], Callable[[dict], str]]]:
-    """Rows with `error` and `run_s` of every choice, and the name of a row."""
+    """Return, for each choice, the rows with `error` and `run_s`, and a function for the name of a row."""
     fig5, liver, cube, ways = load("fig5_dma", "liver_choices", "precision", "fit_methods")
     steps = [r | {"error": r["error"]["mean"]} for r in fig5["steps"]]
     meshes = [r | {"error": r[kind]["mean"], "kind": kind} for r in fig5["mesh"] for kind in ("raw", "corrected")]
@@ -57,7 +57,7 @@ def questions() -> dict[str, tuple[list[dict], Callable[[dict], str]]]:
             lambda r: f"{r['nodes']} nodes, {'divided out' if r['kind'] == 'corrected' else 'not'}",
         ),
         "parameters of a sweep without noise: method of the fit": (ways["exact"], lambda r: r["name"]),
-        # The explicit integrator of the comparison is no option of the program.
+        # The explicit integrator of the comparison is not an option of the program.
         "liver in motion, elastic: integrator, step": (
             [r for r in of_liver("explicit against implicit (hyperelastic)") if not r["name"].startswith("explicit")],
             stepped,
@@ -82,7 +82,7 @@ def questions() -> dict[str, tuple[list[dict], Callable[[dict], str]]]:
 
 
 def choices() -> str:
-    """For an error of 10, 1 and 0.1 %: the cheapest choice, its error and its run time."""
+    """Return the fastest choice for an error of 10, 1 and 0.1 %, with its error and its run time."""
     rows = ["| what | 10 % | 1 % | 0.1 % |", "|---|---|---|---|"]
     for what, (found, name) in questions().items():
         cells = []
@@ -110,7 +110,7 @@ def choices() -> str:
 
 
 def simulation() -> str:
-    """The liver at real time, and the cube."""
+    """Speed and error of the liver in real time, and of the cube."""
     liver, solve = load("fig6_liver", "solve_benchmark")
     cube = solve["static_cube"]
     rows = {(r["model"], r["dt"], r["newton"]): r for r in liver["rows"]}
@@ -136,7 +136,7 @@ def simulation() -> str:
 
 
 def runs() -> str:
-    """One line of the sweeps."""
+    """One line on the sweeps."""
     bench, lives = load("sweep_benchmark", "sweep_survival")
     kills = lives["kills"]["kills"] + sum(r["killed"] for r in lives["loopback"])
     lost = lives["kills"]["finished_chunks_lost"]
@@ -148,7 +148,7 @@ def runs() -> str:
 
 
 def gradients() -> str:
-    """What a gradient costs, on the liver."""
+    """Cost of a gradient for the liver."""
     (cost,) = load("gradient_cost")
     liver = {(r["model"], r["steps"], r["store"]): r for r in cost["rows"]}
     rows = [
@@ -174,7 +174,7 @@ def gradients() -> str:
 
 
 def maps() -> str:
-    """The lesion."""
+    """Table of the lesion."""
     (found,) = load("lesion")
     rows = [
         "| noise | map: centre off | time | sphere: centre off | radius off | modulus off | standard error | time |",
@@ -199,7 +199,7 @@ def maps() -> str:
 
 
 def together() -> str:
-    """Intervals of the slowest mode, by tests."""
+    """Table of intervals of the slowest mode, for each combination of tests."""
     (found,) = load("creep_and_sweep")
     rows = ["| fitted (synthetic, 2 % noise) | G0 | slow ratio | slow time | run, compile included |", "|---" * 5 + "|"]
     for r in found["rows"]:
@@ -218,12 +218,12 @@ def together() -> str:
 
 
 def span(found: Returned) -> str:
-    """From the least to the greatest part, in per cent."""
+    """Return the smallest and the largest fraction, in per cent."""
     return " to ".join(percent(part) for part in dict.fromkeys((found.least, found.most)))
 
 
 def extremes() -> str:
-    """The robust solver, in two lines."""
+    """Two lines on the robust solver."""
     inverted, cost = load("stability_inverted", "stability_cost")
     solver = "projected, from the start itself"
     mild = returned(solver, ("0 % inverted", "5 % inverted", "20 % inverted"))

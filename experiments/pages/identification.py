@@ -4,7 +4,7 @@ from experiments.pages.results import load, percent, short
 
 
 def precision() -> str:
-    """float32 beside float64: laws, cube, liver."""
+    """Table of float32 and float64: laws, cube, liver."""
     (data,) = load("precision")
     tetrahedra = data["laws"][0]["tetrahedra"]
     rows = [
@@ -22,7 +22,7 @@ def precision() -> str:
 
 
 def jax_releases() -> str:
-    """The same programs with different releases of jax."""
+    """Table of the same programs with different releases of jax."""
     (data,) = load("jax_releases")
     head = "| jax | torsion: transposes written, compiled; copies | run | compile | complete liver | compile |"
     rows = [head, "|---" * 6 + "|"]
@@ -35,7 +35,7 @@ def jax_releases() -> str:
 
 
 def gradients() -> str:
-    """Every row of the cost of a gradient."""
+    """Table of all costs of a gradient."""
     (data,) = load("gradient_cost")
     rows = ["| model | tetrahedra | steps | store | run | gradient | over | memory | predicted |", "|---" * 9 + "|"]
     for r in data["rows"]:
@@ -46,7 +46,7 @@ def gradients() -> str:
 
 
 def lesion() -> str:
-    """Every map."""
+    """Table of all maps."""
     (data,) = load("lesion")
     rows = [
         "| noise | length of the prior | chi2 a component | centre off | largest modulus over true | "
@@ -68,7 +68,7 @@ def lesion() -> str:
 
 
 def plate() -> str:
-    """The guide's table: regions, map and direct inversion beside the truth."""
+    """Return the guide's table: regions, map and direct inversion, with the true values."""
     (data,) = load("elastography")
     hertz = data["frequencies_Hz"]
     rows = [
@@ -103,12 +103,12 @@ def plate() -> str:
 
 
 def _span(parts: list[float]) -> str:
-    """The smallest and the largest part, once if they are written alike."""
+    """Return the smallest and the largest fraction, or one number if both are printed alike."""
     return " to ".join(dict.fromkeys(percent(part) for part in (min(parts), max(parts))))
 
 
 def _between(row: dict) -> str:
-    """Where voxels of a row lie, from the nearest edge."""
+    """Return the range of distances of a row's voxels from the nearest edge."""
     low, high = (None if row[key] is None else 1e3 * row[key] for key in ("from_m", "to_m"))
     side = "inside" if high is not None and high <= 0 else "outside"
     ends = [abs(end) for end in (low, high) if end is not None]
@@ -116,7 +116,7 @@ def _between(row: dict) -> str:
 
 
 def liver_waves_came_out() -> str:
-    """The sentence of the overview."""
+    """Sentence for the overview."""
     (data,) = load("liver_waves")
     said = []
     for r in data["rows"]:
@@ -129,7 +129,7 @@ def liver_waves_came_out() -> str:
 
 
 def plate_came_out() -> str:
-    """The sentence of the overview."""
+    """Sentence for the overview."""
     (data,) = load("elastography")
     said = []
     for r in data["rows"][1:]:

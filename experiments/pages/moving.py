@@ -1,10 +1,10 @@
-"""Table of the mesh's estimate in motion."""
+"""Table of the estimated mesh error in motion."""
 
 from experiments.pages.results import load, percent
 
 
 def came_out() -> str:
-    """One line: how near the estimates are."""
+    """One line on the accuracy of the estimates."""
     (data,) = load("moving_mesh")
     rows = data["moving"]
     near = [r["effectivity"] for r in rows]
@@ -16,7 +16,7 @@ def came_out() -> str:
 
 
 def table() -> str:
-    """Every row."""
+    """Table of all rows."""
     (data,) = load("moving_mesh")
     rows = [
         "A beam is let go. Motion, error and estimate are of its end, root mean square over all steps; effectivity is",

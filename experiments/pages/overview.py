@@ -1,4 +1,4 @@
-"""The table of experiments/README.md: what every script asks, what came out, what the chapter says, run times."""
+"""The table of experiments/README.md: question and result of every script, the chapter's statement, run times."""
 
 import json
 from collections.abc import Callable
@@ -217,7 +217,7 @@ def _laws() -> str:
     return f"the hand-derived terms of all {len(data['laws'])} laws are within {worst:.0e} of automatic differentiation"
 
 
-#: Script -> (question, what came out, what the chapter says and why it differs).
+#: Script -> (question, function for the result, the chapter's statement and the reason for a difference).
 ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
     "main_job": (
         "the README's command on both shipped sweeps: what comes out, where does the time go?",
@@ -382,7 +382,7 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
 
 
 def overview() -> str:
-    """The whole table."""
+    """Return the whole table."""
     file = RESULTS / "run_times.json"
     times = json.loads(file.read_text()) if file.exists() else {}
 

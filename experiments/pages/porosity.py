@@ -1,10 +1,10 @@
-"""The chapter's claim that porosity prevents large deformations: what came out, and what it takes."""
+"""The chapter's claim that porosity prevents large deformations: results, and conditions under which it holds."""
 
 from typing import Any
 
 from experiments.pages.results import load
 
-#: What is varied: its name on the page, and its unit.
+#: Parameters that are varied: name on the page, and unit.
 NAMES = {
     "bulk": ("K0 of", " Pa"),
     "limit_bulk": ("K_lim of", " Pa"),
@@ -19,7 +19,10 @@ def _shown(name: str, value: float) -> str:
 
 
 def holding(data: dict[str, Any]) -> dict[str, list[str]]:
-    """By what is varied: between which values the claim begins to hold, or that none of those tried is enough."""
+    """Return, for each varied parameter, the values between which the claim begins to hold.
+
+    Parameters for which no tested value is enough are listed separately.
+    """
     found: dict[str, list[str]] = {"it takes": [], "not enough": []}
     base = {r["varied"]: r for r in data["rows"]}["Table 2"]
     start = data["table_2"] | {"ramp_s": 0.0}
@@ -42,7 +45,7 @@ def holding(data: dict[str, Any]) -> dict[str, list[str]]:
 
 
 def porosity() -> str:
-    """Four models, then every variation beside the body without the sponge."""
+    """Table of four models, and of every variation with the same body without porosity."""
     (data,) = load("porosity_claim")
     names = {
         "Table 2, elastic": "porohyperelastic beside hyperelastic, Table 2",

@@ -4,7 +4,7 @@ from experiments.pages.results import load, percent
 
 
 def came_out() -> str:
-    """One line: error, stated error, time a step."""
+    """One line: error, stated error, time per step."""
     (data,) = load("reduced")
     r = data["models"][-1]
     near = f"{percent(r['relative_median'])} in {r['runs']} unseen runs (95 % below {percent(r['relative_95'])})"
@@ -15,7 +15,7 @@ def came_out() -> str:
 
 
 def table() -> str:
-    """The viscous phantom: training, times, errors."""
+    """Table of the viscous phantom: training, times, errors."""
     (data,) = load("reduced")
     rows = [
         f"The viscous phantom, {data['elements']:,} linear tetrahedra, 24 steps of 0.05 s; gravity, a pull at the",
@@ -45,7 +45,7 @@ def table() -> str:
 
 
 def correction(r: dict) -> str:
-    """One line: what the correction does, and what it tells of the model without it."""
+    """One line on the effect of the correction, and on its size as an estimate of the error without it."""
     low, high = r["change_effectivity_range"]
     without = f"{percent(r['uncorrected_median'])} (95 % below {percent(r['uncorrected_95'])})"
     return (
@@ -58,7 +58,7 @@ def correction(r: dict) -> str:
 
 
 def identified(r: dict) -> str:
-    """One line: numbers identified through the model, and lanes of `vmap`."""
+    """One line on parameters identified with the model, and on many runs at once with `vmap`."""
     errors = zip(r["identified"], r["identified_error"], r["identified_error_without_bias"], strict=True)
     each = "; ".join(f"`{name}` {percent(before)}, {percent(after)}" for name, before, after in errors)
     return (
@@ -71,7 +71,7 @@ def identified(r: dict) -> str:
 
 
 def porous_came_out() -> str:
-    """One line: error, stated error, time a step."""
+    """One line: error, stated error, time per step."""
     (data,) = load("reduced_porous")
     made, r, took = data["training"], data["unseen"], data["times"]
     near = f"{percent(r['relative_median'])} in {r['runs']} unseen runs (largest {percent(r['relative_largest'])})"
@@ -83,7 +83,7 @@ def porous_came_out() -> str:
 
 
 def porous_table() -> str:
-    """The complete phantom: training, times, errors of motion and pressure."""
+    """Table of the complete phantom: training, times, errors of motion and pressure."""
     (data,) = load("reduced_porous")
     made, r, took = data["training"], data["unseen"], data["times"]
     motion, plain, pressure = (
@@ -114,7 +114,7 @@ def porous_table() -> str:
 
 
 def porous_words(made: dict, r: dict, took: dict) -> str:
-    """One line: stated errors of the unseen runs r, iterations, lanes, and how busy the machine was."""
+    """One line on stated errors of the test runs r, iterations, batches, and load of the machine."""
     low, high = r["effectivity_range"]
     least, most = r["change_effectivity_range"]
     of_motion, of_pressure = zip(*r["mesh_ratios"], strict=True)
@@ -132,7 +132,7 @@ def porous_words(made: dict, r: dict, took: dict) -> str:
 
 
 def quadratic_came_out() -> str:
-    """One line: error, stated error, time a step."""
+    """One line: error, stated error, time per step."""
     (data,) = load("reduced_quadratic")
     made, r, took = data["training"], data["unseen"], data["times"]
 
@@ -148,7 +148,7 @@ def quadratic_came_out() -> str:
 
 
 def quadratic_table() -> str:
-    """The phantom of quadratic elements: training, times, errors."""
+    """Table of the phantom with quadratic elements: training, times, errors."""
     (data,) = load("reduced_quadratic")
     made, r, took = data["training"], data["unseen"], data["times"]
     return "\n".join(
@@ -176,7 +176,9 @@ def quadratic_table() -> str:
 
 
 def quadratic_row(name: str, r: dict, kinds: tuple[str, str, str], step_ms: float) -> str:
-    """Errors of the unseen runs r, with or without the correction, and how well they are stated."""
+    """Return a row with errors of the test runs r, with or without the correction, and the quality of the stated
+    errors.
+    """
     error, part, stated = kinds
     low, high = r[f"{stated}effectivity_range"]
     errors = " | ".join(percent(r[f"{error}_{k}"]) for k in ("median", "95", "largest"))
@@ -187,7 +189,7 @@ def quadratic_row(name: str, r: dict, kinds: tuple[str, str, str], step_ms: floa
 
 
 def quadratic_words(r: dict, took: dict) -> str:
-    """One line: the largest displacement, and iterations."""
+    """One line on the largest displacement and on iterations."""
     return (
         f"The largest displacement is {r['largest_displacement_mm']:.0f} mm. The error of the modes alone is stated by "
         f"the size of the correction. A run takes {took['iterations_per_step']:.2g} iterations a step. Times of steps "
@@ -196,7 +198,7 @@ def quadratic_words(r: dict, took: dict) -> str:
 
 
 def separated_came_out() -> str:
-    """One line: error and time of an answer."""
+    """One line on the error and the time of one evaluation."""
     (data,) = load("separated")
     best = min((r for r in data["models"] if r["model"] == "separated"), key=lambda r: r["error_largest"])
     near = f"off by {percent(best['error_largest'])} at most in {data['unseen']} unseen runs"
@@ -205,7 +207,7 @@ def separated_came_out() -> str:
 
 
 def separated_table() -> str:
-    """Separated forms of several grids, and a reduced basis."""
+    """Table of separated forms on several grids, and of a reduced basis."""
     (data,) = load("separated")
     rows = [
         "The hyperelastic phantom at rest; modulus, bulk modulus and weight are free. Errors are the largest distance",

@@ -1,4 +1,4 @@
-"""Tables of the rigs: error against run time of meshes, and the default at every shape and K/mu."""
+"""Tables of the rigs: error against run time of meshes, and the default mesh at every shape and K/mu."""
 
 from experiments.pages.results import RESULTS, load, percent
 
@@ -6,7 +6,7 @@ TESTS = ("tension", "punch", "creep")
 
 
 def rigs() -> str:
-    """Meshes at one shape of the sample, then the default."""
+    """Table of meshes at one shape of the sample, then that of the default mesh."""
     if not _ran():
         return "The rigs' readings against an independent solver: `python -m experiments stability_rigs` has not run."
     (data,) = load("stability_rigs")
@@ -43,7 +43,7 @@ def rigs() -> str:
 
 
 def came_out() -> str:
-    """The sentence of the overview."""
+    """Sentence for the overview."""
     if not _ran():
         return "has not run"
     (data,) = load("stability_rigs")

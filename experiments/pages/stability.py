@@ -7,21 +7,24 @@ from experiments.pages.results import load, percent
 
 
 def stability() -> str:
-    """Inverted starts, the liver at any step, locking, rigs."""
+    """Tables of inverted starting positions, the liver with any time step, locking, and rigs."""
     return "\n".join([*_inverted(), "", *_steps(), "", *_cost(), "", *_locking(), "", rigs.rigs()])
 
 
 class Returned(NamedTuple):
-    """Of scrambled starts the part that ends at the minimum reached from rest: least and greatest, by law and kind."""
+    """Fractions of scrambled starting positions that end at the minimum reached from rest.
+
+    `least` and `most` are the smallest and largest fraction over laws and kinds of starting positions.
+    """
 
     least: float
     most: float
     laws: int
-    folded: float  # of the others: the part that ends in another equilibrium
+    folded: float  # fraction of the others that ends in another equilibrium
 
 
 def returned(solver: str, cases: tuple[str, ...] | None = None) -> Returned:
-    """What becomes of the starts of some kinds, all if None, over the laws that a solver was tried with."""
+    """Return the results for some kinds of starting positions (all if None), over all laws tested with a solver."""
     (data,) = load("stability_inverted")
     tables = [t[solver] for t in data["laws"].values() if solver in t]
     found = [r for t in tables for case, r in t.items() if cases is None or case in cases]
@@ -49,7 +52,7 @@ def _inverted() -> list[str]:
         rate = f"{100 * r['right'] / r['starts']:.0f} %"
         return rate + (f" ({r['most_iterations']}; {1e3 * r['seconds_a_start']:.2g} ms)" if r["right"] else "")
 
-    # By solver, so that the rates from the start itself stand first.
+    # Sorted by solver, so that runs from the starting positions themselves come first.
     for solver in next(iter(data["laws"].values())):
         for law, table in ((n, t[solver]) for n, t in data["laws"].items() if solver in t):
             rows.append(f"| `{law}` | {solver} | " + " | ".join(cell(table[case]) for case in cases) + " |")
@@ -104,7 +107,7 @@ def _locking() -> list[str]:
 
     def cell(r: dict) -> str:
         found = f"{100 * abs(r['error']):.2g} %, {r['newton']} iterations, {r['run_s']:.2g} s"
-        # Stalled: as near as the digits allow, or nearly.
+        # Stalled: the residual is at, or near, the limit of the number format.
         return {"converged": found, "stalled": f"stalled: {found}"}.get(r["code"], r["code"])
 
     direct = [r for r in data["rows"] if r["linear_solver"] == "direct"]
@@ -117,7 +120,7 @@ def _locking() -> list[str]:
 
 
 def inverted_came_out() -> str:
-    """The sentence of the overview."""
+    """Sentence for the overview."""
     solver = "projected, from the start itself"
     half, fifth = returned(solver, ("50 % inverted",)), returned(solver, ("20 % inverted",))
     left = returned("projected, guess left")
@@ -133,7 +136,7 @@ def inverted_came_out() -> str:
 
 
 def steps_came_out() -> str:
-    """The sentence of the overview."""
+    """Sentence for the overview."""
     (data,) = load("stability_steps")
 
     def good(precision: str) -> str:
@@ -148,7 +151,7 @@ def steps_came_out() -> str:
 
 
 def bulk_came_out() -> str:
-    """The sentence of the overview."""
+    """Sentence for the overview."""
     (data,) = load("stability_bulk")
     key = ("Cook's membrane", 1e4, 16, "direct", "float64")
     rows = [
@@ -161,7 +164,7 @@ def bulk_came_out() -> str:
 
 
 def cost_came_out() -> str:
-    """The sentence of the overview."""
+    """Sentence for the overview."""
     (data,) = load("stability_cost")
     over = ", ".join(f"{r['model']} {r['time_over_off']:.2f}" for r in data["rows"])
     return f"run time over that without: {over}"

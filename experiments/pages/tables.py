@@ -4,7 +4,7 @@ from experiments.pages.results import error_text, load, percent
 
 
 def laws() -> str:
-    """Every law: error and time of its hand-derived terms, and how well it follows brain and rubber."""
+    """Table of laws: error and time of the hand-derived terms, and misfit for brain and rubber."""
     table, brain, rubber = load("laws_table", "curves_brain", "curves_rubber")
     fits = [{f["law"]: f for f in data["laws"]} for data in (brain, rubber)]
 
@@ -25,7 +25,7 @@ def laws() -> str:
 
 
 def numbers() -> str:
-    """The table of error against run time and the paragraph on the chapter's 5 %."""
+    """Table of error against run time, and the paragraph on the chapter's 5 %."""
     fig5, job = load("fig5_dma", "main_job")
     steps = {(r["scheme"], r["steps"]): r for r in fig5["steps"]}
 
@@ -63,7 +63,7 @@ def numbers() -> str:
 
 
 def simulations() -> str:
-    """The known answers on their finest meshes, and the liver's three models."""
+    """Table of problems with known solutions on their finest meshes, and of the liver's three models."""
     known, liver = load("known_answers", "fig6_liver")
     rods = [r for r in known["cantilever"] if r["volumetric"] == "element"]
     cook, land, rod = known["cook"][-1], known["land"][-1], rods[-1]
@@ -104,7 +104,7 @@ def simulations() -> str:
 
 
 def speed() -> str:
-    """Force and stiffness against other ways, solves, growth with the mesh."""
+    """Tables of force and stiffness by several methods, of solves, and of the growth with the mesh."""
     fig4, solve, scaling = load("fig4_assembly", "solve_benchmark", "scaling")
     ways = ("chapter", "standard FEM", "autodiff 9 x 9", "vmapped Hessian")
     rows = [
@@ -156,7 +156,9 @@ def speed() -> str:
 
 
 def runs() -> str:
-    """Rows a minute, what a sweep survives, a posterior carried through the liver, a training set."""
+    """Paragraphs on runs per minute, killed sweeps, a posterior propagated through the liver, and a training
+    set.
+    """
     bench, lives, spread, training = load("sweep_benchmark", "sweep_survival", "propagate_posterior", "training_set")
     kills, others = lives["kills"], lives["loopback"]
     killed, lost = kills["kills"] + sum(r["killed"] for r in others), kills["finished_chunks_lost"]

@@ -1,10 +1,10 @@
-"""Known answers: rows that the tests wrote, and meshes of `known_answers.py`."""
+"""Problems with known solutions: rows that the tests wrote, and the meshes of `known_answers.py`."""
 
 from experiments.pages.results import load
 
 
 def tests() -> str:
-    """A row a benchmark of the tests."""
+    """Table with one row for each benchmark of the tests."""
     (found,) = load("verification")
     rows = ["| benchmark | known from | difference | allowed | observed order | test |", "|---" * 6 + "|"]
     for r in found["rows"]:
@@ -17,7 +17,7 @@ def tests() -> str:
 
 
 def meshes() -> str:
-    """Cook, Land and the cantilever, mesh by mesh."""
+    """Table of Cook, Land and the cantilever on each mesh."""
     (known,) = load("known_answers")
     rows = ["| body | tetrahedra | ours | known | difference | run |", "|---" * 6 + "|"]
 
@@ -55,6 +55,6 @@ PARTS = {"tests": tests, "meshes": meshes}
 
 
 def _allowed(tolerance: float) -> str:
-    """One digit, or two where one would be another number."""
+    """Return a tolerance with one digit, or with two if one digit would change its value."""
     short = f"{tolerance:.0e}"
     return short if abs(float(short) / tolerance - 1) < 0.01 else f"{tolerance:.1e}"

@@ -1,4 +1,4 @@
-"""Fill in the parts of the pages between markers."""
+"""Fill in the parts of the pages between their markers."""
 
 import json
 from collections.abc import Callable
@@ -43,7 +43,7 @@ PAGES: dict[Path, dict[str, Callable[[], str]]] = {
 
 
 def begin(part: str) -> str:
-    """The marker before a part."""
+    """Return the marker before a part."""
     return f"<!-- {part}: python -m experiments pages -->"
 
 
@@ -58,7 +58,7 @@ def write() -> None:
 
 
 def record(script: str, kind: str, seconds: float) -> None:
-    """Remember how long a script took, full or quick."""
+    """Store the run time of a script, for full or quick runs."""
     file = RESULTS / "run_times.json"
     times = json.loads(file.read_text()) if file.exists() else {}
     times.setdefault(script, {})[kind] = round(seconds, 1)

@@ -1,1 +1,1 @@
-"""How the files of data/ and tests/ were made."""
+"""Scripts that made the files of data/ and tests/."""

@@ -1,11 +1,11 @@
 """Stiffness of glued cylinders by another program: axisymmetric, linear elastic, quadratic triangles (NumPy, SciPy).
 
-Writes tests/rig_values.json, which the rigs of `fitting.rigs` are held against. Nothing of this project is imported.
+Writes tests/rig_values.json, which the rigs of `fitting.rigs` are compared with. No code of this project is imported.
 
-Displacements (u_r, u_z) are quadratic and the pressure p = K div u is linear and continuous on a triangle
-(Taylor-Hood, which does not lock). The lines of the grid are graded to the rims of the plates and to the punch's edge,
-where stresses are infinite. Every number is computed on three grids, each of half the cells of the next, and
-extrapolated with the order that is observed; displacements alone, which are too stiff on any grid, are the check.
+Displacements (u_r, u_z) are quadratic, and the pressure p = K div u is linear in each triangle and continuous
+(Taylor-Hood, which does not lock). The grid lines are graded to the rims of the plates and to the punch's edge, where
+stresses are singular. Every number is computed on three grids, each with half the cells of the next. It is extrapolated
+with the observed order. Elements with displacements alone, which are too stiff on any grid, serve as a check.
 
     python -m experiments.sources.axisymmetric_reference
 """
@@ -20,16 +20,19 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 FILE = Path(__file__).parents[2] / "tests" / "rig_values.json"
-#: Height over radius, and bulk over shear modulus.
+#: Height over radius, and bulk modulus over shear modulus.
 ASPECTS, RATIOS = (0.2, 0.5, 1.0, 2.0, 5.0), (3.0, 20.0, 100.0, 1e4)
-#: The punch's radius over that of the sample: in all these cases, and in some.
+#: Radius of the punch over that of the sample: the first value in all cases, the others in some.
 PUNCH, OTHERS = 0.4, (0.1, 0.8)
-#: Distance of line t from a rim goes as t to this power: at an exponent of 0.5 of the displacement, order 4 is kept.
+#: The distance of line t from a rim is proportional to t to this power. If the displacement near the rim has the
+#: exponent 0.5, order 4 is kept.
 GRADING = 4.0
 
 
 class Grid(NamedTuple):
-    """Quadratic triangles: nodes (n, 2) at (r, z), six numbers a triangle, corners first, and the number of corners."""
+    """Quadratic triangles: nodes (n, 2) at (r, z), six node numbers per triangle with corners first, and number of
+    corners.
+    """
 
     nodes: np.ndarray
     triangles: np.ndarray
@@ -37,7 +40,7 @@ class Grid(NamedTuple):
 
 
 def lines(length: float, cells: int, rims: str) -> np.ndarray:
-    """Places from 0 to `length`, graded to the end(s) named in `rims`: "0", "1" or "01"."""
+    """Return positions from 0 to `length`, graded to the end(s) named in `rims`: "0", "1" or "01"."""
     t = np.linspace(0.0, 1.0, cells + 1)
     if rims == "01":
         half = 0.5 * (2 * np.minimum(t, 1 - t)) ** GRADING
@@ -46,7 +49,7 @@ def lines(length: float, cells: int, rims: str) -> np.ndarray:
 
 
 def grid(r: np.ndarray, z: np.ndarray) -> Grid:
-    """Rectangles between the lines, each cut in two, with nodes in the middle of every edge."""
+    """Return rectangles between the lines, each cut into two triangles, with nodes in the middle of every edge."""
 
     def halves(x: np.ndarray) -> np.ndarray:
         return np.insert(x, np.arange(1, len(x)), (x[1:] + x[:-1]) / 2)
@@ -72,7 +75,7 @@ def grid(r: np.ndarray, z: np.ndarray) -> Grid:
 
 
 def _rule() -> tuple[np.ndarray, np.ndarray]:
-    """Seven points of a triangle (7, 3), exact to degree 5, and their weights (Radon 1948)."""
+    """Return seven integration points of a triangle (7, 3), exact to degree 5, and their weights (Radon 1948)."""
     s = math.sqrt(15.0)
     a, b = (6 - s) / 21, (6 + s) / 21
     points = [[1 / 3, 1 / 3, 1 / 3]]
@@ -82,7 +85,10 @@ def _rule() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shapes(L: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quadratic functions (6,) at one point and their gradients (e, 6, 2), from areas L (3,), gradients G (e, 3, 2)."""
+    """Return quadratic shape functions (6,) at one point and their gradients (e, 6, 2).
+
+    L (3,) are the area coordinates, and G (e, 3, 2) are their gradients.
+    """
     N = [L[a] * (2 * L[a] - 1) for a in range(3)]
     D = [(4 * L[a] - 1) * G[:, a] for a in range(3)]
     for a, b in ((0, 1), (1, 2), (2, 0)):
@@ -92,9 +98,11 @@ def _shapes(L: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def system(mesh: Grid, ratio: float, mixed: bool = True) -> sp.csc_matrix:
-    """Stiffness over the shear modulus; `mixed` with pressures over it after the 2 n displacements, else without.
+    """Return the stiffness matrix divided by the shear modulus.
 
-    The energy is that of small strain: |dev e|^2 + K/2 (div u)^2 with a shear modulus of 1, integrated 2 pi r dr dz.
+    With `mixed`, the unknowns are 2 n displacements followed by pressures over the shear modulus; otherwise
+    displacements. The energy is that of small strain, |dev e|^2 + K/2 (div u)^2 with a shear modulus of 1, integrated 2
+    pi r dr dz.
     """
     x, T = mesh.nodes[mesh.triangles[:, :3]], mesh.triangles
     edge = x[:, [2, 0, 1]] - x[:, [1, 2, 0]]
@@ -131,7 +139,7 @@ def _assembled(blocks: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape:
 
 
 def stiffness(K: sp.csc_matrix, held: np.ndarray, moved: np.ndarray) -> float:
-    """Force on the unknowns `moved`, all by one, while those `held` are zero."""
+    """Return the force on the unknowns `moved`, which are all 1, while the unknowns `held` are 0."""
     x = np.zeros(K.shape[0])
     x[moved] = 1.0
     free = np.setdiff1d(np.arange(len(x)), np.concatenate([held, moved]))
@@ -140,23 +148,28 @@ def stiffness(K: sp.csc_matrix, held: np.ndarray, moved: np.ndarray) -> float:
 
 
 def compliance(K: sp.csc_matrix, held: np.ndarray, load: np.ndarray) -> float:
-    """Work of a load in what it does: load . x."""
+    """Return load . x, with the unknowns x that the load causes."""
     free = np.setdiff1d(np.arange(K.shape[0]), held)
     return float(load[free] @ splu(K[free][:, free]).solve(load[free]))
 
 
 def tension(height: float, ratio: float, cells: int, mixed: bool = True) -> float:
-    """Force over mu R d of a cylinder between glued plates pulled apart by d; the upper half, held in the middle."""
+    """Return the force over mu R d of a cylinder between glued plates that are pulled apart by d.
+
+    The mesh is the upper half, fixed axially in the middle plane.
+    """
     mesh = grid(lines(1.0, cells, "1"), lines(height / 2, cells, "1"))
     r, z = mesh.nodes.T
     n, top, axis, middle = len(r), np.flatnonzero(z == height / 2), np.flatnonzero(r == 0), np.flatnonzero(z == 0)
     held = np.unique(np.concatenate([top, axis, n + middle]))
-    # The half is pulled by d / 2.
+    # The half cylinder is stretched by d / 2.
     return stiffness(system(mesh, ratio, mixed), held, n + top) / 2
 
 
 def punch(height: float, ratio: float, cells: int, mixed: bool = True, radius: float = PUNCH) -> float:
-    """Force over mu R d of a glued flat punch of `radius` R, pressed by d into a cylinder on a glued plate."""
+    """Return the force over mu R d of a glued flat punch of `radius` R, pressed by d into a cylinder on a glued
+    plate.
+    """
     under, beside = lines(radius, cells, "1"), radius + lines(1 - radius, cells, "01")[1:]
     mesh = grid(np.concatenate([under, beside]), lines(height, 2 * cells, "01"))
     r, z = mesh.nodes.T
@@ -167,7 +180,9 @@ def punch(height: float, ratio: float, cells: int, mixed: bool = True, radius: f
 
 
 def creep(height: float, ratio: float, cells: int, mixed: bool = True) -> float:
-    """Mean displacement of the top over R t / mu of a cylinder on a glued plate, pulled by a uniform t on its top."""
+    """Return the mean displacement of the top over R t / mu of a cylinder on a glued plate, under a uniform
+    tension t.
+    """
     mesh = grid(lines(1.0, cells, "1"), lines(height, cells, "0"))
     r, z = mesh.nodes.T
     n, bottom, axis = len(r), np.flatnonzero(z == 0), np.flatnonzero(r == 0)
@@ -175,7 +190,7 @@ def creep(height: float, ratio: float, cells: int, mixed: bool = True) -> float:
     load = np.zeros(K.shape[0])
     top = np.flatnonzero(z == height)
     top = top[np.argsort(r[top])]
-    # Integrals of N 2 pi r over an edge from a to b with its middle: Simpson's rule is exact for this cubic.
+    # Integrals of N 2 pi r over an edge from a to b with middle node c. Simpson's rule is exact for this cubic.
     for a, c, b in zip(top[:-2:2], top[1:-1:2], top[2::2], strict=True):
         length = r[b] - r[a]
         load[n + np.array([a, c, b])] += 2 * math.pi * length / 6 * np.array([r[a], 4 * r[c], r[b]])
@@ -186,7 +201,9 @@ TESTS = {"tension": tension, "punch": punch, "creep": creep}
 
 
 def converged(test: str, height: float, ratio: float, cells: int, **other: float) -> dict[str, Any]:
-    """A number on three grids, the observed order, its extrapolation, and how far that is from the finest [1]."""
+    """Return a number on three grids, the observed order, the extrapolation, and its difference from the finest grid
+    [1].
+    """
     coarse, middle, fine = (TESTS[test](height, ratio, n, **other) for n in (cells // 4, cells // 2, cells))
     order = math.log2(abs((middle - coarse) / (fine - middle)))
     value = fine + (fine - middle) / (2 ** max(order, 1.0) - 1)
@@ -204,7 +221,7 @@ def converged(test: str, height: float, ratio: float, cells: int, **other: float
 
 
 def main() -> None:
-    """The table: every test at every height and ratio, and other punches at some."""
+    """Write the table: every test at every height and ratio, and other punches at some of them."""
     own = {"tension": {}, "punch": {"radius": PUNCH}, "creep": {}}
     cases = [(test, h, k, own[test]) for test in TESTS for h in ASPECTS for k in RATIOS]
     cases += [("punch", h, k, {"radius": a}) for a in OTHERS for h in (ASPECTS[0], 1.0) for k in (3.0, 1e4)]

@@ -1,9 +1,9 @@
 """Cook's membrane by another program: plane strain, quadratic triangles with linear pressures (scikit-fem, SciPy).
 
-Writes data of `experiments.benchmarks.elements`: the mean rise of the membrane's right edge. Nothing of this project is
-imported; the energy, mu/2 (Ibar1 - 3) + K/2 (J - 1)^2, and its derivatives stand here once more, with the pressure
-p = K (J - 1) as an unknown. The grid is graded to its corners: at the clamp's upper one the stress has no bound, at the
-two right ones the shear does not fit the free edges.
+Writes data for `experiments.benchmarks.elements`: the mean rise of the membrane's right edge. No code of this project
+is imported. The energy, mu/2 (Ibar1 - 3) + K/2 (J - 1)^2, and its derivatives are implemented here independently, with
+the pressure p = K (J - 1) as an unknown. The grid is graded to its corners. At the upper corner of the clamp the stress
+is singular. At the two right corners the shear load does not fit the free edges.
 
     pip install '.[reference]' && python -m experiments.sources.cooks_membrane
 """
@@ -28,14 +28,14 @@ from skfem import (
 from skfem.helpers import ddot, det, grad
 
 FILE = Path(__file__).parents[1] / "results" / "cooks_membrane.json"
-#: Shear modulus [Pa], shear traction over it, K/mu, and cells along each side: the last grid is the answer.
+#: Shear modulus [Pa], shear traction over it, K/mu, and cells along each side. The last grid gives the result.
 MU, LOAD, RATIOS, CELLS = 770.0, 0.01, (1.0, 3.0, 100.0, 1e4), (16, 32, 64)
-#: The distance of line t of n to the nearer side goes as t to this power.
+#: The distance of line t (of n) from the nearer side is proportional to t to this power.
 GRADING = 2.5
 
 
 def grid(n: int) -> MeshTri:
-    """n x n quadrilaterals, each cut in two [m]."""
+    """Return n x n quadrilaterals, each cut into two triangles [m]."""
     t = np.linspace(0, 1, n + 1)
     half = 0.5 * (2 * np.minimum(t, 1 - t)) ** GRADING
     lines = np.where(t <= 0.5, half, 1 - half)
@@ -45,7 +45,7 @@ def grid(n: int) -> MeshTri:
 
 
 def state(w: Any) -> tuple[Any, Any, Any]:
-    """F, J and F^-T at the points."""
+    """Return F, J and F^-T at the integration points."""
     F = grad(w["u"]) + np.eye(2)[:, :, None, None]
     J = det(F)
     return F, J, np.array([[F[1, 1], -F[1, 0]], [-F[0, 1], F[0, 0]]]) / J
@@ -53,7 +53,10 @@ def state(w: Any) -> tuple[Any, Any, Any]:
 
 @LinearForm
 def forces(v, w):
-    """First Piola stress: mu J^-2/3 (F - I1/3 F^-T) + p J F^-T, I1 with the stretch of 1 across the plane."""
+    """Internal virtual work with the first Piola stress mu J^-2/3 (F - I1/3 F^-T) + p J F^-T.
+
+    I1 contains the stretch of 1 perpendicular to the plane.
+    """
     F, J, inverse = state(w)
     P = MU * J ** (-2 / 3) * (F - (ddot(F, F) + 1) / 3 * inverse) + w["p"] * J * inverse
     return ddot(P, grad(v))
@@ -61,13 +64,13 @@ def forces(v, w):
 
 @LinearForm
 def volumes(q, w):
-    """J - 1 = p / K."""
+    """Weak form of J - 1 = p / K."""
     return (state(w)[1] - 1 - w["p"] / w["K"]) * q
 
 
 @BilinearForm
 def stiffness(du, v, w):
-    """Derivative of `forces` by the displacement."""
+    """Derivative of `forces` with respect to the displacement."""
     F, J, inverse = state(w)
     H, I1, a = grad(du), ddot(F, F) + 1, MU * J ** (-2 / 3)
     trace, turned = ddot(inverse, H), -np.einsum("ij...,kj...,kl...->il...", inverse, H, inverse)
@@ -77,19 +80,19 @@ def stiffness(du, v, w):
 
 @BilinearForm
 def coupling(du, q, w):
-    """Derivative of J."""
+    """Derivative of `volumes` with respect to the displacement: that of J."""
     _, J, inverse = state(w)
     return J * ddot(inverse, grad(du)) * q
 
 
 @BilinearForm
 def compliance(p, q, w):
-    """Of the pressures."""
+    """Derivative of `volumes` with respect to the pressure."""
     return -p * q / w["K"]
 
 
 def mean_rise(n: int, ratio: float) -> float:
-    """Mean rise [m] of the right edge: Newton's method in two load steps."""
+    """Return the mean rise [m] of the right edge, by Newton's method in two load steps."""
     mesh = grid(n)
     u_basis = Basis(mesh, ElementVector(ElementTriP2()), intorder=6)
     p_basis = u_basis.with_element(ElementTriP1())
@@ -117,7 +120,7 @@ def mean_rise(n: int, ratio: float) -> float:
 
 
 def main() -> None:
-    """Values by K/mu, of every grid."""
+    """Write the values for each K/mu on every grid."""
     found = {f"{ratio:g}": {str(n): mean_rise(n, ratio) for n in CELLS} for ratio in RATIOS}
     print(json.dumps(found, indent=1))
     FILE.write_text(json.dumps(found, indent=1) + "\n")

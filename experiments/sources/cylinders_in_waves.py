@@ -1,9 +1,9 @@
 """Exact motion of plane shear waves that meet stiff cylinders, in an unbounded incompressible medium (NumPy, SciPy).
 
-The motion is in the plane: u = grad(phi) + curl(psi e_z), with phi harmonic and psi of Helmholtz's equation on both
-sides (Ewing, Jardetzky and Press 1957, Elastic Waves in Layered Media, chapter 2). Outside are the plane waves and,
-about every cylinder, outgoing modes; inside are regular ones. Motion and traction are continuous: least squares at
-points of the circles. Nothing of this project is imported.
+The motion is in the plane: u = grad(phi) + curl(psi e_z). On both sides, phi is harmonic and psi satisfies Helmholtz's
+equation (Ewing, Jardetzky and Press 1957, Elastic Waves in Layered Media, chapter 2). Outside, the solution consists of
+the plane waves and of outgoing modes about every cylinder. Inside, the modes are regular. Motion and traction are
+continuous at points of the circles, in the sense of least squares. No code of this project is imported.
 """
 
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import h2vp, hankel2, jv, jvp
 
-#: Modes -MODES to MODES about every cylinder, and points on its circle.
+#: Modes -MODES to MODES about every cylinder, and number of points on its circle.
 MODES, POINTS = 18, 80
 KINDS = ("phi outside", "psi outside", "phi inside", "psi inside")
-#: Angle of the direction [rad], and amplitude [m].
+#: Angle of the direction of propagation [rad], and amplitude [m].
 Wave = tuple[float, complex]
 
 
 class Medium(NamedTuple):
-    """Moduli at one angular frequency [rad/s]."""
+    """Complex shear moduli inside and outside the cylinders at one angular frequency [rad/s], and density."""
 
     outside: complex  # [Pa]
     inside: complex  # [Pa]
@@ -27,12 +27,12 @@ class Medium(NamedTuple):
     density: float
 
     def number(self, outside: bool) -> complex:
-        """Wave number [1/m]."""
+        """Return the wave number [1/m]."""
         return self.omega * np.sqrt(self.density / (self.outside if outside else self.inside))
 
 
 class Mode(NamedTuple):
-    """exp(i n t) about a cylinder."""
+    """A function proportional to exp(i n t), with the angle t about a cylinder."""
 
     cylinder: int
     kind: str
@@ -40,23 +40,23 @@ class Mode(NamedTuple):
 
     @property
     def outside(self) -> bool:
-        """Whether it is a motion of the medium about the cylinder."""
+        """Whether the mode is a motion of the medium around the cylinder."""
         return self.kind.endswith("outside")
 
 
 def motion(
     points: np.ndarray, cylinders: list[tuple[tuple[float, float], float]], medium: Medium, waves: list[Wave]
 ) -> np.ndarray:
-    """The motion (n, 2) at points (n, 2) [m].
+    """Return the motion (n, 2) at points (n, 2) [m].
 
     Args:
-        points: where.
-        cylinders: centre and radius of each [m].
-        medium: outside and inside.
-        waves: angle of the direction [rad] and amplitude at the origin [m] of each; all are polarised across.
+        points: positions.
+        cylinders: centre and radius of each cylinder [m].
+        medium: moduli outside and inside.
+        waves: angle of the direction [rad] and amplitude at the origin [m] of each wave; polarised perpendicular to it.
 
     Raises:
-        ValueError: motion and traction are not continuous to a millionth.
+        ValueError: the jump of motion or traction is above a millionth.
     """
     modes = [
         Mode(c, kind, n)
@@ -104,7 +104,7 @@ def _plane(angle: float, points: np.ndarray, medium: Medium) -> tuple[np.ndarray
 
 
 def _mode(mode: Mode, points: np.ndarray, cylinders: list, medium: Medium) -> tuple[np.ndarray, np.ndarray]:
-    """Motion (n, 2) and stress (n, 2, 2) of an amplitude of 1."""
+    """Return motion (n, 2) and stress (n, 2, 2) of a mode with amplitude 1."""
     centre, radius = cylinders[mode.cylinder]
     at, n, G = points - np.array(centre), mode.n, medium.outside if mode.outside else medium.inside
     r, t = np.hypot(*at.T), np.arctan2(at[:, 1], at[:, 0])

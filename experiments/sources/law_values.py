@@ -1,8 +1,8 @@
-"""Energies, stresses and moduli of every law with 50 digits, from the printed energies alone.
+"""Energies, stresses and moduli of every law with 50 digits, computed from the published energies alone.
 
 ``python -m experiments.sources.law_values`` writes tests/law_values.json, which tests/test_law_values.py compares the
-laws with. Nothing of the laws' code is used: energies are functions of F by invariants, principal stretches or Green's
-strain, and all derivatives are numerical ones of mpmath. Needs mpmath: ``pip install '.[test]'``.
+laws with. No code of the laws is used. Energies are functions of F, computed with invariants, principal stretches or
+Green's strain. All derivatives are numerical ones of mpmath. Needs mpmath: ``pip install '.[test]'``.
 """
 
 import json
@@ -16,7 +16,7 @@ import mpmath as mp
 TABLE = Path(__file__).parents[2] / "tests" / "law_values.json"
 DIGITS = 50
 
-#: Deformation gradients: J = 1.22, 0.48, 1.26 and -0.53; none is symmetric, the stretches of each differ.
+#: Deformation gradients: J = 1.22, 0.48, 1.26 and -0.53. None is symmetric, and the stretches of each differ.
 GRADIENTS = {
     "stretched": [[1.2, 0.15, 0.3], [-0.1, 0.9, 0.2], [0.05, -0.12, 1.1]],
     "compressed": [[1.0, -0.4, 0.1], [0.3, 0.6, -0.25], [-0.15, 0.2, 0.6]],
@@ -27,7 +27,7 @@ POSITIVE = ("stretched", "compressed", "large")
 #: The direction of second derivatives.
 DIRECTION = [[0.3, -0.7, 0.2], [0.5, 0.4, -0.6], [-0.1, 0.8, 0.9]]
 
-#: Laws with parameters that all differ from 0 and from each other; several laws of a case add up.
+#: Laws with parameters that all differ from 0 and from each other. Several laws of a case are added.
 CASES: dict[str, list[dict[str, Any]]] = {
     "neo_hookean": [dict(name="neo_hookean", mu=770.0, bulk=7700.0)],
     "neo_hookean_compressible": [dict(name="neo_hookean_compressible", mu=770.0, lame_lambda=3080.0)],
@@ -75,25 +75,28 @@ FINITE = (
 
 
 def invariants(F: mp.matrix) -> tuple:
-    """I1, I2 of C = F^T F, and J."""
+    """Return I1 and I2 of C = F^T F, and J."""
     C = F.T * F
     I1 = trace(C)
     return I1, (I1**2 - trace(C * C)) / 2, mp.det(F)
 
 
 def trace(A: mp.matrix) -> Any:
-    """Sum of the diagonal."""
+    """Return the sum of the diagonal."""
     return A[0, 0] + A[1, 1] + A[2, 2]
 
 
 def power_sum(F: mp.matrix, J: Any, alpha: float) -> Any:
-    """Xi(alpha) - 3, from the eigenvalues of C (squares of the principal stretches)."""
+    """Return Xi(alpha) - 3, from the eigenvalues of C (squares of the principal stretches)."""
     squares = mp.eigsy(F.T * F, eigvals_only=True)
     return sum((v / J ** (mp.mpf(2) / 3)) ** (mp.mpf(alpha) / 2) for v in squares) - 3
 
 
 def exponent_of_costa(law: dict, F: mp.matrix) -> Any:
-    """Q: E by the axes fibre, sheet made orthogonal to it, normal."""
+    """Return the exponent Q of Costa's law.
+
+    Green's strain E is resolved along the axes fibre, sheet (made orthogonal to the fibre) and normal.
+    """
     f, s = (mp.matrix(law[k]) for k in ("fibre", "sheet"))
     s = s - (f.T * s)[0] / (f.T * f)[0] * f
     n = mp.matrix([f[1] * s[2] - f[2] * s[1], f[2] * s[0] - f[0] * s[2], f[0] * s[1] - f[1] * s[0]])
@@ -108,15 +111,15 @@ def exponent_of_costa(law: dict, F: mp.matrix) -> Any:
 
 
 def inverse_langevin(terms: int) -> list[Fraction]:
-    """a_1, a_3, …: the inverse of coth(y) - 1/y = sum_n 4^n B_2n / (2n)! y^(2n-1) as a power series, exactly."""
+    """Return a_1, a_3, …: exact power series of the inverse of coth(y) - 1/y = sum_n 4^n B_2n / (2n)! y^(2n-1)."""
     numerators = [mp.bernfrac(2 * n) for n in range(1, terms + 1)]
     forward = [Fraction(4**n * p, q * int(mp.factorial(2 * n))) for n, (p, q) in enumerate(numerators, 1)]
     found: list[Fraction] = []
-    for n in range(terms):  # the coefficient of x^(2n+1) in forward(found(x)) is 1 for n = 0, else 0
+    for n in range(terms):  # the coefficient of x^(2n+1) in forward(found(x)) is 1 for n = 0, otherwise 0
         trial = [*found, Fraction(0)]
         power, total = trial, forward[0] * trial[n]
         square = product(trial, trial)
-        for m in range(1, n + 1):  # y^(2m+1) begins at x^(2m+1)
+        for m in range(1, n + 1):  # the series of y^(2m+1) begins at x^(2m+1)
             power = product(power, square)
             total += forward[m] * power[n - m]
         found.append(((1 if n == 0 else 0) - total) / forward[0])
@@ -124,19 +127,21 @@ def inverse_langevin(terms: int) -> list[Fraction]:
 
 
 def product(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
-    """Of two series, cut at the length of the first."""
+    """Return the product of two power series, cut at the length of the first."""
     return [sum((a[i] * b[n - i] for i in range(n + 1)), Fraction(0)) for n in range(len(a))]
 
 
 def arruda_boyce(mu: Any, N: Any, I1: Any) -> Any:
-    """mu N times the integral of the inverse Langevin function to sqrt(I1 / (3 N)), from rest, to five terms."""
+    """Return mu N times the integral of the inverse Langevin function from rest to sqrt(I1 / (3 N)), with five
+    terms.
+    """
     a = inverse_langevin(5)
     terms = ((mp.mpf(c.numerator) / c.denominator / (2 * k), k) for k, c in enumerate(a, 1))
     return mu * N * sum(c * ((I1 / (3 * N)) ** k - (1 / mp.mpf(N)) ** k) for c, k in terms)
 
 
 def volumetric(law: dict, J: Any) -> Any:
-    """U(J); below J = c its Taylor parabola at c."""
+    """Return U(J). Below J = c it is the Taylor parabola of U at c."""
     kind, K, c = law.get("volumetric", "quadratic"), mp.mpf(law["bulk"]), mp.mpf(law.get("continued_below", "-inf"))
     U = {
         "quadratic": lambda J: K / 2 * (J - 1) ** 2,
@@ -150,7 +155,7 @@ def volumetric(law: dict, J: Any) -> Any:
 
 
 def whole_energy(law: dict, F: mp.matrix) -> Any:
-    """Of laws that are no sum of an isochoric and a volumetric energy."""
+    """Return the energy of laws that are not a sum of an isochoric and a volumetric energy."""
     (I1, _, J), mu, lam = invariants(F), mp.mpf(law["mu"]), mp.mpf(law["lame_lambda"])
     c = mp.mpf(law.get("continued_below", "-inf"))
     match law["name"]:
@@ -169,7 +174,7 @@ def whole_energy(law: dict, F: mp.matrix) -> Any:
 
 
 def isochoric_energy(law: dict, F: mp.matrix, J: Any) -> Any:
-    """Of every law that has a volumetric energy beside it."""
+    """Return the isochoric energy of a law that has a separate volumetric energy."""
     I1, I2, _ = invariants(F)
     a, b = I1 / J ** (mp.mpf(2) / 3) - 3, I2 / J ** (mp.mpf(4) / 3) - 3
     p = {key: mp.mpf(v) for key, v in law.items() if isinstance(v, float)}
@@ -201,7 +206,9 @@ def isochoric_energy(law: dict, F: mp.matrix, J: Any) -> Any:
 
 
 def energy(laws: list[dict], F: mp.matrix) -> Any:
-    """Strain energy density [Pa]; below c an isochoric energy is that at c^2 / (2 c - J) in place of J."""
+    """Return the strain energy density [Pa]. Below J = c, an isochoric energy is evaluated with c^2 / (2 c - J)
+    for J.
+    """
     total = mp.mpf(0)
     for law in laws:
         if "bulk" not in law:
@@ -216,19 +223,19 @@ def energy(laws: list[dict], F: mp.matrix) -> Any:
 
 
 def derivative(laws: list[dict], F: mp.matrix, H: mp.matrix, order: int) -> Any:
-    """The order-th derivative of the energy at F in the direction H."""
+    """Return the derivative of the energy of this order at F in the direction H."""
     return mp.diff(lambda t: energy(laws, F + t * H), 0, order)
 
 
 def unit(i: int, j: int) -> mp.matrix:
-    """e_i (x) e_j."""
+    """Return e_i (x) e_j."""
     E = mp.zeros(3)
     E[i, j] = mp.mpf(1)
     return E
 
 
 def at_gradient(laws: list[dict], F: list[list[float]]) -> dict[str, Any]:
-    """Energy [Pa], first Piola stress [Pa] and the second derivative in `DIRECTION` [Pa], as floats."""
+    """Return energy [Pa], first Piola stress [Pa] and the second derivative in `DIRECTION` [Pa], as floats."""
     A = mp.matrix(F)
     return {
         "energy": float(energy(laws, A)),
@@ -238,7 +245,7 @@ def at_gradient(laws: list[dict], F: list[list[float]]) -> dict[str, Any]:
 
 
 def at_rest(laws: list[dict]) -> dict[str, float]:
-    """Ground-state shear and bulk modulus [Pa]: Voigt's means over all directions."""
+    """Return the ground-state shear and bulk modulus [Pa]: Voigt averages over all directions."""
     second: Callable[[mp.matrix], Any] = lambda H: derivative(laws, mp.eye(3), H, 2)  # noqa: E731
     every = sum(second((unit(i, j) + unit(j, i)) / 2) for i in range(3) for j in range(3))
     spherical = second(mp.eye(3))
@@ -246,7 +253,7 @@ def at_rest(laws: list[dict]) -> dict[str, float]:
 
 
 def values(name: str) -> dict[str, Any]:
-    """All numbers of a case."""
+    """Return all numbers of a case."""
     gradients = GRADIENTS if name in FINITE else POSITIVE
     with mp.workdps(DIGITS):
         at = {g: at_gradient(CASES[name], GRADIENTS[g]) for g in gradients}
@@ -254,7 +261,7 @@ def values(name: str) -> dict[str, Any]:
 
 
 def text(value: Any, indent: str = "") -> str:
-    """JSON of nested dictionaries, an entry a line."""
+    """Return JSON of nested dictionaries, with one entry per line."""
     if not isinstance(value, dict):
         return json.dumps(value)
     rows = ",\n".join(f"{indent} {json.dumps(key)}: {text(v, indent + ' ')}" for key, v in value.items())
@@ -262,7 +269,7 @@ def text(value: Any, indent: str = "") -> str:
 
 
 def main() -> None:
-    """Writes the table."""
+    """Write the table."""
     table = {"gradients": GRADIENTS, "direction": DIRECTION, "cases": {name: values(name) for name in CASES}}
     TABLE.write_text(text(table) + "\n")
 

@@ -1,7 +1,7 @@
 """Make the tables of data/: ``python -m experiments.sources.make_data FOLDER``.
 
-FOLDER holds the folders lions_mane and curves.
-Without FOLDER only the tables that follow from the chapter are rewritten.
+FOLDER contains the folders lions_mane and curves. Without FOLDER, only the tables that follow from the chapter are
+written.
 """
 
 import sys
@@ -50,12 +50,12 @@ BRAIN = """\
 test,stretch,shear,nominal_stress_kPa
 """
 
-#: Table 2 (the g's are ratios, not Pa as printed).
+#: Table 2 (the values g are ratios, not Pa as printed).
 TABLE_2 = Maxwell(jnp.array(770.0), jnp.array([0.235, 0.333]), jnp.array([0.27, 0.03]))
 
 
 def lions_mane(folder: Path) -> None:
-    """Mean and standard deviation of the raw sweeps."""
+    """Write mean and standard deviation of the raw sweeps."""
     files = sorted(folder.glob("lion-frequency-inplane-*.csv"))
     raw = np.stack([np.loadtxt(f, delimiter=",", skiprows=2) for f in files])
     gaps = [float(f.open().readline().split("preload ")[1].split(" um")[0]) for f in files]
@@ -67,7 +67,7 @@ def lions_mane(folder: Path) -> None:
 
 
 def porcine_liver() -> None:
-    """Moduli that Table 2 implies, all digits."""
+    """Write the moduli that follow from Table 2, with all digits."""
     f = np.geomspace(0.1, 4.0, 16)
     storage, loss = moduli(TABLE_2, jnp.asarray(2 * np.pi * f))
     with (DATA / "porcine_liver_frequency_sweep.csv").open("w") as out:
@@ -77,7 +77,7 @@ def porcine_liver() -> None:
 
 
 def rubber(folder: Path) -> None:
-    """All points of Treloar's three tests."""
+    """Write all points of Treloar's three tests."""
     with (DATA / "rubber_curves.csv").open("w") as out:
         out.write(RUBBER)
         for letters, test in (("UT", "uniaxial"), ("ET", "equibiaxial"), ("PS", "pure_shear")):
@@ -86,7 +86,7 @@ def rubber(folder: Path) -> None:
 
 
 def brain(folder: Path) -> None:
-    """Every second point of one region's tests."""
+    """Write every second point of the tests on one region."""
     with (DATA / "brain_cortex_curves.csv").open("w") as out:
         out.write(BRAIN)
         for letters in ("UT_T", "UT_C"):

@@ -1,9 +1,10 @@
 """Make data/liver_phantom.vtu: a liver-shaped PHANTOM, not an anatomy, from an implicit surface.
 
-``pip install '.[mesher]' && python -m experiments.sources.make_liver``. Two lobes, about 28 x 16 x 8 cm and 1.5 l,
-node sets `vena_cava` (a patch of the back, where the vessel would hold it) and `suspensory_ligament` (a strip of the
-top between the lobes). Axes: x from left to right lobe, y from front to back, z upwards, in metres. A patient's own
-mesh goes in by the same scene file."""
+``pip install '.[mesher]' && python -m experiments.sources.make_liver``. The phantom has two lobes, about 28 x 16 x 8 cm
+and 1.5 l. Its node sets are `vena_cava` (a patch of the back, where the vessel would support it) and
+`suspensory_ligament` (a strip of the top between the lobes). The axes are x from left to right lobe, y from front to
+back, z upwards, in metres. A patient's own mesh can be used in the same scene file.
+"""
 
 from pathlib import Path
 
@@ -15,24 +16,26 @@ import liverjax as lj
 from liverjax.physics.boundary import boundary_triangles
 
 FILE = Path(__file__).parents[2] / "data" / "liver_phantom.vtu"
-#: Lobes as ellipsoids: centre and semi-axes [m]; the left one is flatter and thins out.
+#: Lobes as ellipsoids: centre and semi-axes [m]. The left one is flatter and becomes thin towards its end.
 LOBES = (((0.055, 0.0, 0.0), (0.090, 0.080, 0.041)), ((-0.060, -0.012, 0.008), (0.085, 0.055, 0.027)))
 VOLUME = 1.5e-3
-SPACING = 0.0113  # of the surface's grid [m]
+SPACING = 0.0113  # grid spacing for the surface [m]
 
 
 def level(points: np.ndarray) -> np.ndarray:
-    """Signed blend of the lobes, about a distance in units of a lobe's size, negative inside."""
+    """Return a smooth union of the lobes: about the distance from the surface in units of a lobe's size, negative
+    inside.
+    """
     f = np.stack([np.linalg.norm((points - c) / np.asarray(r), axis=-1) - 1 for c, r in map(np.array, LOBES)])
     sharpness = 6.0
     blend = -np.log(np.sum(np.exp(-sharpness * f), axis=0)) / sharpness
-    # A shallow dent below, where the vessels enter.
+    # A shallow dent on the lower side, where the vessels enter.
     dent = np.exp(-np.sum(((points - np.array([0.01, 0.0, -0.045])) / 0.035) ** 2, axis=-1))
     return blend + 0.35 * dent
 
 
 def surface(offset: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of level = offset, evened out and drawn back onto the surface."""
+    """Return vertices and triangles of level = offset, smoothed and projected back onto the surface."""
     low, high = np.array([-0.17, -0.11, -0.07]), np.array([0.17, 0.11, 0.07])
     shape = np.ceil((high - low) / spacing).astype(int) + 1
     grid = low + spacing * np.moveaxis(np.indices(shape), 0, -1)
@@ -46,7 +49,7 @@ def surface(offset: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(30):
         mean = np.array([vertices[n].mean(axis=0) for n in neighbours])
         vertices = 0.5 * vertices + 0.5 * mean
-        for _ in range(3):  # Newton along the gradient
+        for _ in range(3):  # Newton iterations along the gradient
             h = 1e-5
             slope = np.stack([(level(vertices + h * e) - level(vertices - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
             step = (level(vertices) - offset) / np.sum(slope**2, axis=1)
@@ -55,13 +58,16 @@ def surface(offset: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def enclosed(vertices: np.ndarray, triangles: np.ndarray) -> float:
-    """Volume of a closed surface [m^3], by the divergence theorem."""
+    """Return the volume of a closed surface [m^3], by the divergence theorem."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     return abs(float(np.sum(a * np.cross(b, c)))) / 6
 
 
 def filled(spacing: float, largest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points and tetrahedra of at most `largest` [m^3], of the phantom; `spacing` [m] of its surface's grid."""
+    """Return points and tetrahedra of the phantom.
+
+    The volume of a tetrahedron is at most `largest` [m^3]; `spacing` [m] is that of the grid for the surface.
+    """
     low, high = -0.3, 0.3
     for _ in range(18):
         offset = (low + high) / 2
@@ -78,7 +84,7 @@ def filled(spacing: float, largest: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main() -> None:
-    """Find the level of the wanted volume, fill it with tetrahedra, name the node sets, write the file."""
+    """Find the level for the wanted volume, fill it with tetrahedra, name the node sets, and write the file."""
     points, tets = filled(SPACING, 3.2e-7)
     outer = np.unique(boundary_triangles(lj.tet_mesh(points, tets)))
     x, y, z = points[outer].T

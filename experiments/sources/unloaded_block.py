@@ -1,10 +1,11 @@
-"""The shape of a block before its weight acts, by another program (scikit-fem, SciPy) and another method.
+"""The shape of a block without its weight, by another program (scikit-fem, SciPy) and another method.
 
-Writes data of `tests/test_unloaded.py`. The method is that of Govindjee and Mihalic (1996, Comput. Methods Appl. Mech.
-Engrg. 136): equilibrium is written in the given shape, and the way back from it is the unknown. The block is that of
-Mazier et al. (2022, Engineering with Computers 38, DOI 10.1007/s00366-021-01597-z): 2 x 2 x 2 m, neo-Hookean, held
-below, under its weight. Here the cube is the given shape, of linear tetrahedra. Nothing of this project is imported;
-the energy, mu/2 (I1 - 3) - mu ln J + lambda/2 ln^2 J, and its derivatives stand here once more.
+Writes data for `tests/test_unloaded.py`. The method is that of Govindjee and Mihalic (1996, Comput. Methods Appl. Mech.
+Engrg. 136): equilibrium is written in the given loaded shape, and the inverse deformation from this shape is the
+unknown. The block is that of Mazier et al. (2022, Engineering with Computers 38, DOI 10.1007/s00366-021-01597-z): 2 x 2
+x 2 m, neo-Hookean, fixed at its bottom, under its weight. Here the cube is the given shape, with linear tetrahedra. No
+code of this project is imported. The energy, mu/2 (I1 - 3) - mu ln J + lambda/2 ln^2 J, and its derivatives are
+implemented here independently.
 
     pip install '.[reference]' && python -m experiments.sources.unloaded_block
 """
@@ -25,32 +26,32 @@ STEPS = 4
 
 
 def strained(w: Any) -> tuple[np.ndarray, np.ndarray]:
-    """F = f^-1 of the way back f = 1 + grad u, and ln J."""
+    """Return F = f^-1 of the inverse deformation f = 1 + grad u, and ln J."""
     f = np.eye(3)[:, :, None, None] + grad(w["u"])
     return inv(f), -np.log(det(f))
 
 
 def turned(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """A B."""
+    """Return the matrix product A B."""
     return np.einsum("ij...,jk...->ik...", A, B)
 
 
 def stress(F: np.ndarray, ln_J: np.ndarray) -> np.ndarray:
-    """Cauchy stress: (mu (F F^T - 1) + lambda ln J 1) / J."""
+    """Return the Cauchy stress (mu (F F^T - 1) + lambda ln J 1) / J."""
     one = np.eye(3)[:, :, None, None]
     return np.exp(-ln_J) * (MU * (turned(F, np.swapaxes(F, 0, 1)) - one) + LAME * ln_J * one)
 
 
 @LinearForm
 def forces(v, w):
-    """Stress and weight in the given shape, where the density is that of the reference shape over J."""
+    """Virtual work of stress and weight in the given shape, where the density is the reference density over J."""
     F, ln_J = strained(w)
     return ddot(stress(F, ln_J), grad(v)) + w["part"] * DENSITY * GRAVITY * np.exp(-ln_J) * v[2]
 
 
 @BilinearForm
 def slope(du, v, w):
-    """Derivative of `forces` by u: F changes by -F grad(du) F, ln J by -tr(F grad(du))."""
+    """Derivative of `forces` with respect to u: F changes by -F grad(du) F, and ln J by -tr(F grad(du))."""
     F, ln_J = strained(w)
     H = turned(F, grad(du))
     trace = np.einsum("ii...", H)
@@ -62,7 +63,7 @@ def slope(du, v, w):
 
 
 def way_back(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Positions (V, 3) [m] before the weight, by Newton's method in load steps."""
+    """Return positions (V, 3) [m] of the shape without weight, by Newton's method in load steps."""
     basis = Basis(MeshTet(points.T, tetrahedra.T), ElementVector(ElementTetP1()), intorder=2)
     free = basis.complement_dofs(basis.get_dofs(lambda x: x[2] < 1e-9))
     u = basis.zeros()
@@ -80,14 +81,14 @@ def way_back(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def cube() -> tuple[np.ndarray, np.ndarray]:
-    """Points (V, 3) [m] and tetrahedra (E, 4) of cells that are cut in six, all along one diagonal."""
+    """Return points (V, 3) [m] and tetrahedra (E, 4). Each cell is cut into six, always along the same diagonal."""
     lines = SIDE * np.linspace(0, 1, CELLS + 1)
     mesh = MeshTet.init_tensor(lines, lines, lines)
     return mesh.p.T, mesh.t.T
 
 
 def main() -> None:
-    """Mesh and shape."""
+    """Write the mesh and the shape."""
     points, tetrahedra = cube()
     found = way_back(points, tetrahedra)
     top = found[np.abs(points[:, 2] - SIDE) < 1e-9, 2]

@@ -1,1 +1,1 @@
-"""Stiff and extreme cases, and runs that are killed."""
+"""Stiff and extreme cases, and runs that are interrupted."""

@@ -1,8 +1,8 @@
-"""Locking and its remedy: error and iterations against K/mu, with volume changes by element and averaged at the nodes.
+"""Locking and its remedy: error and iterations against K/mu, with volume changes per element or averaged at the nodes.
 
-Cook's membrane (plane strain, mean rise of the right edge in two load steps) and a column twisted by an eighth of a
-turn in five (torque), against a finer mesh with averaged volumes; by a factorisation, and by conjugate gradients;
-the finest meshes in float32 too.
+Two bodies are compared with a finer mesh with averaged volumes: Cook's membrane (plane strain, mean rise of the right
+edge in two load steps) and a column twisted by an eighth of a turn in five steps (torque). The equations are solved by
+a factorisation and by conjugate gradients; the finest meshes also run in float32.
 ``python -m experiments stability_bulk`` (5 minutes) writes results/stability_bulk.json.
 """
 
@@ -28,7 +28,7 @@ COOK, FINEST, COLUMN, TURN = either((4, 8, 16), (2, 4, 8)), either(24, 8), (2, 3
 
 
 def membrane(n: int, ratio: float, **solve) -> tuple[lj.Scene, np.ndarray]:
-    """Cook's membrane of n x n cells, 48 mm wide, and the nodes of its right edge."""
+    """Return Cook's membrane of n x n cells, 48 mm wide, and the nodes of its right edge."""
     flat = shapes.box((1.0, 1.0, 1.0), (n, n, 1))
     s, t, w = np.asarray(flat.points).T
     points = np.stack([48 * s, 44 * s + t * (44 - 28 * s), w], axis=1) * 1e-3
@@ -45,12 +45,12 @@ def membrane(n: int, ratio: float, **solve) -> tuple[lj.Scene, np.ndarray]:
 
 
 def rise(scene: lj.Scene, nodes: np.ndarray, result: lj.Result) -> float:
-    """Mean rise of the right edge [m]."""
+    """Return the mean rise of the right edge [m]."""
     return float(np.mean(np.asarray(result.positions[-1] - scene.mesh.points)[nodes, 1]))
 
 
 def column(n: int, ratio: float, **solve) -> tuple[lj.Scene, np.ndarray]:
-    """A column of n x n x 3 n cells, its top turned in five steps, and the nodes of its top."""
+    """Return a column of n x n x 3 n cells whose top is turned in five steps, and the nodes of its top."""
     mesh = shapes.box((0.02, 0.02, 0.06), (n, n, 3 * n))
     points = np.asarray(mesh.points)
     bottom, top = (np.flatnonzero(np.isclose(points[:, 2], z)) for z in (0.0, 0.06))
@@ -68,14 +68,14 @@ def column(n: int, ratio: float, **solve) -> tuple[lj.Scene, np.ndarray]:
 
 
 def torque(scene: lj.Scene, nodes: np.ndarray, result: lj.Result) -> float:
-    """Torque [N m] at the top."""
+    """Return the torque [N m] at the top."""
     arm = np.asarray(result.positions[-1])[nodes] - [0.01, 0.01, 0.06]
     force = np.asarray(result.reactions[-1])[nodes]
     return float(np.sum(arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]))
 
 
 def ran(made: tuple[lj.Scene, np.ndarray], measure) -> dict:
-    """One run and what it took."""
+    """Run one case. Return its result and cost."""
     scene, nodes = made
     begin = time.perf_counter()
     program = jax.jit(lj.simulate).lower(scene).compile()
@@ -98,7 +98,9 @@ def ran(made: tuple[lj.Scene, np.ndarray], measure) -> dict:
 
 
 def cases(sizes: tuple[int, ...], both: bool) -> list[tuple[int, dict]]:
-    """Cells and choices of the runs of a body; the second mesh also by conjugate gradients where both is true."""
+    """Return cells and settings for the runs of a body. With `both`, the second mesh is also solved by conjugate
+    gradients.
+    """
     chosen = []
     for n in sizes:
         for volumetric in ("element", "nodal"):
@@ -112,7 +114,7 @@ def cases(sizes: tuple[int, ...], both: bool) -> list[tuple[int, dict]]:
 
 
 def main() -> None:
-    """Both bodies, both volumes, every ratio."""
+    """Run both bodies with both volume options and every ratio."""
     rows = []
     bodies = (("Cook's membrane", membrane, rise, COOK, FINEST), ("twisted column", column, torque, COLUMN, 4))
     for ratio in RATIOS:
@@ -128,7 +130,7 @@ def main() -> None:
 
 
 def _pick(rows: list[dict], **of) -> list[dict]:
-    """The converged rows in float64 of a body, mesh, volume and solver."""
+    """Return the converged rows in float64 for a body, mesh, volume option and solver."""
     of |= {"precision": "float64", "code": "converged"}
     return [r for r in rows if all(r[k] == v for k, v in of.items())]
 

@@ -1,7 +1,7 @@
-"""What does it cost to have robustness at hand where it is not needed? The liver under a fifth of gravity, both ways.
+"""Cost of a robust solver where robustness is not needed: the liver under a fifth of gravity, with both options.
 
-``python -m experiments stability_cost`` (4 minutes) writes results/stability_cost.json: steps a second with robust =
-"off" and "projected" in alternating rounds, medians, the largest difference of the positions beside.
+``python -m experiments stability_cost`` (4 minutes) writes results/stability_cost.json: steps per second with robust =
+"off" and "projected" in alternating rounds, as medians, and the largest difference of the positions.
 """
 
 import statistics
@@ -18,7 +18,7 @@ SECONDS, DT, ROUNDS = 2.0, 0.05, either(7, 1)
 
 
 def main() -> None:
-    """Every model."""
+    """Run every model."""
     rows = []
     for name, scene in either(models(), {"hyperelastic": models()["hyperelastic"]}).items():
         programs, compiling, results = {}, {}, {}

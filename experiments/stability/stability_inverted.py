@@ -1,13 +1,17 @@
-"""Inverted and crushed starts: which solver comes back to rest, in how many iterations and how much time?
+"""Inverted and crushed starting positions: which solver returns to rest, with how many iterations and how much time?
 
-A block that hangs under a fifth of gravity begins at scrambled positions with 0, 5, 20, 50 % of its elements inverted
-(50 seeds each), or pressed flat to J = 0.05; the answer is compared with that of a start from rest. Solvers: the
-energy made least with the projected stiffness and with the chapter's regularised one, from the start itself: one step
-of motion of 10,000 s, in which no start may be left. Then plain Newton with load steps. Then both stiffnesses at rest,
-where a start is but a guess: an inverted one is left, and the load is followed from the reference shape. So these last
-rates say that the reference shape is a good start, and nothing about the starts.
+A block that hangs under a fifth of gravity starts from scrambled positions with 0, 5, 20 or 50 % of its elements
+inverted (50 seeds each), or compressed to J = 0.05. The result is compared with that of a run from rest. Three groups
+of solvers are tested:
+
+* Minimisation of the energy with the projected stiffness, or with the chapter's regularised one, from the starting
+  positions themselves. This is one step of motion of 10,000 s, which cannot use another starting point.
+* Plain Newton with load steps.
+* Both stiffnesses in a static run, where a starting position is only a guess. If it is inverted, the load is followed
+  from the reference shape instead. So these rates show only that the reference shape is a good starting point.
+
 ``python -m experiments stability_inverted [LAW …]`` (40 minutes for all laws) writes results/stability_inverted.json,
-or replaces the laws named in it.
+or replaces the named laws in it.
 """
 
 import json
@@ -37,7 +41,7 @@ SOLVERS = {
     "regularised, guess left": lj.Solve(robust="regularised"),
     "projected, guess left, float32": lj.Solve(robust="projected", precision="float32", tolerance=1e-4),
 }
-#: From the start itself: the laws that a solver is tried with; compiling takes a minute a law.
+#: Laws for which a solver starts from the scrambled positions themselves. Compilation takes a minute per law.
 MOVED = {
     "projected, from the start itself": (
         *("stable_neo_hookean", "neo_hookean", "arruda_boyce", "saint_venant_kirchhoff"),
@@ -45,12 +49,13 @@ MOVED = {
     ),
     "regularised, from the start itself": ("stable_neo_hookean", "neo_hookean", "arruda_boyce"),
 }
-#: Same answer: within this part of the block's size; a residual of 1e-8 allows about 1e-9, one of 1e-4 about 1e-5.
+#: Largest difference, relative to the size of the block, of equal results. A residual of 1e-8 allows about 1e-9, a
+#: residual of 1e-4 about 1e-5.
 SAME = {"float64": 1e-6, "float32": 1e-4}
 
 
 def scene(law: lj.Law, solve: lj.Solve) -> lj.Scene:
-    """The block, hanging."""
+    """The hanging block."""
     top = np.flatnonzero(np.asarray(MESH.points)[:, 2] > 0.0999)
     return lj.Scene(
         mesh=MESH,
@@ -62,12 +67,14 @@ def scene(law: lj.Law, solve: lj.Solve) -> lj.Scene:
 
 
 def volume_ratios(x: np.ndarray) -> np.ndarray:
-    """J of every element."""
+    """Return J of every element."""
     return np.asarray(lj.tet_mesh(x, MESH.tetrahedra).volumes / MESH.volumes)
 
 
 def scrambled(part: float, seed: int) -> np.ndarray:
-    """Positions in which about this part of the elements is inverted; 0: as far as none is."""
+    """Return positions in which about this fraction of the elements is inverted. With 0, the largest distortion without
+    inversion.
+    """
     points = np.asarray(MESH.points)
     noise = np.random.default_rng(seed).standard_normal(points.shape)
     low, high = 0.0, 0.3
@@ -79,14 +86,14 @@ def scrambled(part: float, seed: int) -> np.ndarray:
 
 
 def starts() -> dict[str, jax.Array]:
-    """Name -> positions (N, V, 3)."""
+    """Return starting positions (N, V, 3) by name."""
     made = {f"{100 * p:g} % inverted": np.stack([scrambled(p, k) for k in range(SEEDS)]) for p in PARTS}
     crushed = np.asarray(MESH.points) * [1, 1, FLAT] + [0, 0, 0.1 * (1 - FLAT)]
     return {name: jnp.asarray(x) for name, x in made.items()} | {f"crushed to J = {FLAT}": jnp.asarray(crushed[None])}
 
 
 def tried(law: lj.Law, solve: lj.Solve, all_starts: dict[str, jax.Array], rest: np.ndarray) -> dict[str, dict]:
-    """What one solver makes of every start."""
+    """Return the results of one solver from every starting position."""
     block = scene(law, solve)
 
     def one(x):
@@ -119,10 +126,10 @@ def tried(law: lj.Law, solve: lj.Solve, all_starts: dict[str, jax.Array], rest: 
 
 
 def main(names: list[str]) -> None:
-    """Every law, every solver."""
+    """Run every law with every solver."""
     kept = RESULTS / "stability_inverted.json"
     all_starts, content = starts(), {"elements": MESH.number_of_elements, "seeds": SEEDS, "laws": {}}
-    if kept.exists():  # laws that are there already stay
+    if kept.exists():  # laws that are stored already stay
         content["laws"] = json.loads(kept.read_text())["laws"]
     for name in names:
         law = laws.typical(name)
@@ -160,7 +167,9 @@ def _figure(content: dict) -> plt.Figure:
 
 
 def _pictures(all_starts: dict[str, jax.Array]) -> None:
-    """A start of the worst kind, where it ends, and an end that is another equilibrium: folded, if one is."""
+    """Plot a starting position of the worst kind, its end, and an end in another equilibrium: a folded one, if there is
+    any.
+    """
     law, several = laws.typical("stable_neo_hookean"), all_starts["50 % inverted"]
     block = scene(law, SOLVERS["projected, from the start itself"])
     program = jax.jit(lambda x: lj.simulate(block, start=x).positions[-1])
@@ -169,7 +178,7 @@ def _pictures(all_starts: dict[str, jax.Array]) -> None:
     wrong = [np.abs(x - rest).max() > 0.1 * SAME["float64"] for x in found]
     right = wrong.index(False)
     panels = [(several[right], "start, half inverted"), (found[right], "its end")]
-    if any(wrong):  # of few starts none may fold
+    if any(wrong):  # with few starting positions, none may fold
         panels.append((found[wrong.index(True)], "end of another start"))
     figure = plt.figure(figsize=(9.5, 3.6))
     for k, (x, title) in enumerate(panels):

@@ -1,8 +1,8 @@
 """Error of the rigs against run time: whole cylinders and graded sectors, linear and quadratic elements, K/mu.
 
-Tension, a punch of 0.4 of the radius and creep of a neo-Hookean cylinder glued to its plates, at small strain, against
-tests/rig_values.json: converged numbers of a program that shares no line with this one (axisymmetric, small strain,
-`experiments/sources/axisymmetric_reference.py`).
+The tests are tension, a punch of 0.4 of the radius, and creep of a neo-Hookean cylinder glued to its plates, at small
+strain. They are compared with tests/rig_values.json. Its converged numbers come from a program that shares no code with
+this one (axisymmetric, small strain, `experiments/sources/axisymmetric_reference.py`).
 ``python -m experiments stability_rigs`` writes results/stability_rigs.json;
 ``python -m experiments.stability.stability_rigs tension meshes`` runs these parts again.
 """
@@ -24,7 +24,7 @@ from liverjax.core import status
 from liverjax.core.plotting import COLOURS
 
 R, MU = 0.01, 800.0
-#: Small: forth and back, the term of second order in the strain cancels.
+#: A small strain. In the difference of forward and backward steps, the term of second order in the strain cancels.
 PART = 1e-3
 TESTS = ("tension", "punch", "creep")
 VALUES = json.loads((ROOT / "tests" / "rig_values.json").read_text())["rows"]
@@ -33,14 +33,14 @@ ASPECTS = either((0.2, 0.5, 1.0, 2.0, 5.0), (1.0,))
 
 
 def known(test: str, aspect: float, ratio: float) -> float:
-    """The converged number."""
+    """Return the converged number."""
     keys = {"test": test, "height_over_radius": aspect, "bulk_over_shear": ratio}
     rows = [r for r in VALUES if keys.items() <= r.items() and r.get("punch_radius", 0.4) == 0.4]
     return rows[0]["value"]
 
 
 def rigs(test: str, aspect: float, cells: glued.Cells) -> tuple[glued.Rig, float]:
-    """The rig, of two steps forth and back, and what its reading is to be divided by."""
+    """Return the rig, with a step forward and a step back, and the unit that its reading is divided by."""
     height, forth_and_back = aspect * R, np.array([1.0, -1.0]) * PART * R
     if test == "tension":
         return glued.tension(R, height, 1.0, forth_and_back / height, cells), MU * R * PART * R
@@ -50,7 +50,7 @@ def rigs(test: str, aspect: float, cells: glued.Cells) -> tuple[glued.Rig, float
 
 
 def row(test: str, aspect: float, cells: glued.Cells, ratios: tuple[float, ...]) -> list[dict[str, Any]]:
-    """Errors and run times of a rig at some K/mu, by one program."""
+    """Return errors and run times of a rig at some K/mu, with one compiled program."""
     rig, unit = rigs(test, aspect, cells)
     law = lj.laws.NeoHookean(mu=jnp.asarray(MU), bulk=jnp.asarray(MU))
     begin = time.perf_counter()
@@ -84,7 +84,9 @@ def row(test: str, aspect: float, cells: glued.Cells, ratios: tuple[float, ...])
 
 
 def choices() -> list[tuple[str, glued.Cells]]:
-    """Meshes to compare: whole cylinders of one cell size; sectors half, as and twice as fine as the default."""
+    """Return meshes to compare: whole cylinders with one cell size, and sectors half, equally and twice as fine as the
+    default.
+    """
     default, made = glued.Cells(), []
     for order, sizes, fine in ((1, (3, 6), (1.0, 2.0)), (2, (3,), (0.5, 1.0, 2.0))):
         made += [(f"whole, order {order}", default._replace(size=R / n, order=order)) for n in either(sizes, (3,))]
@@ -95,7 +97,7 @@ def choices() -> list[tuple[str, glued.Cells]]:
 
 
 def main(wanted: list[str]) -> None:
-    """The default at every shape, then other meshes at one; or the parts that are named."""
+    """Run the default mesh at every shape, then other meshes at one shape; or only the named parts."""
     file = RESULTS / "stability_rigs.json"
     found: dict[str, list] = {"default": [], "meshes": []}
     if wanted and file.is_file():

@@ -1,8 +1,8 @@
-"""The liver under its full weight at time steps from 1 ms to 10 s: which steps end in equilibrium, and what they take.
+"""The liver under its full weight with time steps from 1 ms to 10 s: which steps reach equilibrium, and at what cost?
 
-Twenty steps of each size, hyperelastic, viscous and complete, as the solver follows the load and with
-robust = "projected", which makes the energy least where following fails; a code a step, in words. The same in
-float32, with how far its nodes lie from those of float64 after the last step.
+Twenty steps of each size are run for the hyperelastic, viscous and complete model. The solver follows the load; with
+robust = "projected" it minimises the energy where following fails. Each step returns a status. The same runs are made
+in float32, and their nodes are compared with those of float64 after the last step.
 ``python -m experiments stability_steps`` (14 minutes) writes results/stability_steps.json.
 """
 
@@ -25,7 +25,7 @@ TOLERANCE = {"float64": 1e-6, "float32": 1e-4}
 
 
 def main() -> None:
-    """Every model, solver and step."""
+    """Run every model, solver and step size."""
     rows, found = [], {}
     for name, scene in either(models(), {"hyperelastic": models()["hyperelastic"]}).items():
         body = lj.Body(density=1060.0, gravity=jnp.array([0.0, 9.81, 0.0]))
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def _row(mesh: lj.TetMesh, result: lj.Result) -> dict:
-    """What happened in a run."""
+    """Return status and cost of a run."""
     codes, s = np.asarray(result.status), result.statistics
     least = [float(determinant(deformation_gradient(mesh, x)).min()) for x in np.asarray(result.positions, float)]
     return {
@@ -59,9 +59,10 @@ def _row(mesh: lj.TetMesh, result: lj.Result) -> dict:
 
 
 def _apart(mesh: lj.TetMesh, result: lj.Result, of: lj.Result) -> float | None:
-    """Largest distance of a node from another run after the last step, over the largest displacement there [1].
+    """Return the largest distance of a node from another run after the last step, over the largest displacement there
+    [1].
 
-    None where a step of either run did not end in equilibrium.
+    Returns None if a step of either run did not reach equilibrium.
     """
     if not all((np.asarray(r.status) == status.CONVERGED).all() for r in (result, of)):
         return None

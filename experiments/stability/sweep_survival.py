@@ -1,7 +1,8 @@
-"""What a sweep survives: 20 kills at random moments, processes on loopback of which one is killed, eight devices.
+"""Robustness of sweeps: 20 kills at random moments, several processes of which one is killed, eight devices.
 
-``python -m experiments sweep_survival`` (5 minutes) writes results/sweep_survival.json. Results are compared byte by
-byte with those of an undisturbed run, those of eight devices by their largest difference.
+The processes run on one machine and find each other by a loopback address. ``python -m experiments sweep_survival`` (5
+minutes) writes results/sweep_survival.json. Results are compared byte by byte with those of an undisturbed run, and
+those of eight devices by their largest difference.
 """
 
 import os
@@ -24,7 +25,7 @@ ROWS, CHUNK, KILLS, SEED = either(4096, 512), 32, either(20, 2), 7
 
 
 class Case:
-    """One sweep in a folder, run as whole processes."""
+    """One sweep in a folder, run as separate processes."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -37,7 +38,7 @@ class Case:
         )
 
     def start(self, out: str, *more: str) -> subprocess.Popen:
-        """A sweep in a process of its own; programs compiled once are found again in a cache."""
+        """Start a sweep in a separate process. Programs that are compiled once are found again in a cache."""
         files = [str(self.folder / name) for name in ("scene.toml", "rows.csv")]
         call = [sys.executable, "-m", "liverjax", "sweep", *files, "--out", str(self.folder / out)]
         kept = {
@@ -53,7 +54,7 @@ class Case:
         )
 
     def run(self, out: str, *more: str) -> float:
-        """Seconds of a complete run."""
+        """Return the seconds of a complete run."""
         begin, process = time.perf_counter(), self.start(out, *more)
         said, _ = process.communicate(timeout=600)
         if process.returncode != 0:
@@ -61,12 +62,12 @@ class Case:
         return time.perf_counter() - begin
 
     def content(self, out: str) -> dict[str, bytes]:
-        """Bytes of every dataset."""
+        """Return the bytes of every dataset."""
         with h5py.File(self.folder / out) as file:
             return {name: value[()].tobytes() for name, value in file.items()}
 
     def finished(self, out: str) -> set[str]:
-        """Chunks that are done, every one of them readable."""
+        """Return the finished chunks, and check that each one can be read."""
         parts = set((self.folder / f"{out}.parts").glob("part_*.h5"))
         for part in parts:
             with h5py.File(part) as file:
@@ -75,7 +76,7 @@ class Case:
 
 
 def kills(case: Case, whole: dict[str, bytes], longest: float) -> dict:
-    """Sweeps killed at random moments and resumed until they are done; the moments are seeded."""
+    """Kill sweeps at random moments and resume them until they are complete. The moments have a fixed seed."""
     moments, done, lost, sweeps, equal = random.Random(SEED), 0, 0, 0, True
     after: list[int] = []
     while done < KILLS:
@@ -90,7 +91,7 @@ def kills(case: Case, whole: dict[str, bytes], longest: float) -> dict:
                 process.wait()
                 done += 1
                 if (case.folder / out).exists():
-                    break  # killed after the parts were joined
+                    break  # killed after the parts had been joined
                 lost += len(before - case.finished(out))
                 after.append(len(case.finished(out)))
         case.run(out, "--resume")
@@ -111,7 +112,9 @@ def _free_port() -> int:
 
 
 def loopback(case: Case, whole: dict[str, bytes], n: int, kill: bool) -> dict:
-    """n processes that find each other by JAX's distributed runtime; one killed after its first chunk, or none."""
+    """Run n processes that find each other by JAX's distributed runtime. One is killed after its first chunk,
+    or none.
+    """
     out, host = f"shared_{n}_{kill}.h5", f"127.0.0.1:{_free_port()}"
     begin = time.perf_counter()
     processes = [case.start(out, "--distributed", host, str(n), str(i)) for i in range(n)]
@@ -141,10 +144,10 @@ def loopback(case: Case, whole: dict[str, bytes], n: int, kill: bool) -> dict:
 
 
 def main() -> None:
-    """All of it."""
+    """Run all parts."""
     with tempfile.TemporaryDirectory() as made:
         case = Case(Path(made))
-        case.run("first.h5")  # fills the cache
+        case.run("first.h5")  # fills the cache of compiled programs
         seconds = case.run("whole.h5")
         whole = case.content("whole.h5")
         content = {"rows": ROWS, "chunk": CHUNK, "seconds_undisturbed": seconds}

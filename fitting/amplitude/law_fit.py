@@ -1,4 +1,4 @@
-"""Hyperelastic laws from strain sweeps: least squares on the first harmonic, from many starts."""
+"""Fit hyperelastic laws to strain sweeps, by least squares on the first harmonic, from many starting points."""
 
 import json
 import time
@@ -27,13 +27,13 @@ CHANGED = 0.2
 
 class Memory(NamedTuple):
     """Factor m(nw) for each harmonic n, from a Prony series. Without a series, the factor is 1 + i (loss tangent), with
-    one loss tangent."""
+    the same loss tangent for all harmonics."""
 
     series: Maxwell | None = None
 
     def of(self, omega: float) -> np.ndarray:
-        """m(nw) (1, n) of the series. Without a series (2, n): the second row is to be multiplied by the loss
-        tangent."""
+        """Return m(nw) (1, n) of the series. Without a series, return (2, n): m is the first row plus the loss tangent
+        times the second row."""
         n = np.arange(cycle.INSTANTS // 2 + 1)
         if self.series is None:
             return np.array([np.ones(len(n)), np.where(n == 0, 0, 1j)])
@@ -63,18 +63,19 @@ def memory_from(path: Path) -> Memory:
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{path} is no fit.json of a frequency sweep ({type(error).__name__}): make one first"
+            f"{path} is not the fit.json of a frequency sweep ({type(error).__name__}): fit a frequency sweep first"
         ) from None
     return Memory(model)
 
 
-#: A series covers an angular frequency if the product with its longest relaxation time is at least the first value, and
-#: the product with its shortest time at most the second.
+#: A series covers the angular frequency omega under two conditions: omega times the longest relaxation time is at least
+#: the first value, and omega times the shortest one is at most the second value.
 KNOWN = (0.5, 2.0)
 
 
 def outside_series(memory: Memory, omega: float) -> str | None:
-    """A sentence if the relaxation times of the series do not cover the angular frequency omega [rad/s]; else None."""
+    """Return a warning if the relaxation times of the series do not cover the angular frequency omega [rad/s],
+    otherwise None."""
     if memory.series is None:
         return None
     times = np.asarray(memory.series.relaxation_times)
@@ -91,7 +92,8 @@ def outside_series(memory: Memory, omega: float) -> str | None:
 
 
 def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: str) -> StrainFit:
-    """Minimise the squares of the relative misfit of G* at all amplitudes; the best of many starts.
+    """Minimise the sum of the squared relative misfits of G* at all amplitudes, and return the best result of many
+    starting points.
 
     Without a Prony series, the loss tangent is one more parameter of the fit, and the modulus is valid only at this
     frequency.
@@ -120,7 +122,7 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
     compiled = time.perf_counter()
     found = jax.block_until_ready(program(points))
     times = (time.perf_counter() - compiled, compiled - begin)
-    # G' and G'' of one sweep are one test, and their residuals are relative already.
+    # G' and G'' of one sweep are one test, and their residuals are already relative.
     law = assessed(own, _as_curves(sweep), found, scale, times, of_tests=False)
     best = found.u[int(np.nanargmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
     G, third = (np.asarray(v) for v in model(best))
@@ -128,7 +130,7 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
 
 
 def with_loss_tangent(candidate: Candidate) -> Candidate:
-    """The candidate with one more parameter, the tangent of the loss angle."""
+    """Return the candidate with one more parameter, the tangent of the loss angle."""
 
     def values(u: jax.Array, scale: object) -> jax.Array:
         return jnp.concatenate([candidate.values(u[:-1], scale), u[-1:]])
@@ -145,14 +147,14 @@ def with_loss_tangent(candidate: Candidate) -> Candidate:
 
 
 def _as_curves(sweep: StrainSweep) -> list[Curve]:
-    """The two moduli as curves over the shear at the rim, for the warnings of a fit."""
+    """Return the two moduli as curves over the shear at the rim, for the warnings of a fit."""
     F = np.tile(np.eye(3), (len(sweep.strain), 1, 1))
     F[:, 0, 1] = sweep.strain
     return [Curve(name, "simple_shear", F, (0, 1), G) for name, G in (("G'", sweep.storage), ("G''", sweep.loss))]
 
 
 def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
-    """Warnings about the fits, for the user. The best fit comes first in `fits`."""
+    """Return warnings about the fits for the user. The best fit must come first in `fits`."""
     best = fits[0]
     told = list(best.law.warnings)
     tangents = sweep.loss / sweep.storage
@@ -160,19 +162,20 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
     shape = [n for n, unit in zip(best.law.names, best.law.units, strict=True) if unit == "1" and n != "loss_tangent"]
     if "loss_tangent" in best.law.names and shape:
         told.append(
-            f"without --model the stress at rest has the modulus of this frequency too: {' and '.join(shape)} may be "
-            "off by several per cent, which no standard error contains; give the fit.json of a frequency sweep"
+            "without --model, the constant part of the stress has the modulus of this frequency too. "
+            f"{' and '.join(shape)} may be off by several per cent, which no standard error contains: give the "
+            "fit.json of a frequency sweep"
         )
     if abs(change) > CHANGED:
         told.append(
-            f"the loss tangent changes by {100 * change:+.0f} % over the sweep: no law whose memory is the same at all "
-            "strains does that; fit the part before it changes (--max-strain)"
+            f"the loss tangent changes by {100 * change:+.0f} % over the sweep: a law with the same relaxation at all "
+            "strains cannot describe this. Fit only the strains before this change (--max-strain)"
         )
     if np.sqrt(np.mean(np.abs((best.storage + 1j * best.loss) / (sweep.storage + 1j * sweep.loss) - 1) ** 2)) > 0.05:
         told.append("the law misses the moduli by more than 5 % on average: it does not describe this sweep")
     if sweep.storage[-1] < 0.8 * sweep.storage[0]:
         told.append(
-            "the storage modulus falls with strain: tissue that slips, yields or tears does so too, and a hyperelastic "
-            "law that follows it is only a description"
+            "the storage modulus falls with strain. The same happens if tissue slips, yields or tears. Then a "
+            "hyperelastic law only describes the curve"
         )
     return [*told, *tied_laws([f.law for f in fits], "sweep")]

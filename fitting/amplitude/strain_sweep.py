@@ -1,4 +1,4 @@
-"""A strain sweep from a file: moduli over the strain amplitude, at one frequency."""
+"""Read a strain sweep from a file: moduli over the strain amplitude, at one frequency."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,9 +11,9 @@ from fitting.readers.tables.text_tables import text_of
 from liverjax.core.errors import InputError
 
 FEWEST_POINTS, LARGEST_STRAIN, LARGEST_WITHOUT_UNIT = 4, 10.0, 2.0
-#: If a column in percent has no strain [1] above this, its values may be fractions.
+#: If a column in percent has no strain above this value [1], its values may in fact be fractions.
 SMALLEST_LARGEST = 0.01
-#: If the temperature changes by more than this [K], a table has several sweeps.
+#: If the temperature changes by more than this value [K], the table contains several sweeps.
 LARGEST_DRIFT = 2.0
 
 
@@ -33,17 +33,17 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     amplitude.
 
     Args:
-        path: path of the file. Its strain column is named strain, with the unit % or 1.
+        path: path of the file. The name of its strain column is strain, with the unit % or 1.
         table: name of one of several tables, or a part of the name.
-        max_strain: points of larger strain [1] are left out.
+        max_strain: maximum strain [1]; points of larger strain are left out.
 
     Raises:
-        InputError: no table has a strain, the moduli are of tension, there are several frequencies or temperatures, or
-            there are too few points.
+        InputError: no table has a strain, the moduli are tensile moduli, there are several frequencies or temperatures,
+            or there are too few points.
     """
     found = [t for t in tables_of(str(path), text_of(path, "a strain sweep").splitlines()) if "strain" in t.raw]
     if not found:
-        raise InputError(f"{path}: no table has a column strain in % or 1: add it")
+        raise InputError(f"{path}: no table has a column strain in % or 1: add this column")
     place, notes = choose_table(str(path), found, table, "strains", lambda t: len(np.unique(t.raw["strain"])))
     chosen = found[place]
     columns = {c.quantity: (c, j) for j, c in reversed(list(enumerate(chosen.columns)))}
@@ -69,11 +69,11 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     if np.ptp(omega[kept]) > 0.01 * omega[kept].mean():
         low, high = omega[kept].min() / 2 / np.pi, omega[kept].max() / 2 / np.pi
         raise InputError(
-            f"{path}: the frequency goes from {low:.3g} to {high:.3g} Hz: give a sweep of the strain alone"
+            f"{path}: the frequency goes from {low:.3g} to {high:.3g} Hz: give a strain sweep at one frequency"
         )
     _refuse_several_temperatures(path, chosen.raw.get("temperature"), kept)
     if deviations := [c.name for c in chosen.columns if c.quantity.endswith("_sd")]:
-        notes.append(f"the columns {', '.join(deviations)} are not used: the deviation comes from the residuals")
+        notes.append(f"the columns {', '.join(deviations)} are not used: the noise is estimated from the residuals")
     notes += _of_unit(path, chosen.strain_unit, float(strain[kept].max()))
     order = np.argsort(strain[kept], kind="stable")
     return StrainSweep(
@@ -96,7 +96,8 @@ def _refuse_several_temperatures(path: Path, temperature: np.ndarray | None, kep
 
 
 def _of_unit(path: Path, unit: str, largest: float) -> list[str]:
-    """A note if the unit of the strains is missing or may be wrong. Strains that are too large are refused."""
+    """Return a note if the unit of the strains is missing or may be wrong. Raises `InputError` for strains that are too
+    large."""
     if largest > (LARGEST_STRAIN if unit else LARGEST_WITHOUT_UNIT):
         raise InputError(
             f"{path}: a strain of {largest:g} is too large: write it in % (strain_%), or as a fraction (strain_1)"

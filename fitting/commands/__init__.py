@@ -1,1 +1,1 @@
-"""Command lines of the fits: one file per sub-command, each with `parser` (its arguments) and `run`."""
+"""Command lines of the fits. Each sub-command has one file with `parser` (the arguments) and `run`."""

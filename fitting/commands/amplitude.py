@@ -10,7 +10,7 @@ from liverjax.core.files import writable
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command; --help shows `prog` as its name."""
+    """Return the option parser of the command. --help shows `prog` as the name of the command."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Fit the parameters of a hyperelastic law to moduli that change with the strain amplitude, at "
@@ -18,7 +18,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         epilog="The errors (±) come from noise alone. An error of the gap is not included: 50 µm in 1 mm changes "
         f"every modulus and strain by 5 %. {EXIT_CODES}",
     )
-    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")
+    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW for your own law, or all")
     command.add_argument(
         "sweep", type=Path, metavar="SWEEP", help="frequency, moduli and strain: CSV, text or workbook"
     )
@@ -34,7 +34,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit one law, or all laws; exit code 1 if the best fit did not converge."""
+    """Fit one law, or all laws. The exit code is 1 if the best fit did not converge."""
     if options.max_strain is not None and not options.max_strain > 0:
         raise InputError(f"--max-strain {options.max_strain:g} must be above 0: give e.g. 0.1 for 10 %")
     from tqdm import tqdm

@@ -1,5 +1,4 @@
-"""``python -m fitting creep FILE``: the command `relaxation` for a test in which the stress is imposed in place of the
-strain."""
+"""``python -m fitting creep FILE``: like the command `relaxation`, but the stress is imposed instead of the strain."""
 
 from fitting.commands.relaxation import parser, run
 

@@ -18,16 +18,20 @@ if TYPE_CHECKING:
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command; --help shows `prog` as its name."""
+    """Return the option parser of the command. --help shows `prog` as the name of the command."""
     command = argparse.ArgumentParser(
         prog=prog,
-        description="Fit hyperelastic laws to tension, compression, shear, equibiaxial and pure-shear curves at once.",
+        description="Fit hyperelastic laws to tension, compression, shear, equibiaxial and pure-shear curves together.",
         epilog=EXIT_CODES,
     )
-    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")
-    command.add_argument("files", type=Path, nargs="+", metavar="CURVES.csv", help="F11 … P33, or test, stretch, …")
+    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW for your own law, or all")
+    command.add_argument(
+        "files", type=Path, nargs="+", metavar="CURVES.csv", help="with F11 … P33, or test, stretch, …"
+    )
     command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="terms of Ogden's law (default 1, 2 and 3)")
-    command.add_argument("--unit", choices=("Pa", "kPa", "MPa"), help="for stress columns without unit (default: Pa)")
+    command.add_argument(
+        "--unit", choices=("Pa", "kPa", "MPa"), help="unit of stress columns that name none (default: Pa)"
+    )
     command.add_argument(
         "--out", type=Path, default=Path("curves"), metavar="DIR", help="folder of the results (default curves)"
     )
@@ -35,8 +39,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def _with_finite_stress(fits: "list[LawFit]") -> "list[LawFit]":
-    """The fits whose law has a finite stress on the curves. A warning names the other laws. If no law is left, they are
-    refused."""
+    """Return the fits whose law has a finite stress on the curves. A warning names the other laws. Raises `InputError`
+    if no law is left."""
     wrong = [f.label for f in fits if not np.isfinite(f.mean_relative_error)]
     told = f"{', '.join(wrong)}: the stress is not finite on these curves: check the law with python -m liverjax check"
     if len(wrong) == len(fits):
@@ -47,7 +51,7 @@ def _with_finite_stress(fits: "list[LawFit]") -> "list[LawFit]":
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit one law, or all laws, to the curves; exit code 1 if the best fit did not converge."""
+    """Fit one law, or all laws, to the curves. The exit code is 1 if the best fit did not converge."""
     from tqdm import tqdm
 
     from fitting.fits import stress_stretch

@@ -24,11 +24,11 @@ _TOLD = 0.3
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command; --help shows `prog` as its name."""
+    """Return the option parser of the command. --help shows `prog` as the name of the command."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Find a map of stiffness, or a few parameters of a scene, from displacements measured at some "
-        "points. Several loads on one body: a scene and a file of displacements for each.",
+        "points. For several loads on one body, give a scene and a file of displacements for each load.",
         epilog=EXIT_CODES,
     )
     command.add_argument(
@@ -41,15 +41,15 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--name", default="law.mu", metavar="NAME", help="parameter to map (default law.mu)")
     command.add_argument("--length", type=float, metavar="M", help="correlation length [m] (default: size / 10)")
     command.add_argument(
-        "--sphere", action="store_true", help="also fit a sphere of another stiffness, with a start from the map"
+        "--sphere", action="store_true", help="also fit a sphere of another stiffness; the map gives the starting point"
     )
     command.add_argument(
         "--parameters", metavar="NAME,…", help="these parameters instead of a map, e.g. law.mu,viscosity.ratios"
     )
     command.add_argument("--noise", type=float, metavar="M", help="standard deviation [m] if a file has no column sd")
     command.add_argument("--unit", default="m", help="unit of the lengths in the displacement files (default m)")
-    command.add_argument("--iterations", type=int, default=60, help="maximum number for each weight (default 60)")
-    command.add_argument("--resume", action="store_true", help="go on from the last iteration written to --out")
+    command.add_argument("--iterations", type=int, default=60, help="maximum iterations for each prior (default 60)")
+    command.add_argument("--resume", action="store_true", help="continue from the last iteration written to --out")
     command.add_argument(
         "--out", type=Path, default=Path("field"), metavar="DIR", help="folder of the results (default field)"
     )
@@ -58,7 +58,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def _problem(options: argparse.Namespace) -> Problem:
-    """Scenes and displacements of the command line, checked."""
+    """Read and check the scenes and displacements of the command line."""
     for name in ("length", "noise", "iterations"):
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value > 0):
@@ -102,7 +102,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     if given:
         print(
             f"note: {given} of {mesh.number_of_elements} elements keep the {options.name} of their [[region]]: the map "
-            "says nothing there; leave it out of the region to map it too",
+            "has no value there; to map these elements too, leave it out of the region",
             file=sys.stderr,
         )
     writable(options.out, ("field.json", "field.vtu", "field.h5", "field.png", "progress.h5"))
@@ -116,8 +116,10 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     if max(beside) > _TOLD:
         linear = any(scene.mesh.order == 1 for scene in problem.scenes)
         remedy = "a finer mesh, or order = 2," if linear else "a finer mesh"
-        finer = f"; {remedy} would say more" if max(beside) > 1 else ""
-        print(f"note: the mesh's error, {max(beside):.2g} times the noise, counts as noise{finer}", file=sys.stderr)
+        finer = f"; {remedy} would give more information" if max(beside) > 1 else ""
+        print(
+            f"note: the mesh's error is {max(beside):.2g} times the noise, and counts as noise{finer}", file=sys.stderr
+        )
     with bar:
         found = field.estimate(problem, options.name, length, how)
     good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR

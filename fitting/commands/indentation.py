@@ -12,7 +12,7 @@ depth_um,force_mN. Points after the deepest one are left out. """
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command; --help shows `prog` as its name."""
+    """Return the option parser of the command. --help shows `prog` as the name of the command."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Identify Young's modulus and the contact point from an indentation curve: a rigid sphere, cone "
@@ -22,7 +22,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("file", type=Path, metavar="CURVE.csv", help="depth and force")
     command.add_argument("--shape", choices=("sphere", "cone", "punch"), default="sphere", help="default sphere")
     command.add_argument("--radius", type=float, default=0.0, metavar="M", help="radius of sphere or punch [m]")
-    command.add_argument("--half-angle", type=float, metavar="DEG", help="cone: from axis to side (default 45)")
+    command.add_argument("--half-angle", type=float, metavar="DEG", help="cone: angle from axis to side (default 45)")
     command.add_argument("--thickness", type=float, required=True, metavar="M", help="thickness of the layer [m]")
     command.add_argument("--poisson", type=float, default=0.5, metavar="NU", help="Poisson's ratio (default 0.5)")
     command.add_argument(
@@ -31,18 +31,18 @@ def parser(prog: str) -> argparse.ArgumentParser:
     return command
 
 
-#: Largest radius [m] that is accepted. Above the second value, a layer thickness [m] is probably a mistake.
+#: LARGEST: largest radius [m] that is accepted. THICK: a layer thickness [m] above this is probably a mistake.
 LARGEST, THICK = 0.2, 1.0
 #: Half-angle [degrees] of a cone if none is given.
 HALF_ANGLE = 45.0
 
 
 def _notes_on_shape(options: argparse.Namespace) -> list[str]:
-    """Notes on an assumed angle, and on options that have no effect for this shape."""
+    """Return notes on an assumed angle, and on options that have no effect for this shape."""
     cone, told = options.shape == "cone", []
     if cone and options.half_angle is None:
         told.append(
-            f"a half-angle of {HALF_ANGLE:g} degrees is assumed; --half-angle sets another. E is in proportion to 1/tan"
+            f"a half-angle of {HALF_ANGLE:g} degrees is assumed; --half-angle sets another. E is proportional to 1/tan"
         )
     if not cone and options.half_angle is not None:
         told.append(f"--half-angle is for a cone: it changes nothing for a {options.shape}")

@@ -7,8 +7,8 @@ from tqdm import tqdm
 
 
 def cost_bar(unit: str, description: str | None = None) -> tuple[tqdm, Callable[[int, float], None]]:
-    """A progress bar on standard error, and the function to call with every cost. The bar is off if standard error is
-    not a terminal."""
+    """Return a progress bar on standard error, and the function to call with every cost. The bar is off if standard
+    error is not a terminal."""
     bar = tqdm(desc=description, unit=f" {unit}", disable=None, leave=False)
 
     def told(_: int, cost: float) -> None:
@@ -20,7 +20,7 @@ def cost_bar(unit: str, description: str | None = None) -> tuple[tqdm, Callable[
 
 @contextmanager
 def named_bar(description: str) -> Iterator[Callable[[str], None]]:
-    """A progress bar on standard error. It yields the function to call with the name of each fit. The bar is off if
+    """Show a progress bar on standard error. Yields the function to call with the name of each fit. The bar is off if
     standard error is not a terminal."""
     with tqdm(desc=description, unit=" fits", disable=None, leave=False) as bar:
 

@@ -1,4 +1,4 @@
-"""``python -m fitting relaxation FILE`` and ``… creep FILE``: Prony modes from a test in time."""
+"""``python -m fitting relaxation FILE`` and ``… creep FILE``: Prony modes from a relaxation or creep test."""
 
 import argparse
 import sys
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 COLUMNS = """The file has a column of time and one of these: relaxation_modulus_Pa (creep: creep_compliance_1/Pa);
 strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. With two columns, the model follows
-the measured load, ramp included. Torque and force need the size of the sample. """
+the measured load, including the ramp. Torque and force need the size of the sample. """
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command; --help shows `prog` as its name."""
+    """Return the option parser of the command. --help shows `prog` as the name of the command."""
     kind = prog.split()[-1]
     command = argparse.ArgumentParser(
         prog=prog,
@@ -27,7 +27,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.set_defaults(kind=kind)
     command.add_argument(
-        "file", type=Path, metavar="FILE", help="CSV, TRIOS or RheoCompass text; or TOML that describes a test in a rig"
+        "file", type=Path, metavar="FILE", help="CSV, TRIOS or RheoCompass text; or a TOML description of a test rig"
     )
     shared_options.add_modes(command)
     command.add_argument(
@@ -40,9 +40,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--ramp",
         type=float,
         metavar="S",
-        help="duration of the ramp [s] if no row shows it, until the first row under load; 0: a step",
+        help="duration [s] of the rise of the load, if no row shows it (until the first row under load); 0: a step",
     )
-    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out earlier answers")
+    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out responses before this")
     command.add_argument("--radius", type=float, metavar="M", help="radius of the sample [m], for torque and force")
     command.add_argument("--height", type=float, metavar="M", help="height of the sample [m], for torque and force")
     shared_options.add_cards_and_samples(command)
@@ -54,14 +54,14 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
-    """Read the test that a TOML file describes. Options that belong into the file are refused."""
+    """Read the test that a TOML file describes. Raise an error for options that belong in the file."""
     from fitting.rigs.described import read_described
 
     for name in ("radius", "height", "ramp", "min_time"):
         if getattr(options, name) or (name == "ramp" and options.ramp is not None):
             option = f"--{name.replace('_', '-')}"
             raise InputError(
-                f"{option} belongs into the file {options.file} that describes the test: leave the option out"
+                f"{option} belongs in the file {options.file} that describes the test: leave the option out"
             )
     test = read_described(options.file)
     if test.kind != options.kind:
@@ -73,24 +73,24 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
 
 
 def _said_of_rows(test: "TimeTest") -> list[str]:
-    """A note if only some rows of a long record are fitted, and a note on the time before the first answer."""
+    """Return notes: if only some rows of a long record are fitted, and on the time before the first response."""
     from fitting.fits.time_tests import thinned
 
     number, every, told = len(thinned(test)), int(test.used.sum()), []
     if number < every:
-        told.append(f"{number} of {every} answers are fitted, spread over the log of the time since each load")
+        told.append(f"{number} of {every} points are fitted, spread over the logarithm of the time since each load")
     first, last = test.resolved
     if test.answers_at_once:
         return told
     told.append(
-        f"the answers begin {first:.3g} s after the load, and end at {last:.3g} s: G0 does not contain what relaxed "
-        "before"
+        f"the responses begin {first:.3g} s after the load, and end at {last:.3g} s: G0 does not contain the stress "
+        "that relaxed before"
     )
     return told
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit the test. The exit code is 1 if the fit did not converge, and the test shows relaxation."""
+    """Fit the test. The exit code is 1 if the fit did not converge although the test shows relaxation."""
     from fitting.fits import time_tests
     from fitting.fits.families import springpots_in_time as fits
     from fitting.fits.honesty import total_error
@@ -118,7 +118,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))
     found = fits.choose_in_time(test, options.model, options.modes)
-    if options.file.suffix.lower() != ".toml":  # in a described rig, the sizes act in another way
+    if options.file.suffix.lower() != ".toml":  # in a described rig, errors of the sizes have another effect
         default = Simulation()
         rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
         found.details["geometry_error"] = total_error.of_geometry(rig, None)

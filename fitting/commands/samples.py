@@ -1,4 +1,4 @@
-"""``python -m fitting SAMPLE1.csv SAMPLE2.csv …``: every sample by itself, and the population of the samples."""
+"""``python -m fitting SAMPLE1.csv SAMPLE2.csv …``: one fit for each sample, and the population of the samples."""
 
 import argparse
 import sys

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 
 def add_modes(command: argparse.ArgumentParser) -> None:
-    """Option --modes."""
+    """Add the option --modes."""
     command.add_argument(
         "--modes", type=_whole_number_or_auto, default="auto", help="number of relaxation modes, or auto (default)"
     )
 
 
 def refuse_copies(files: list[Path]) -> None:
-    """Refuse files with the same content: one measurement would count twice."""
+    """Raise an error if two files have the same content, because one measurement would count twice."""
     seen: dict[bytes, Path] = {}
     for file in (file for file in files if file.is_file()):
         first = seen.setdefault(file.read_bytes(), file)
@@ -31,12 +31,12 @@ def refuse_copies(files: list[Path]) -> None:
 
 
 def add_cards_and_samples(command: argparse.ArgumentParser) -> None:
-    """Options --samples and --cards."""
-    command.add_argument("--samples", type=int, metavar="N", help="4 chains of N draws of the posterior, posterior.csv")
+    """Add the options --samples and --cards."""
+    command.add_argument("--samples", type=int, metavar="N", help="write 4 chains of N posterior draws (posterior.csv)")
     command.add_argument(
         "--cards",
         action="store_true",
-        help="material cards for liverjax, FEBio, Abaqus, Ansys and SOFA too, in DIR/cards",
+        help="also write material cards for liverjax, FEBio, Abaqus, Ansys and SOFA, in DIR/cards",
     )
 
 
@@ -48,7 +48,7 @@ def _whole_number_or_auto(text: str) -> int | str:
 
 
 def check_samples(count: int | None) -> None:
-    """Refuse a number of draws (--samples) that is too small or too large."""
+    """Raise an error if the number of draws (--samples) is too small or too large."""
     if count is not None and not 100 <= count <= 100000:
         raise InputError(f"--samples {count} is out of range: give 100 to 100000 draws of each chain, e.g. 1000")
 
@@ -80,8 +80,9 @@ def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
 
 
 def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") -> "Sweep":
-    """The sweep without the points at which the instrument dominates. If the density of the sample is given, its
-    inertia is not mistaken for the instrument. This inertia stays in the moduli."""
+    """Return the sweep without the points at which the instrument dominates. If the density of the sample is given, the
+    inertia of the sample is not mistaken for that of the instrument. The moduli still contain the inertia of the
+    sample."""
     import numpy as np
 
     from fitting.fits import sample_inertia
@@ -98,7 +99,7 @@ def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") ->
         if strain:
             density = compression.torsional_density(laws.typical(options.law), strain, density)
         bare = sample_inertia.taken_off(sweep, density, options.height)
-    except InputError:  # the later step that subtracts the inertia raises this error with its remedy
+    except InputError:  # the later step that subtracts the inertia raises this error with the remedy
         return kramers_kronig.without_instrument(sweep)
     kept = kramers_kronig.without_instrument(bare)
     told = tuple(note for note in kept.notes if note not in bare.notes)
@@ -110,7 +111,7 @@ def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") ->
 
 
 def _other_command(path: Path) -> str | None:
-    """The command for the test in this file; None if no reader knows it."""
+    """Return the command for the test in this file, or None if no reader can read the file."""
     from fitting.readers import curves, indentation_curves, time_tests
 
     readers = (

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command; --help shows `prog` as its name."""
+    """Return the option parser of the command. --help shows `prog` as the name of the command."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Identify a generalised Maxwell (Prony) or fractional model from a rheometer's frequency sweep.",
-        epilog=f"Tests in time: {prog} relaxation --help, {prog} creep --help. "
+        epilog=f"Relaxation and creep tests: {prog} relaxation --help, {prog} creep --help. "
         f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. "
         f"Indentation: {prog} indentation --help. Strain sweeps: {prog} amplitude --help. "
         f"Waves on voxels: {prog} waves --help. " + EXIT_CODES,
@@ -91,7 +91,7 @@ def _celsius(text: str) -> float | str:
             return text if text == MIDDLE else float(text)
     except ValueError:
         pass
-    raise argparse.ArgumentTypeError(f"{text!r} is no temperature in degrees Celsius: give the file first")
+    raise argparse.ArgumentTypeError(f"{text!r} is no temperature in degrees Celsius: give the files before --master")
 
 
 def _add_sample(command: argparse.ArgumentParser) -> None:
@@ -99,13 +99,13 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
     command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
     command.add_argument(
-        "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m]; errors of moduli contain it"
+        "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m], to include in errors"
     )
     command.add_argument(
         "--friction-error",
         type=float,
         metavar="NMS",
-        help="standard deviation of the friction of the instrument's bearing [N m s]: it is fitted too",
+        help="standard deviation of the friction of the instrument's bearing [N m s], to fit the friction too",
     )
     command.add_argument(
         "--density", type=float, metavar="KG_M3", help="density of the sample, to subtract its inertia (default: none)"
@@ -115,7 +115,7 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="E",
-        help="compression of the sample before the sweep, a part of its height (default 0); --height is the gap",
+        help="compression of the sample before the sweep, divided by its height (default 0); --height is the gap",
     )
     command.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the simulated sample")
     command.add_argument("--steps", type=int, default=50, help="time steps per cycle of the simulation (default 50)")
@@ -133,11 +133,11 @@ def _add_outputs(command: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="TEST",
-        help="tests that are not fitted: how well the fit predicts them",
+        help="tests that are not fitted, but predicted by the fit for comparison",
     )
-    command.add_argument("--profile", action="store_true", help="95 %% intervals by profile likelihood as well")
+    command.add_argument("--profile", action="store_true", help="also compute 95 %% intervals by profile likelihood")
     shared_options.add_cards_and_samples(command)
-    command.add_argument("--report", action="store_true", help="one page with pictures and numbers too, report.pdf")
+    command.add_argument("--report", action="store_true", help="also write a page with pictures, report.pdf")
     command.add_argument(
         "--out", type=Path, default=Path("fit"), metavar="DIR", help="folder of the results (default fit)"
     )
@@ -224,7 +224,7 @@ def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
 
 
 def _tests_to_predict(options: argparse.Namespace) -> list["Measured"]:
-    """The tests that the fit is to predict (--predict)."""
+    """Read the tests that the fit predicts (--predict)."""
     if not options.predict:
         return []
     from fitting.commands.together import read_any
@@ -237,7 +237,7 @@ def _tests_to_predict(options: argparse.Namespace) -> list["Measured"]:
 
 
 def _predictions(tests: list["Measured"], sweep: "Sweep", fit: "Fit") -> list[str]:
-    """A sentence on each test that the fit predicts."""
+    """Return a sentence on each test that the fit predicts."""
     if not tests:
         return []
     from fitting.reports import prediction
@@ -246,7 +246,7 @@ def _predictions(tests: list["Measured"], sweep: "Sweep", fit: "Fit") -> list[st
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse values that are impossible for a sample or a simulation, and options that cannot be combined."""
+    """Raise an error for impossible values of a sample or a simulation, and for options that cannot be combined."""
     for name in ("radius", "height"):
         value = getattr(options, name)
         if value is not None and not 0 < value <= 0.2:
@@ -255,7 +255,7 @@ def _check(options: argparse.Namespace) -> None:
     if options.gap_error is not None and not (options.height and 0 <= options.gap_error < options.height):
         raise InputError(
             f"--gap-error {options.gap_error:g} is the gap's standard deviation in metres: give --height, and an error "
-            "below it"
+            "below this height"
         )
     _check_friction(options)
     if options.density is not None and not 100 <= options.density <= 25000:
@@ -298,7 +298,7 @@ def _note_idle(options: argparse.Namespace) -> None:
 
 
 def _check_friction(options: argparse.Namespace) -> None:
-    """Refuse --friction-error if the size of the sample is missing, or if the fit does not use the friction."""
+    """Raise an error for --friction-error if the size of the sample is missing, or if the fit does not use it."""
     error = options.friction_error
     if error is None:
         return
@@ -318,7 +318,7 @@ def _check_friction(options: argparse.Namespace) -> None:
 
 
 def _check_precompression(options: argparse.Namespace) -> None:
-    """Refuse an impossible compression, and options that cannot be combined with a compression."""
+    """Raise an error for an impossible compression, and for options that cannot be combined with a compression."""
     if options.precompression == 0:
         return
     from fitting.rigs import compression
@@ -334,13 +334,13 @@ def _check_precompression(options: argparse.Namespace) -> None:
             )
     if options.model != "prony" and options.method != "closed-form":
         raise InputError(
-            f"--precompression with --model {options.model} is computed in closed form, since the modes that a "
-            "simulation needs do not separate constant from slowly relaxing stress: give --method closed-form"
+            f"--precompression with --model {options.model} works in closed form only, because the modes of a "
+            "simulation do not separate constant from slowly relaxing stress: give --method closed-form"
         )
 
 
 def _check_master(options: argparse.Namespace) -> None:
-    """Refuse options that cannot be combined with a master curve."""
+    """Raise an error for options that cannot be combined with a master curve."""
     if options.master is None:
         if options.vertical:
             raise InputError("--vertical is for a master curve: give --master too")
@@ -356,7 +356,7 @@ def _check_master(options: argparse.Namespace) -> None:
 
 
 def _check_samples(options: argparse.Namespace) -> None:
-    """Refuse options that need a single sweep."""
+    """Raise an error for options that need a single sweep."""
     for name, asked, instead in (
         ("--method torsion", options.method == "torsion", "leave it out, or give one file"),
         ("--profile", options.profile, "leave it out, or give one file"),
@@ -371,7 +371,7 @@ def _check_samples(options: argparse.Namespace) -> None:
 
 
 def _check_together(options: argparse.Namespace) -> None:
-    """Refuse options that cannot be combined with several tests."""
+    """Raise an error for options that cannot be combined with several tests."""
     for name, asked in (
         ("--method torsion", options.method == "torsion"),
         ("--profile", options.profile),
@@ -386,7 +386,7 @@ def _check_together(options: argparse.Namespace) -> None:
 
 
 def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":
-    """The fit of the chosen model in closed form."""
+    """Return the fit of the chosen model in closed form."""
     from fitting.fits import viscoelastic
     from fitting.fits.families import models
 
@@ -404,7 +404,7 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
-    """The closed-form fit and, by default, the fit through the simulation; and the corrected sweep that both use."""
+    """Return the closed-form fit and, by default, the fit of the simulation; and the corrected sweep of both fits."""
     from fitting.fits import instrument, sample_inertia, viscoelastic
     from fitting.fits.honesty import edges, total_error
     from fitting.methods import generalised_maxwell
@@ -429,7 +429,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     closed, corrected = instrument.without_error_of_inertia(closed, sweep)
     for note in corrected.notes[len(sweep.notes) :]:
         print(f"note: {note}", file=sys.stderr)
-    if options.gap_error:  # before the sentences that use the errors
+    if options.gap_error:  # before the warnings that use the errors
         closed = instrument.with_gap_error(closed, options.gap_error / simulation.height)
     if corrected is not sweep:
         dense = generalised_maxwell.spectrum(corrected)
@@ -447,8 +447,8 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
 
 
 def _simulated(options: argparse.Namespace, sweep: "Sweep", closed: "Fit", simulation: "Simulation") -> "Fit":
-    """The fit through the torsion simulation. If the simulation has a density, it is compared with moduli that contain
-    the inertia."""
+    """Return the fit of the torsion simulation. If the simulation has a density, its moduli are compared with moduli
+    that contain the inertia of the sample."""
     from fitting.fits import sample_inertia, simulated_rheometer
 
     inertia = simulation.inertia
@@ -478,7 +478,7 @@ def _simulation(options: argparse.Namespace) -> "Simulation":
 
 
 def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Posterior | None":
-    """Samples of the posterior of the last fit, if the user asks for them and the model has only a few parameters."""
+    """Draw from the posterior of the last fit, if the user asks for this and the model has only a few parameters."""
     from fitting.fits import posterior, sample_inertia
 
     if not options.samples:

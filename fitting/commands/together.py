@@ -44,8 +44,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _without_sample_inertia(tests: "list[Measured]", density: float | None, height: float | None) -> "list[Measured]":
-    """The tests. The inertia of the sample is subtracted from the sweeps if the density and the height of the sample
-    are given."""
+    """Return the tests. The inertia of the sample is subtracted from the sweeps if the density and the height of the
+    sample are given."""
     from fitting.fits import sample_inertia
     from fitting.readers.frequency_sweep import Sweep
 
@@ -53,7 +53,7 @@ def _without_sample_inertia(tests: "list[Measured]", density: float | None, heig
         return tests
     if height is None:
         print(
-            "note: --density without --height takes no inertia off the sweeps: give the height of the sample [m]",
+            "note: --density without --height subtracts no inertia from the sweeps: give the height of the sample [m]",
             file=sys.stderr,
         )
         return tests
@@ -61,10 +61,10 @@ def _without_sample_inertia(tests: "list[Measured]", density: float | None, heig
 
 
 def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "Measured":
-    """Read a file as a test in a rig, as shear waves, as a test in time, or as another sweep.
+    """Read a file as a described test in a rig, as shear waves, as another sweep, or as a relaxation or creep test.
 
     Another sweep is cut to the band that the user gives. As in the first sweep, points at which the instrument
-    dominates are left out. A `whole` sweep is only predicted, so it is not cut.
+    dominates are left out. If `whole`, the sweep is only predicted, so it is not cut.
     """
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion

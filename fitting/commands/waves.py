@@ -20,41 +20,45 @@ if TYPE_CHECKING:
     from fitting.waves.kept_regions import Keep
 
 FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5", "progress_of_regions.h5")
-#: Maximum memory of one matrix factor [GB]. A body that needs more is divided in parts, or the grid is made coarser.
-#: MOST_OF_MAP: largest number of values of a map in a divided body (its matrices are dense).
+#: MOST_MEMORY: maximum memory of one matrix factor [GB]. A body that needs more is divided into parts, or the grid is
+#: made coarser. MOST_OF_MAP: largest number of values of a map in a divided body (its matrices are dense).
 MOST_MEMORY, MOST_OF_MAP = 4.0, 5000
 #: Maximum correlation length of a map, divided by the size of the organ. Above it, the map would be uniform.
 LONGEST = 5.0
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command; --help shows `prog` as its name."""
+    """Return the option parser of the command. --help shows `prog` as the name of the command."""
     command = argparse.ArgumentParser(
         prog=prog,
-        description="Find storage and loss modulus of an organ from harmonic waves on voxels (elastography): of the "
-        "whole organ, of regions, and as a map, each with standard deviations. The usual direct inversion is computed "
-        "too.",
+        description="Find storage and loss modulus of an organ from harmonic waves on voxels (elastography). Results "
+        "are for the whole organ, for regions, and as a map, each with standard deviations. The usual direct inversion "
+        "is computed too.",
         epilog=EXIT_CODES,
     )
     command.add_argument(
         "data", type=Path, metavar="DATA", help="complex displacements: .npz, .npy, .h5, .mat, .csv, .nii, .nii.gz"
     )
-    command.add_argument("--frequencies", type=float, nargs="+", metavar="HZ", help="if the file does not state them")
+    command.add_argument("--frequencies", type=float, nargs="+", metavar="HZ", help="frequencies, if not in the file")
     command.add_argument("--mask", type=Path, metavar="FILE", help="voxels of the organ, if the file has no mask")
     command.add_argument("--labels", type=Path, metavar="FILE", help="number of the region of each voxel")
     command.add_argument("--unit", help="unit of the displacements: m, mm or um (default m)")
     command.add_argument(
         "--spacing", type=float, nargs=3, metavar="M", help="spacing of the voxels [m], if the file states none"
     )
-    command.add_argument("--noise", type=float, metavar="M", help="standard deviation of one component (default: data)")
+    command.add_argument(
+        "--noise", type=float, metavar="M", help="standard deviation of one component (default: from data)"
+    )
     command.add_argument("--density", type=float, default=DENSITY, metavar="KG_M3", help=f"default {DENSITY:g}")
     command.add_argument("--stride", type=int, metavar="N", help="take means of N x N x N voxels (default: as needed)")
-    command.add_argument("--no-map", action="store_true", help="only the whole and the regions")
-    command.add_argument("--length", type=float, metavar="M", help="correlation length [m] (default 2 bricks)")
+    command.add_argument("--no-map", action="store_true", help="fit only the whole organ and the regions")
+    command.add_argument(
+        "--length", type=float, metavar="M", help="correlation length of the map [m] (default 4 voxels)"
+    )
     command.add_argument(
         "--samples", type=int, default=20, metavar="N", help="maps drawn from the posterior (default 20)"
     )
-    command.add_argument("--resume", action="store_true", help="go on from the last step written to --out")
+    command.add_argument("--resume", action="store_true", help="continue from the last step written to --out")
     command.add_argument("--out", type=Path, default=Path("waves"), metavar="DIR", help="folder (default waves)")
     command.set_defaults(optional_files=FILES[2:4])
     return command
@@ -122,7 +126,7 @@ def _kept_regions(options: argparse.Namespace, organ: "Organ") -> "Keep":
 
 @contextmanager
 def _forces_that_balance(data: Path) -> Iterator[None]:
-    """Raise an `InputError` with one sentence if the equations have no solution."""
+    """Raise an `InputError` if the equations have no solution."""
     try:
         yield
     except np.linalg.LinAlgError:
@@ -133,8 +137,8 @@ def _forces_that_balance(data: Path) -> Iterator[None]:
 
 
 def _organ(options: argparse.Namespace, field) -> "Organ":
-    """The organ with the body of its voxels. If this is too large, the body is divided in parts; if that is not enough,
-    the voxels are made coarser."""
+    """Return the organ with the body of its voxels. A body that is too large is divided into parts. If this is not
+    enough, the voxels are made coarser."""
     from fitting.waves import elastography, wave_field
 
     stride = options.stride or 1
@@ -154,7 +158,7 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
     parts = int(body.part.max()) + 1
     if parts > 1:
         print(
-            f"note: the organ is divided in {parts} parts. Forces are not balanced where parts meet, so errors are "
+            f"note: the organ is divided into {parts} parts. Forces are not balanced where parts meet, so errors are "
             "larger than without parts",
             file=sys.stderr,
         )
@@ -164,7 +168,7 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
 
 
 def _check_waves(options: argparse.Namespace) -> None:
-    """Refuse values that are impossible for a measurement."""
+    """Raise an error for values that are impossible in a measurement."""
     for name in ("length", "noise"):
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value > 0):

@@ -1,11 +1,12 @@
 """A stiffness map from measured displacements: a smooth field of one parameter of the law, with its uncertainty.
 
 The parameter of an element is the value in the scene times exp(m). Here m is the mean over the element of a nodal field
-(V,) with the prior of `fitting.methods.prior`. A Gauss-Newton method in a trust region (Steihaug 1983) minimises
-chi^2/2 + |z|^2/2 over the whitened field z. The Hessian I + J^T J is never assembled: each product with it needs a
+(V,) with the prior of `fitting.methods.prior`. The unknown is the whitened field z, whose entries are independent with
+variance 1 in the prior. A Gauss-Newton method in a trust region (Steihaug 1983) minimises chi^2/2 + |z|^2/2. J is the
+derivative of the residuals with respect to z. The Hessian I + J^T J is never assembled: each product with it needs a
 linearised run and its transpose. No eigenvalue of this Hessian is below 1. The norm of the gradient is therefore an
 upper bound of the distance to the minimum, in standard deviations of the map. The prior's standard deviation of m sets
-the weight of the regularisation. This standard deviation grows until chi^2 is as low as the number of measured
+the weight of the regularisation. This standard deviation is increased until chi^2 is as low as the number of measured
 components (discrepancy principle; Morozov 1966), or until chi^2 no longer falls. The uncertainty comes from the same
 Hessian. Lanczos iterations find the largest eigenvalues of J^T J (Bui-Thanh et al. 2013).
 """
@@ -50,10 +51,10 @@ class Field(NamedTuple):
     name: str
     log_factor: np.ndarray  # m (V,)
     modulus: np.ndarray  # modulus of the elements (E,); NaN where a region has a law without it
-    sd: np.ndarray  # of m at the nodes (V,), with the data
-    prior_sd: np.ndarray  # of m at the nodes (V,), without data
-    mesh_bias: np.ndarray | None  # error of m (V,) by the meshes, to be subtracted from m; None: not known
-    deviation: float  # standard deviation of the prior that was chosen
+    sd: np.ndarray  # standard deviation of m at the nodes (V,), with the data
+    prior_sd: np.ndarray  # the same without data
+    mesh_bias: np.ndarray | None  # error of m (V,) due to the meshes, to be subtracted from m; None: unknown
+    deviation: float  # chosen standard deviation of the prior
     length: float  # correlation length [m]
     chi2: float
     components: int
@@ -63,11 +64,11 @@ class Field(NamedTuple):
     eigenvalues: np.ndarray  # of J^T J in whitened z: the data determine the directions with eigenvalues above 1
     codes: tuple[int, ...]
     seconds: float
-    given: np.ndarray  # (E,) whether a [[region]] of the scene sets the modulus: the map does not change it there
+    given: np.ndarray  # (E,) True where a [[region]] of the scene sets the modulus; the map does not change it there
 
 
 def start_of(problem: Problem, name: str) -> jax.Array:
-    """Values of the parameter at the elements (E,) before the fit.
+    """Return the value of the parameter in each element (E,) before the fit.
 
     Raises:
         InputError: the scenes have different meshes, or `name` is not a positive number.
@@ -80,34 +81,36 @@ def start_of(problem: Problem, name: str) -> jax.Array:
             raise InputError("the scenes have different meshes: a field needs one mesh in all scenes")
     base = numbers_at(scene, name)
     if isinstance(base, tuple) or jnp.ndim(base) > 1 or (jnp.ndim(base) == 1 and base.shape != (E,)):
-        raise InputError(f"a field of {name!r} needs one number: name one of the list, e.g. {name}.0")
+        raise InputError(f"a field of {name!r} needs one number per element: name one entry of the list, e.g. {name}.0")
     if not np.all(np.asarray(base) > 0):
         raise InputError(f"a field of {name!r} must begin at a positive value: change the value in the scene")
     if np.all(given_by_regions(problem, name)[0]):
         raise InputError(
-            f"every element has the {name} of its [[region]], so there is nothing to map: leave it out there"
+            f"a [[region]] sets {name} in every element, so nothing is left to map: remove this parameter from a "
+            "[[region]]"
         )
     return jnp.broadcast_to(base, (E,))
 
 
 def given_by_regions(problem: Problem, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Which elements (E,) keep the parameter of their [[region]] in all scenes, and the values (E,) of the first scene
-    there, or NaN."""
+    """Return whether a [[region]] sets the parameter of each element (E,) in all scenes, and its values (E,) in the
+    first scene. Values that no region sets are NaN."""
     E = problem.scenes[0].mesh.number_of_elements
     each = [set_by_regions(scene.region, name, E) for scene in problem.scenes]
     return np.all([own for own, _ in each], axis=0), each[0][1]
 
 
 def values_at(problem: Problem, name: str, base: jax.Array, m: jax.Array) -> dict[str, jax.Array]:
-    """Values of the parameter at the elements for the nodal field m (V,), by the name of the parameter."""
+    """Return the values of the parameter in the elements for the nodal field m (V,). The name of the parameter is the
+    key."""
     corners = m[problem.scenes[0].mesh.tetrahedra]
     return {name: base * jnp.exp(jnp.mean(corners, axis=1))}
 
 
 @partial(jax.jit, static_argnames="name")
 def _linearised(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> Any:
-    """The residuals (n,) of the runs at m, the linear map J from changes of m to changes of the residuals, and the
-    codes of the runs."""
+    """Return the residuals (n,) of the runs at m, the linear map J from changes of m to changes of the residuals, and
+    the status codes of the runs."""
     return jax.linearize(lambda m: misfit(problem, values_at(problem, name, base, m)), m, has_aux=True)
 
 
@@ -122,16 +125,16 @@ def _pulled(J: Callable, r: jax.Array, m: jax.Array) -> jax.Array:
 
 
 class _LinearRuns(NamedTuple):
-    """The runs, linearised at a whitened field z: products with the Jacobian of the residuals by z, and with its
-    transpose."""
+    """The runs, linearised at a whitened field z. They give products with the derivative J of the residuals with
+    respect to z, and with its transpose."""
 
     p: smooth.Prior
     deviation: float
     z: np.ndarray
     m: jax.Array
     r: np.ndarray  # residuals (n,)
-    J: Callable  # of changes of m
-    slope: np.ndarray  # J^T r (V,) by z
+    J: Callable  # linear map from changes of m to changes of r
+    slope: np.ndarray  # J^T r (V,), with J with respect to z
     codes: tuple[int, ...]
 
     @property
@@ -142,33 +145,36 @@ class _LinearRuns(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """(chi^2 + |z|^2)/2. If the runs are not finite, the cost is infinite and the search goes back."""
+        """Cost (chi^2 + |z|^2)/2. If the runs are not finite, the cost is infinite and the search tries a shorter
+        step."""
         return float(0.5 * (self.r @ self.r + self.z @ self.z)) if self.finite else np.inf
 
     def push(self, z: np.ndarray) -> jax.Array:
-        """J z (n,)."""
+        """Return the product J z (n,)."""
         return _pushed(self.J, jnp.asarray(self.deviation * smooth.field_at_nodes(self.p, z.ravel())))
 
     def pull(self, r: np.ndarray | jax.Array) -> np.ndarray:
-        """J^T r (V,) of residuals (n,)."""
+        """Return the product J^T r (V,) for residuals r (n,)."""
         return self.deviation * smooth.to_whitened(self.p, np.asarray(_pulled(self.J, jnp.asarray(r), self.m)))
 
     def gradient(self) -> np.ndarray:
-        """The gradient of the cost by z (V,)."""
+        """Return the gradient (V,) of the cost with respect to z."""
         return self.z + (self.slope if self.finite else 0.0)
 
     def hessian(self, z: np.ndarray) -> np.ndarray:
-        """(I + J^T J) z."""
+        """Return the product (I + J^T J) z (V,)."""
         return z + (self.pull(self.push(z)) if self.finite else 0.0)
 
 
 def _without_addresses(structure: object) -> str:
-    """Kinds of laws and physics, and settings that are no numbers, as a text that is equal in every process."""
+    """Return the structure of scenes as a text without memory addresses, which is the same in every process. It
+    contains the types of all objects, and the settings that are not numbers."""
     return re.sub(r" at 0x[0-9a-f]+", "", str(structure))
 
 
 class _Search:
-    """State of a search: the functions that the minimiser calls, and the file from which a stopped run can go on."""
+    """State of a search: the functions that the minimiser calls, and the file from which a stopped search can
+    continue."""
 
     def __init__(
         self, problem: Problem, name: str, base: jax.Array, p: smooth.Prior, file: Path | None, progress: Callable
@@ -176,7 +182,7 @@ class _Search:
         self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
         self.history: list[dict[str, float]] = []
         self.k, self.z = 0, np.zeros(len(p.root_mass))
-        self.last: list[_LinearRuns] = []  # a trial point, and the point from which the trial began
+        self.last: list[_LinearRuns] = []  # a trial point, and the point before this trial step
         self.evaluations = 0
         self.marks = {
             "name": name,
@@ -190,7 +196,7 @@ class _Search:
         }
 
     def at(self, z: np.ndarray) -> _LinearRuns:
-        """The runs, linearised at z."""
+        """Return the runs, linearised at z."""
         deviation = DEVIATIONS[self.k]
         for one in self.last:
             if one.deviation == deviation and np.array_equal(one.z, z):
@@ -200,12 +206,12 @@ class _Search:
         self.evaluations += 1
         here = _LinearRuns(self.p, deviation, z.copy(), m, np.asarray(r), J, z, tuple(int(c) for c in codes))
         here = here._replace(slope=here.pull(here.r))
-        base = [one for one in self.last if np.array_equal(one.z, self.z)]  # trials begin there until a cost is lower
+        base = [one for one in self.last if np.array_equal(one.z, self.z)]  # the next trial step may begin there again
         self.last = [here, *(base or self.last)[:1]]
         return here
 
     def iterated(self, z: np.ndarray) -> None:
-        """Called after each iteration."""
+        """Save the new point and report the progress. The minimiser calls this function after each iteration."""
         self.z = z.copy()
         self.write()
         r = self.at(self.z).r
@@ -221,7 +227,7 @@ class _Search:
             f.attrs.update(self.marks)
 
     def read(self) -> None:
-        """Go on from the file of an earlier run.
+        """Continue from the file of an earlier search.
 
         Raises:
             InputError: the file is damaged, or belongs to another problem.
@@ -249,7 +255,7 @@ class MapOptions(NamedTuple):
     resume: bool = False  # begin from that file if it exists
     #: Called after each iteration with the index of the deviation and chi^2 per component.
     progress: Callable[[int, float], None] = lambda weight, chi2: None
-    mesh_error: bool = True  # estimate the error of the meshes, and its change of the field (`mesh_bias`)
+    mesh_error: bool = True  # estimate the error due to the meshes (`mesh_bias`)
 
 
 def estimate(
@@ -265,11 +271,12 @@ def estimate(
         problem: scenes with one mesh, and the measurements.
         name: dotted name of a positive parameter of the law. The field begins at its value in the scenes.
         length: correlation length of the prior [m].
-        options: how to search, see `MapOptions`.
+        options: settings of the search, see `MapOptions`.
         changes: fields of `options` by their names, for example ``max_iterations=40``.
 
     Raises:
-        InputError: see `start_of`; or `file` belongs to another fit; or the scene cannot be computed at the start.
+        InputError: the problem is invalid (see `start_of`), `file` belongs to another fit, or the simulation fails at
+            the first parameters.
     """
     begin = time.perf_counter()
     base, problem = start_of(problem, name), with_solvers(problem, {})
@@ -281,7 +288,9 @@ def estimate(
     _deviations_in_turn(search, options.max_iterations)
     here = search.at(search.z)
     if not here.finite:
-        raise InputError("the scene has no answer at the parameters where the map begins: run simulate on it first")
+        raise InputError(
+            "the simulation fails at the parameters from which the map begins: run simulate on the scene first"
+        )
     deviation, m = here.deviation, np.asarray(here.m)
     values, vectors = _measured_directions(here, len(m), options.modes)
     before, after = smooth.variances(p, vectors, 1 / (1 + values))
@@ -310,9 +319,10 @@ def estimate(
 
 
 def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
-    """Try one deviation after another until chi^2 is as low as the noise. Each search begins at the last field."""
+    """Try larger and larger standard deviations of the prior until chi^2 is as low as the number of components. Each
+    search begins at the field of the search before."""
     while True:
-        # If a run was stopped after this search had finished, the row of this search exists already.
+        # If the program was stopped after this search had finished, the history already has its row.
         finished = len(search.history) > search.k and search.history[search.k]["iterations"] < max_iterations
         if not finished:
             search.history = [*search.history[: search.k], _minimised(search, max_iterations)]
@@ -326,7 +336,7 @@ def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
 
 
 def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
-    """Find the minimum for the present deviation; return a row of the history."""
+    """Find the minimum for the present standard deviation of the prior, and return a row of the history."""
     begin, before = time.perf_counter(), search.evaluations
     found = scipy.optimize.minimize(
         lambda z: search.at(z).cost,
@@ -345,7 +355,7 @@ def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
 
 
 def _measured_directions(here: _LinearRuns, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Largest eigenvalues (k,) of J^T J in whitened z, and their directions (n, k)."""
+    """Return the largest eigenvalues (k,) of J^T J, and their eigenvectors (n, k) in whitened z."""
     k = min(modes, n - 2, len(here.r))
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=lambda z: here.pull(here.push(z)), dtype=float)
     # The prior determines the directions with an eigenvalue far below 1: these eigenvalues need not be accurate.
@@ -354,7 +364,7 @@ def _measured_directions(here: _LinearRuns, n: int, modes: int) -> tuple[np.ndar
 
 
 def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """(I + J^T J)^-1 g (V,), with a relative tolerance of 1 %. This is enough for estimates of first order."""
+    """Return (I + J^T J)^-1 g (V,), with a relative tolerance of 1 %. This is enough for estimates of first order."""
     n, shrink = len(g), values / (1 + values)
 
     def solved(z: np.ndarray) -> np.ndarray:
@@ -367,8 +377,8 @@ def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: n
 
 
 def _bias_of_map(search: _Search, here: _LinearRuns, values: np.ndarray, vectors: np.ndarray) -> np.ndarray | None:
-    """The change of the field m (V,) by the error of the meshes: (I + J^T J)^-1 J^T times this error in the residuals.
-    None if this error is not known."""
+    """Return the change of the field m (V,) due to the error of the meshes: (I + J^T J)^-1 J^T times this error in the
+    residuals. Returns None if this error is unknown."""
     left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, here.m))
     if left_out is None or not np.all(np.isfinite(left_out)):
         return None
@@ -377,12 +387,12 @@ def _bias_of_map(search: _Search, here: _LinearRuns, values: np.ndarray, vectors
 
 
 def distance_sentence(found: Field) -> str | None:
-    """A sentence if the search stopped before the minimum; else None."""
+    """Return a warning if the search stopped before the minimum, otherwise None."""
     if found.distance <= FAR:
         return None
     return (
-        f"the search stopped {found.distance:.2g} standard deviations of the map away from its minimum: give more "
-        "--iterations and --resume, or a smaller [solve] tolerance"
+        f"the search stopped {found.distance:.2g} standard deviations of the map away from the minimum: give --resume "
+        "with more --iterations, or a smaller [solve] tolerance"
     )
 
 
@@ -392,20 +402,20 @@ OPEN = 0.5
 
 
 def level_sentence(found: Field) -> str | None:
-    """A sentence if the data do not determine how stiff the map is at any node; None if they do."""
+    """Return a warning if the data determine the modulus at none of the nodes, otherwise None."""
     least = float(np.min(found.sd))
     if not least > OPEN:
         return None
     return (
-        "the data do not determine the level of the map: at no node is the map known better than to a factor of "
-        f"{np.exp(least):.2g}; displacements alone determine only ratios of moduli, so give a traction or a measured "
-        "force"
+        "the data do not determine the level of the map: at every node, the modulus is uncertain by a factor of "
+        f"{np.exp(least):.2g} or more. Displacements alone determine only ratios of moduli, so give a traction or a "
+        "measured force"
     )
 
 
 def bias_sentence(found: Field) -> str | None:
-    """A sentence if the mesh error moves the map at some node by more than the standard deviation there. None if it
-    does not, or if the mesh error is not known.
+    """Return a warning if the mesh error changes the map at some node by more than the standard deviation there.
+    Returns None if the change is smaller everywhere, or if the mesh error is unknown.
     """
     if found.mesh_bias is None:
         return None
@@ -414,7 +424,10 @@ def bias_sentence(found: Field) -> str | None:
         return None
     largest = np.abs(found.mesh_bias)[beyond].max()
     if largest > LARGEST_BIAS:
-        return f"the mesh error moves the map by a third or more ({largest:.0%}): too much to correct; refine the mesh"
+        return (
+            f"the mesh error moves the map by a third or more ({largest:.0%}), which is too much to correct: refine "
+            "the mesh"
+        )
     return (
         f"the mesh error moves the map by up to {largest:.0%}, and by more than the standard deviation at "
         f"{beyond.mean():.0%} of the nodes: subtract mesh_bias from the logarithm of the map, or refine the mesh"

@@ -1,9 +1,10 @@
-"""A stiff or soft sphere in a uniform body: its place, size and stiffness are estimated from measured displacements.
+"""A stiff or soft sphere in a uniform body. Centre, radius and stiffness of the sphere are estimated from measured
+displacements.
 
 Unlike a map, the sphere has few parameters. A smooth map spreads a sharp edge, so its peak is not the modulus of an
-inclusion. The map only gives the start values. The edge of the sphere is smooth over a length in proportion to the
-element size, so the residuals have derivatives by the position of the sphere. Errors of radius and modulus compensate
-each other. The elements should therefore be quadratic, or much smaller than the sphere.
+inclusion. The map only gives the starting point. The edge of the sphere is smooth over a length proportional to the
+element size, so the residuals have derivatives with respect to the position of the sphere. An error of the radius can
+compensate an error of the modulus. The elements should therefore be quadratic, or much smaller than the sphere.
 """
 
 from typing import Any
@@ -25,14 +26,14 @@ NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion"
 
 
 def edge_width(mesh: TetMesh) -> float:
-    """Width of the edge [m]: a quarter of the mean distance between neighbouring integration points."""
+    """Return the width of the edge [m], a quarter of the mean distance between neighbouring integration points."""
     size = float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
     return _EDGE * size / mesh.order
 
 
 def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> jax.Array:
-    """The part of each element (E,) inside the sphere: 1 inside, 0 outside, smooth between. It is a mean over points in
-    the element."""
+    """Return the part of each element (E,) that lies inside the sphere: 1 inside, 0 outside, smooth between. The part
+    is a mean over points in the element."""
     corners = mesh.points[mesh.tetrahedra]
     L = np.full((4, 1), 0.25) if mesh.order == 1 else basis(mesh.order).L
     points = jnp.einsum("kq,eki->qei", L, corners)
@@ -41,9 +42,10 @@ def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> j
 
 
 def start_from(problem: Problem, field: Field) -> np.ndarray:
-    """Start u of the sphere from the map. The sphere consists of the elements whose ln(modulus) differs from the
-    background by more than half of the largest difference. Both differences are in standard deviations of the map: with
-    a weak prior, the map may have large values where the data tell little, for example at corners.
+    """Return the starting point u (6,) of the sphere from the map. The sphere consists of the elements whose
+    ln(modulus) differs from the background by more than half of the largest difference. Differences are divided by the
+    standard deviation of the map. With a weak prior, the map may have large values where the data contain little
+    information, for example at corners.
     """
     mesh = problem.scenes[0].mesh
     middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
@@ -63,7 +65,8 @@ def start_from(problem: Problem, field: Field) -> np.ndarray:
 
 
 def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> Estimate:
-    """Centre and radius [m] of the sphere, and the parameter `name` outside and inside, with standard errors.
+    """Estimate the centre and radius [m] of the sphere, and the parameter `name` outside and inside, with standard
+    errors.
 
     Args:
         problem: scenes with one mesh, and the measurements.

@@ -1,11 +1,12 @@
-"""Errors of the instrument that all points of a fit share (inertia, friction, gap), each with a prior. Also the fit of
-a compressed sample.
+"""Errors of the instrument that are common to all points of a fit (inertia, friction, gap), each with a prior. Also the
+fit of a compressed sample.
 
-The instrument subtracts its inertia I. If its true inertia is I (1 + delta), G' is too small by delta I omega^2 / K.
-Without a prior, this term would fit the misfit of the model. Here delta has a normal prior around 0 with the standard
-deviation `raw_torque.UNCERTAINTY`. delta is fitted only if the file has raw columns. It is used only if it stays the
-same when the upper end of the band is left out. The friction b of the bearing adds b omega / K to G''. The error of b
-has a normal prior around 0 with the standard deviation that the user gives.
+The instrument subtracts the torque of its inertia I; the modulus is the torque per angle, divided by the constant K of
+the geometry. If the true inertia is I (1 + delta), G' is too small by delta I omega^2 / K. Without a prior, this term
+would compensate errors of the model. Here delta has a normal prior around 0 with the standard deviation
+`raw_torque.UNCERTAINTY`. delta is fitted only if the file has raw columns. It is used only if it stays the same, within
+its error, when the upper end of the band is left out. The friction b of the bearing adds b omega / K to G''. The error
+of b has a normal prior around 0 with the standard deviation that the user gives.
 """
 
 from typing import Any, NamedTuple
@@ -27,10 +28,11 @@ from liverjax import laws
 #: If the standard error of an instrument error, divided by its prior standard deviation, is at least this, the data do
 #: not determine the instrument error.
 UNTOLD = 0.9
-#: Maximum number of rounds of fit and correction; and maximum number of halvings of a correction that would make a
-#: modulus 0 or negative.
+#: Maximum number of rounds, each a fit and a correction; and maximum number of halvings of a correction that would make
+#: a modulus 0 or negative.
 ROUNDS, HALVINGS = 20, 30
-#: A step below this many prior standard deviations counts as 0. Exact data have no standard error to compare it with.
+#: A correction below this many prior standard deviations counts as 0. For exact data, the standard error is 0 and
+#: cannot be the limit.
 SETTLED = 1e-6
 
 
@@ -39,21 +41,24 @@ class Nuisance(NamedTuple):
 
     name: str
     moved: np.ndarray  # (n,) change of G* [Pa] by one standard deviation
-    unit: float  # the standard deviation in the unit of the report
+    unit: float  # standard deviation of the prior, in the unit of the report
 
     @property
     def reported(self) -> str:
-        """Its name in fit.json. The value there is the true quantity minus the subtracted quantity."""
+        """Name of this error in fit.json. The value there is the true quantity minus the subtracted quantity."""
         return "friction_off_by_N_m_s" if self.name == "friction" else "inertia_off_by"
 
     def told(self, deviations: float) -> str:
-        """The size of this error as text, for a sentence."""
+        """Return the size of this error as text, for a sentence."""
         value = self.unit * deviations
         return _cent(value) if self.name == "inertia" else f"{value:.2g} N m s"
 
     def compared(self, deviations: float) -> str:
-        """Comparison of the true quantity with the subtracted quantity, as text for a sentence."""
-        return f"{self.told(abs(deviations))} {'larger' if deviations > 0 else 'smaller'} than what it subtracted"
+        """Return the comparison of the true quantity with the subtracted quantity, as text for a sentence."""
+        return (
+            f"{self.told(abs(deviations))} {'larger' if deviations > 0 else 'smaller'} than the value that it "
+            "subtracted"
+        )
 
 
 class InstrumentErrors(NamedTuple):
@@ -61,21 +66,21 @@ class InstrumentErrors(NamedTuple):
 
     values: np.ndarray  # (k,)
     covariance: np.ndarray  # (k, k)
-    part: np.ndarray | None  # the values without the last half decade; None if too few points are left
+    part: np.ndarray | None  # the values from the points without the last half decade; None if too few points are left
     part_errors: np.ndarray | None
-    found: bool  # False: the rounds of fit and correction did not end
+    found: bool  # False: the rounds of fit and correction did not converge
 
     @property
     def steady(self) -> np.ndarray:
-        """For each instrument error (k,): whether it was found, and changes by at most two standard errors if the last
-        half decade of the sweep is left out."""
+        """Whether each instrument error (k,) was found and changes by at most two standard errors if the last half
+        decade of the sweep is left out."""
         if self.part is None or self.part_errors is None or not self.found:
             return np.zeros(len(self.values), bool)
         return np.abs(self.values - self.part) <= 2 * self.part_errors
 
 
 def nuisances_of(sweep: Sweep) -> list[Nuisance]:
-    """The errors of the instrument (inertia, friction) for which the sweep has data."""
+    """Return the errors of the instrument (inertia, friction) for which the sweep has data."""
     out = []
     if sweep.inertia is not None:
         out.append(Nuisance("inertia", raw_torque.UNCERTAINTY * sweep.inertia + 0j, raw_torque.UNCERTAINTY))
@@ -85,10 +90,11 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
 
 
 def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
-    """Fit the instrument's errors together with the Prony modes; return the fit and the corrected sweep.
+    """Fit the instrument's errors together with the Prony modes, and return the fit and the corrected sweep.
 
     Fit and sweep are returned unchanged if the sweep has no data of the instrument, or if the model has no free Prony
-    modes. If one of the errors changes with the band, all errors are reported but none is used.
+    modes. If one of the errors changes when the upper end of the band is left out, all errors are reported but none is
+    used.
     """
     known = nuisances_of(sweep)
     if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
@@ -110,8 +116,8 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
         f"the instrument's {n.name} is {n.compared(v)} (standard error {n.told(e)}, prior {n.told(1.0)}), and the "
         "moduli are corrected for it"
         if e < UNTOLD
-        else f"the data do not tell the instrument's {n.name}: its standard error stays {n.told(e)}, of {n.told(1.0)} "
-        "before, and the moduli have this error"
+        else f"the data do not determine the instrument's {n.name}: its standard error is {n.told(e)} with the data "
+        f"and {n.told(1.0)} without, and the moduli contain this error"
         for n, v, e in zip(known, values, np.sqrt(np.diag(covariance)), strict=True)
     ]
     corrected = corrected._replace(notes=(*sweep.notes, *notes))
@@ -120,8 +126,8 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
 
 
 def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
-    """The instrument errors that were fitted together with the modes, and the correction (k,) of the sweep in standard
-    deviations of their priors."""
+    """Return the instrument errors that were fitted together with the modes, and the correction (k,) of the sweep, in
+    standard deviations of their priors."""
     told = fit.details.get("instrument")
     if told is None or told["moves_with_the_band"]:
         return [], np.zeros(0)
@@ -130,24 +136,25 @@ def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
 
 
 def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]:
-    """A sentence on each instrument error that changes with the band, or one sentence if the errors were not found."""
+    """Return a warning for each instrument error that changes when the upper end of the band is left out, or one
+    warning if the errors were not found."""
     out, e = [], np.sqrt(np.diag(errors.covariance))
     if not errors.found:
         each = " and ".join(n.name for n in known)
         return [
-            f"the error of the instrument's {each} was not found together with the modes, so nothing is corrected and "
-            "the errors of the parameters are without it: leave out the frequencies at which the instrument carries "
-            "most of the torque (--max-frequency), or give another number of --modes"
+            f"the error of the instrument's {each} was not found together with the modes. The moduli are not corrected "
+            "for this error, and the errors of the parameters do not contain it: leave out the frequencies at which "
+            "the instrument carries most of the torque (--max-frequency), or give another number of --modes"
         ]
     for k in np.flatnonzero(~errors.steady):
         n = known[k]
         there = "too few points are left to check it"
         if errors.part is not None:
-            there = f"it is {n.told(errors.part[k])} there"
+            there = f"the error is then {n.told(errors.part[k])}"
         out.append(
-            f"the instrument's {n.name} seems {n.compared(errors.values[k])} (standard error {n.told(e[k])}), but "
-            f"not without the last half decade ({there}): the misfit of the model poses as {n.name}, so it is not "
-            "corrected"
+            f"the instrument's {n.name} seems {n.compared(errors.values[k])} (standard error {n.told(e[k])}), but not "
+            f"if the last half decade is left out ({there}). The misfit of the model poses as {n.name}, so this error "
+            "is not corrected"
         )
     return out
 
@@ -157,7 +164,7 @@ def _cent(value: float) -> str:
 
 
 def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[str, object]:
-    """The part `instrument` of fit.json."""
+    """Return the part `instrument` of fit.json."""
     out: dict[str, object] = {}
     errors = np.sqrt(np.diag(found.covariance))
     for k, n in enumerate(known):
@@ -172,7 +179,8 @@ def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[s
 
 
 def directions(sweep: Sweep, known: list[Nuisance]) -> np.ndarray:
-    """Change of the residuals (2n, k) if each instrument error changes by one standard deviation of its prior."""
+    """Return the changes (2n, k) of the residuals if each instrument error changes by one standard deviation of its
+    prior."""
     scales = np.concatenate(sweep.deviations)
     return np.stack([np.concatenate([n.moved.real, n.moved.imag]) / scales for n in known], axis=1)
 
@@ -183,8 +191,8 @@ def _shifted(sweep: Sweep, known: list[Nuisance], values: np.ndarray) -> Sweep:
 
 
 def _with_noise_as_measured(sweep: Sweep) -> Sweep:
-    """The sweep whose weights come from the noise of the measured moduli. A correction subtracts a part of the moduli,
-    but not the noise of this part.
+    """Return the sweep with the standard deviations of its measured moduli as fixed numbers. A correction then changes
+    the moduli but not their noise.
     """
     if sweep.storage_sd is not None:
         return sweep
@@ -193,8 +201,8 @@ def _with_noise_as_measured(sweep: Sweep) -> Sweep:
 
 
 def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, Fit, bool]:
-    """The errors (k,) and their covariance, in standard deviations of the priors; the fit to the corrected moduli; and
-    whether the rounds of fit and correction ended.
+    """Return the errors (k,) and their covariance in standard deviations of the priors, the fit to the corrected
+    moduli, and whether the rounds of fit and correction converged.
     """
     known = nuisances_of(sweep)
     values, covariance = np.zeros(len(known)), np.eye(len(known))
@@ -217,12 +225,12 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
 
 
 def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:
-    """The modes fitted to other moduli, starting from their present values."""
+    """Return the fit of the modes to other moduli. It begins at the present values of the modes."""
     return viscoelastic.modes_from(sweep, fit.solution.u[None], fit.kind)._replace(details=fit.details)
 
 
 def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """The step, halved until all corrected moduli are positive; 0 if no part of it is possible.
+    """Return the step, halved until all corrected moduli are positive. Returns 0 if no part of the step is possible.
 
     The modes can fit a part of a large error, so the first step may be far too long.
     """
@@ -235,7 +243,7 @@ def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarr
 
 
 def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: np.ndarray) -> Estimate:
-    """The estimate with the part of its errors that the instrument's errors cause."""
+    """Return the estimate with its errors enlarged by the errors of the instrument."""
     J = np.asarray(fit.solution.jacobian)
     _, slope = host.with_jacobian(
         lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell), np.asarray(fit.solution.u)
@@ -248,7 +256,7 @@ def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: 
 
 
 def with_gap_error(fit: Fit, relative: float) -> Fit:
-    """The fit with the error of the gap. All moduli share this error; ratios and times do not have it."""
+    """Return the fit with the error of the gap. This error is common to all moduli; ratios and times do not have it."""
     modes = fit.modes
     first = np.concatenate([fit.uncertainty.values[:1], np.zeros(2 * modes)])
     own = fit.parameters
@@ -260,7 +268,7 @@ def with_gap_error(fit: Fit, relative: float) -> Fit:
 
 
 def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) -> Fit:
-    """The closed-form fit of a compressed sample, with the parameters of the sample at rest (not compressed).
+    """Return the closed-form fit of a compressed sample, with the parameters of the sample at rest (not compressed).
 
     Storage modulus, loss modulus and residuals of the fit still describe the compressed sample.
 
@@ -298,8 +306,8 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
 
 
 def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
-    """The kind whose variables u describe the sample at rest: its relaxing part and its equilibrium part are divided by
-    their factors."""
+    """Return the kind (the meaning of the variables u) for the sample at rest. Its relaxing part and its equilibrium
+    part are divided by their factors."""
     seen, shown, moduli = kind.maxwell, kind.values, kind.moduli
     if shown is None or moduli is None:
         return kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
@@ -316,8 +324,8 @@ def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
 
 
 def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, object]]:
-    """New Prony modes for the model of the sample at rest. The modes of the measured moduli cannot be used: they mix
-    the relaxing and the equilibrium part."""
+    """Return the kind and the details with new Prony modes for the model of the sample at rest. The modes of the
+    measured moduli cannot be used, because each of them contains both relaxing and equilibrium part."""
     own, omega = kind.moduli, sweep.angular_frequency
     assert own is not None
     solid = kind.names[0] == "equilibrium_modulus"
@@ -328,7 +336,7 @@ def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, 
 
 
 def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) -> dict[str, object]:
-    """The part `precompression` of fit.json, for a fit in closed form or through the simulation."""
+    """Return the part `precompression` of fit.json, for a fit in closed form or through the simulation."""
     law, strain = laws.typical(simulation.law), simulation.precompression
     G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"
     factors, kept = compression.shares(law, strain), compression.incompressible(law, strain)
@@ -355,6 +363,6 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
 
 
 def _changed(fit: Fit, before: compression.Shares, after: compression.Shares) -> float:
-    """Ratio of G0 with the factors `after` to G0 with the factors `before`. The measured moduli do not change."""
+    """Return the ratio of G0 with the factors `after` to G0 with the factors `before`, for the same measured moduli."""
     stands = float(fit.model.equilibrium_modulus) / float(fit.model.shear_modulus)
     return (1 - stands) * before.relaxing / after.relaxing + stands * before.equilibrium / after.equilibrium

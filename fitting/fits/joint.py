@@ -1,7 +1,9 @@
-"""One set of Prony parameters from several tests at once (sweep, creep, tension, indentation), each with its own noise.
+"""One set of Prony parameters from several tests at once (sweep, creep, tension, indentation), each with separate
+noise.
 
-Residuals of all tests, divided by their noise, are minimised together by Levenberg-Marquardt (forward-mode derivatives
-through every rig). The law is scaled to G0, as in the torsion fit.
+The Levenberg-Marquardt method minimises the residuals of all tests together, divided by their noise. A rig is a test
+machine with its sample; its simulation is differentiated in forward mode. The law is scaled to G0, as in the torsion
+fit.
 """
 
 import time
@@ -31,18 +33,18 @@ from liverjax.physics.viscosity import Prony
 
 
 class Test(NamedTuple):
-    """A measurement and the function that predicts it."""
+    """A measurement and the function `predict`, which returns the predicted values (n,) and the worst status code."""
 
     name: str
     predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
     measured: np.ndarray  # (n,)
     sd: np.ndarray  # (n,) standard deviation of its noise
-    mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) change by an infinitely fine mesh; None: none
+    mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) effect of an infinitely fine mesh; None: no mesh
 
 
 def sweep(data: Sweep) -> Test:
-    """A frequency sweep in closed form. Its noise comes from the file, or else from the misfit of the best Prony
-    modes."""
+    """Return a frequency sweep that is predicted in closed form. Its noise comes from the file, or otherwise from the
+    misfit of the best Prony modes."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
@@ -52,7 +54,8 @@ def sweep(data: Sweep) -> Test:
 
 
 def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.Drive = torsion.Drive()) -> Test:
-    """A frequency sweep through the torsion simulation, with fixed or free height, at torque amplitudes [N m]."""
+    """Return a frequency sweep that the torsion simulation predicts, with fixed or free height, at torque amplitudes [N
+    m]."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
@@ -63,8 +66,8 @@ def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.
 
 
 def _noise_of(data: Sweep) -> np.ndarray:
-    """Standard deviations (2n,) [Pa] of the moduli. If the file has no standard deviations, the scales are only
-    weights. Then the misfit of Prony modes gives the noise.
+    """Return the standard deviations (2n,) [Pa] of the moduli. If the file has no standard deviations, the scales of
+    the sweep are only weights, and the misfit of Prony modes gives the noise.
     """
     scales = np.concatenate(data.deviations)
     if data.noise_given:
@@ -75,8 +78,8 @@ def _noise_of(data: Sweep) -> np.ndarray:
 
 
 def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
-    """A test in a rig of `fitting.rigs.glued`, with readings (T,) [N] or [m] and the standard deviation of their noise:
-    one number, or (T,).
+    """Return a test in a rig of `fitting.rigs.glued`, with readings (T,) [N] or [m]. `sd` is the standard deviation of
+    their noise, as one number or (T,).
 
     Raises:
         InputError: the number of readings differs from the number of steps of the rig, or the noise is not positive.
@@ -90,7 +93,7 @@ def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
         raise InputError(f"{name}: sd has shape {np.shape(sd)}: give one number, or one per reading {measured.shape}")
     sd = np.broadcast_to(np.asarray(sd, float), measured.shape)
     if not (np.all(np.isfinite(measured)) and np.all(np.isfinite(sd)) and np.all(sd > 0)):
-        raise InputError(f"{name}: readings and their positive noise must be finite numbers: correct them")
+        raise InputError(f"{name}: measured and sd must be finite, and sd above 0: correct these values")
 
     def predict(law, viscosity, model):
         readings, codes = glued.read(rig, law, viscosity)
@@ -109,12 +112,12 @@ def fit(
 ) -> Estimate:
     """Fit the Maxwell parameters to all tests, with standard errors. `uncertainty.parameter_names` gives their names.
 
-    If tests are simulated in rigs, `mesh_bias` is the error of each value that the meshes cause. Subtract it to correct
-    the value. A warning is given if it is larger than the standard error.
+    If tests are simulated in rigs, `mesh_bias` is the error of each parameter due to the meshes. Subtract `mesh_bias`
+    to correct the parameter. A warning is given if this error is larger than the standard error.
 
     Args:
         tests: one or more.
-        start: first values of the parameters; the number of modes does not change.
+        start: starting point of the parameters; the number of modes does not change.
         law: one law for all tests. The fit scales its shear modulus to G0.
         part: which part of the stress relaxes, see `Prony`.
         max_iterations, progress: see `levenberg_marquardt_host`.
@@ -161,11 +164,11 @@ def fit(
 
 
 def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law: Law) -> None:
-    """Refuse invalid tests, an invalid law or an invalid start."""
+    """Raise InputError if tests, law or start are invalid."""
     if not tests:
         raise InputError("tests is empty: give one test or more")
     if not callable(getattr(law, "shear_modulus", None)):
-        raise InputError(f"law = {law!r} is no law: give e.g. laws.typical('neo_hookean')")
+        raise InputError(f"law = {law!r} is not a law: give e.g. laws.typical('neo_hookean')")
     ratios, times = (np.atleast_1d(np.asarray(v, float)) for v in (start.ratios, start.relaxation_times))
     if ratios.shape != times.shape or ratios.ndim != 1:
         raise InputError(
@@ -181,7 +184,7 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> np.ndarray:
-    """Errors (n,) of the readings that the meshes cause, divided by the standard deviation of the noise."""
+    """Return the errors (n,) of the readings due to the meshes, divided by the standard deviation of the noise."""
     return np.concatenate(
         [
             np.zeros(len(test.sd)) if test.mesh_error is None else np.asarray(test.mesh_error(*material)) / test.sd

@@ -2,7 +2,7 @@
 
 The likelihood is the same as in the fit: the errors are independent, with the given scales times a common factor s.
 This factor s is integrated out, with the prior 1 / s. If the data have standard deviations, the prior is 1 / s for s >
-1 and else 0: the standard deviations may be enlarged, but never reduced.
+1 and 0 otherwise. So the standard deviations may be enlarged, but never reduced.
 
 If errors of the instrument are fitted together with the modes of a sweep, the posterior contains these errors too, with
 their priors. A sweep does not determine the gap. So the error of the gap is drawn independently, as one factor for all
@@ -61,15 +61,16 @@ class Posterior(NamedTuple):
     times: tuple[float, float] | None = None  # ends [s] of the prior of relaxation times
 
     def warnings(self) -> list[str]:
-        """Warnings if the chains do not agree, if the prior cuts the posterior, or if the linear rig is not accurate
-        enough.
+        """Return warnings if the chains do not agree, if the prior truncates the posterior, or if the linear rig is not
+        accurate enough.
         """
         worst = int(np.argmax(self.r_hat))
         out = self._cut_by_the_prior()
         if self.simulated and not self.simulated["largest_difference"] < DIFFERENT:
             out.append(
-                f"the posterior is that of the linear rig; in {SIMULATED} simulated draws its log density is off by up "
-                f"to {self.simulated['largest_difference']:.2g}: its intervals are only as accurate"
+                f"the posterior was computed with the linear rig instead of the simulation. In {SIMULATED} simulated "
+                f"draws, its log density is wrong by up to {self.simulated['largest_difference']:.2g}, so its "
+                "intervals are only approximate"
             )
         if self.r_hat[worst] < AGREED:
             return out
@@ -80,7 +81,7 @@ class Posterior(NamedTuple):
         ]
 
     def _cut_by_the_prior(self) -> list[str]:
-        """A sentence on each relaxation time with many draws near an end of its prior."""
+        """Return a warning for each relaxation time with many draws near a bound of its prior."""
         out = []
         for k, name in enumerate(self.names):
             if self.times is None or not name.startswith("relaxation_times"):
@@ -92,17 +93,17 @@ class Posterior(NamedTuple):
             ):
                 if near.mean() > CUT:
                     out.append(
-                        f"the prior cuts the posterior of {name}: {100 * near.mean():.0f} % of the draws are near its "
-                        f"end of {end:.3g} s, so its interval and those of the moduli are those of the prior: the data "
-                        "do not bound them; measure a wider band"
+                        f"the prior truncates the posterior of {name}: {100 * near.mean():.0f} % of the draws lie near "
+                        f"the bound of {end:.3g} s. The data do not limit this time, so its interval and those of the "
+                        "moduli depend on the prior. Measure a wider band"
                     )
         return out
 
 
-#: A draw within this factor of an end of the prior is near it; and the part of draws near an end that is reported.
+#: NEAR: a draw within this factor of a bound of the prior counts as near. CUT: a larger part of near draws is reported.
 NEAR, CUT = 1.25, 0.025
-#: R-hat below which the chains agree; and the smallest relative error of data. Without any error, the posterior would
-#: be a point.
+#: AGREED: chains agree if R-hat is below this value. QUIETEST: lower bound of the relative error of data; without any
+#: error, the posterior would be a point.
 AGREED, QUIETEST = 1.01, 1e-6
 
 
@@ -112,17 +113,19 @@ class Target(NamedTuple):
     residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), residuals divided by their scales
     prior: "Modes | Springpots | WithInstrument"
     deviations_given: bool
-    weight: float = 1.0  # number of independent residuals over number of residuals
+    weight: float = 1.0  # number of independent residuals, divided by the number of residuals
 
     def log_likelihood(self, u: np.ndarray) -> np.ndarray:
-        """Log likelihood of u (W, P), up to a constant, with the size of the errors integrated out."""
+        """Return the log likelihood (W,) of u (W, P), up to a constant. The factor s of the errors is integrated
+        out."""
         with np.errstate(all="ignore"):  # a point at which numbers overflow has likelihood 0
             r = self.residuals(u)
             return self.weight * log_likelihood(np.sum(r * r, axis=-1), r.shape[-1], self.deviations_given)
 
 
 def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np.ndarray:
-    """Log of the integral of s^-m exp(-square / 2 s^2) ds / s over all s, or over s >= 1 if deviations are given."""
+    """Return the logarithm of the integral of s^-m exp(-square / (2 s^2)) ds / s over all s, up to a constant. If
+    deviations are given, the integral is over s >= 1. `square` is the sum of m = `count` squared residuals."""
     half = 0.5 * np.maximum(square, QUIETEST**2 * count)
     out = -0.5 * count * np.log(half)
     return out + np.log(scipy.special.gammainc(0.5 * count, half)) if deviations_given else out
@@ -135,11 +138,11 @@ def target(
     size: np.ndarray,
     given: bool,
 ) -> Target:
-    """The posterior of a model.
+    """Return the posterior density of a model.
 
     Args:
         kind: the meaning of u: Prony modes or a fractional model.
-        residuals: u (W, P) -> (W, m), divided by their scales.
+        residuals: function from u (W, P) to the residuals (W, m), divided by their scales.
         resolved: shortest and longest relaxation time [s] that the data resolve.
         size: measured moduli (n,) [Pa].
         given: whether standard deviations of the data are given.
@@ -163,7 +166,7 @@ class Modes(NamedTuple):
     words: str = PRIORS["prony"]
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
-        """Log prior of u (W, P), up to a constant."""
+        """Return the log prior (W,) of u (W, P), up to a constant."""
         with np.errstate(all="ignore"):
             model = self._model(u)
             rest = np.zeros((len(u), 0)) if self.fluid else 1 - model.ratios.sum(axis=-1, keepdims=True)
@@ -171,7 +174,8 @@ class Modes(NamedTuple):
             log_time = np.log(model.relaxation_times)
             inside = (log_time[:, -1] > self.times[0]) & (log_time[:, 0] < self.times[1])
             inside &= (u[:, 0] > self.modulus[0]) & (u[:, 0] < self.modulus[1])
-            # Derivatives of the ratios by their logits (softmax), and of the log times by the logs of their gaps.
+            # Log determinants of the derivatives: ratios by logits (softmax), and log times by the logs of their
+            # differences.
             gaps = u[:, u.shape[-1] - model.ratios.shape[-1] + 1 :]
             found = np.log(shares).sum(axis=-1) + gaps.sum(axis=-1)
         return np.where(inside & np.isfinite(found), found, -np.inf)
@@ -179,7 +183,9 @@ class Modes(NamedTuple):
     def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
         """Draw u (count, parameters) from the prior."""
         modes = parameters // 2
-        share = rng.standard_exponential((count, modes + (not self.fluid)))  # normalised: uniform on the simplex
+        share = rng.standard_exponential(
+            (count, modes + (not self.fluid))
+        )  # divided by their sum: uniform on the simplex
         log_time = -np.sort(-rng.uniform(*self.times, (count, modes)), axis=1)
         top = rng.uniform(*self.modulus, (count, 1))
         gaps = np.log(-np.diff(log_time, axis=1))
@@ -189,22 +195,23 @@ class Modes(NamedTuple):
         return (generalised_maxwell.natural_fluid if self.fluid else generalised_maxwell.natural)(u)
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Names of the reported parameters, for this number of coordinates."""
+        """Return the names of the reported parameters, for this number of coordinates."""
         first, *others = parameter_names(parameters // 2)
         return (first, *others) if self.fluid else (first, "equilibrium_modulus", *others)
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Moduli, ratios and times (n, K), for u (n, P)."""
+        """Return moduli, ratios and times (n, K) for u (n, P)."""
         model = self._model(u)
         moduli = [model.shear_modulus] if self.fluid else [model.shear_modulus, model.equilibrium_modulus]
         return np.concatenate([np.stack(moduli, axis=-1), model.ratios, model.relaxation_times], axis=-1)
 
 
 class Springpots(NamedTuple):
-    """Prior and parameters of a fractional model. u has its free entries in `springpots`: log moduli and logits."""
+    """Prior and parameters of a fractional model. u has the free entries of `springpots`: logs of moduli and logits of
+    exponents."""
 
     model: Fractional
-    moduli: tuple[float, float]  # ends of their logs
+    moduli: tuple[float, float]  # bounds of the log moduli
     values: Callable  # JAX function of one u
     words: str = PRIORS["fractional"]
 
@@ -214,7 +221,7 @@ class Springpots(NamedTuple):
         return np.array([k % 2 == 0 for k in self.model.free])
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
-        """Log prior of u (W, P), up to a constant."""
+        """Return the log prior (W,) of u (W, P), up to a constant."""
         moduli, exponents = u[:, self._moduli], u[:, ~self._moduli]
         inside = np.all((moduli > self.moduli[0]) & (moduli < self.moduli[1]), axis=-1)
         slopes = -np.logaddexp(0, exponents) - np.logaddexp(0, -exponents)
@@ -230,7 +237,7 @@ class Springpots(NamedTuple):
         return self.model.names
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Parameters (n, K) of the fractional model, for u (n, P)."""
+        """Return the parameters (n, K) of the fractional model for u (n, P)."""
         return self.values(u)
 
 
@@ -252,7 +259,7 @@ class WithInstrument(NamedTuple):
         return u[..., : -len(self.errors)], u[..., -len(self.errors) :]
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
-        """Log prior of u (W, P), up to a constant."""
+        """Return the log prior (W,) of u (W, P), up to a constant."""
         modes, errors = self.apart(u)
         return self.modes.log_prior(modes) - 0.5 * np.sum(errors**2, axis=-1)
 
@@ -262,11 +269,11 @@ class WithInstrument(NamedTuple):
         return np.concatenate([modes, rng.standard_normal((count, len(self.errors)))], axis=1)
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Names of the reported parameters, for this number of coordinates."""
+        """Return the names of the reported parameters, for this number of coordinates."""
         return (*self.modes.names(parameters - len(self.errors)), *(n.reported for n in self.errors))
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Moduli, ratios, times and errors of the instrument (n, K), for u (n, P)."""
+        """Return moduli, ratios, times and errors of the instrument (n, K) for u (n, P)."""
         modes, errors = self.apart(u)
         return np.concatenate([self.modes.numbers(modes), errors * [n.unit for n in self.errors]], axis=1)
 
@@ -292,8 +299,8 @@ def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
 
 
 def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:
-    """The draws with the error of the gap, if the fit has one. This error is a factor of all moduli of a draw. The
-    factor is log-normal, so that no modulus is negative."""
+    """Return the draws with the error of the gap, if the fit has this error. It multiplies all moduli of a draw by one
+    factor. The factor is log-normal, so that no modulus is negative."""
     relative, kind = fit.details.get("gap_error"), fit.kind
     if not relative:
         return found
@@ -308,7 +315,7 @@ def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:
 
 
 def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
-    """Sample the posterior of a fit in closed form, of Prony modes or of a fractional model."""
+    """Sample the posterior of a closed-form fit of Prony modes or of a fractional model."""
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     if fit.kind.values is None:
         function = viscoelastic.residuals_of(fit.kind)
@@ -325,7 +332,7 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
 
 
 def _beside_instrument(fit: Fit, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> tuple[Target, int]:
-    """The posterior of Prony modes and of the instrument errors in the fit; and the length of u."""
+    """Return the posterior density of the Prony modes and of the instrument errors in the fit, and the length of u."""
     own, parameters = _sweep_target(fit.kind, sweep, residuals), len(fit.solution.u)
     known, corrected_by = instrument.used_errors(fit, sweep)
     if not known or not isinstance(own.prior, Modes):
@@ -344,17 +351,17 @@ def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np
     return target(kind, residuals, sweep.resolved, size, sweep.noise_given)
 
 
-#: Number of draws that are simulated; a warning is given if their log density differs by more than DIFFERENT.
+#: SIMULATED: number of draws that are simulated. DIFFERENT: a warning is given if their log density differs by more.
 SIMULATED, DIFFERENT = 12, 0.1
 
 
 def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a fit of Prony modes through the torsion simulation.
 
-    The density is computed with the linear rig and its recursion in time. For each frequency, a complex factor corrects
-    the linear rig to the simulation at the minimum. Then some draws are simulated in full. `Posterior.simulated` has
-    the largest difference between the simulated and the approximate log likelihood of these draws. It shows how good
-    the approximation is.
+    The density is computed with the linear rig: the same test for small strain, which needs no simulation in time. For
+    each frequency, a complex factor corrects the linear rig so that both agree at the minimum. Then some draws are
+    simulated in full. `Posterior.simulated` has the largest difference between the simulated and the approximate log
+    likelihood of these draws. It shows how good the approximation is.
     """
     data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
     rig, law, omega, _, measured, _ = data
@@ -388,9 +395,10 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
 
 
 def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
-    """Sample the posterior of a relaxation or creep test in closed form, of Prony modes or of a fractional model.
+    """Sample the posterior of a closed-form fit to a relaxation or creep test, of Prony modes or of a fractional model.
 
-    If neighbouring answers share their noise, the likelihood counts only the number of independent answers.
+    If the noise of neighbouring measured values is correlated, only the number of independent values counts in the
+    likelihood.
     """
     test = test._replace(constant_noise=fit.details.get(time_tests.CONSTANT_NOISE, False))
     if fit.kind.values is None:

@@ -1,5 +1,5 @@
-"""Several samples of one material. Each sample is fitted by itself, with the same model for all; then the population of
-the samples is estimated."""
+"""Several samples of one material. Each sample is fitted separately, with the same model for all. Then the population
+of the samples is estimated."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,12 +30,12 @@ class Samples(NamedTuple):
 
     @property
     def kind(self) -> Kind:
-        """Kind of the common model of all samples."""
+        """The kind of the common model of all samples."""
         return self.fits[0].kind
 
     def values(self, k: int) -> dict[str, tuple[float, float]]:
-        """Parameters of sample k with their errors, by the names of the populations. A strength that the sample does
-        not have is 0."""
+        """Return the parameters of sample k with their errors. The names of the populations are the keys. A strength
+        that is missing in the spectrum of this sample is 0."""
         own = values_of_sample(self.fits[k])
         return {name: own.get(name, (0.0, np.inf)) for name in self.populations}
 
@@ -53,11 +53,11 @@ def fit(
     modes: int | str = "auto",
     progress: Callable[[str], None] = lambda text: None,
 ) -> Samples:
-    """Choose the model with the lowest sum of criteria. Only models that at least half of the samples determine can be
-    chosen.
+    """Choose the model with the lowest sum of the information criteria of all samples. A model can be chosen only if at
+    least half of the samples determine all its parameters.
 
     Args:
-        sweeps: two or more.
+        sweeps: two or more samples.
         model: one of `models.MODELS`.
         modes: number of Prony modes, or "auto".
         progress: called with the name of each fit.
@@ -66,7 +66,9 @@ def fit(
         InputError: a single sweep, or an unknown model.
     """
     if len(sweeps) < 2:
-        raise InputError(f"sweeps has {len(sweeps)} of two or more samples: fit one with viscoelastic.closed_form")
+        raise InputError(
+            f"sweeps needs two or more samples, not {len(sweeps)}: fit a single sample with viscoelastic.closed_form"
+        )
     if model not in models.MODELS:
         raise InputError(f"model = {model!r} is not known: use one of {', '.join(models.MODELS)}")
     dense = [generalised_maxwell.refuse_impossible(s) for s in sweeps]
@@ -101,8 +103,8 @@ def _candidate_for_all(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Ca
 def _modes_for_all(
     sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable
 ) -> list[_Candidate]:
-    """Fits of 1, 2, … Prony modes. The search ends after two numbers of modes in a row that do not lower the summed
-    criterion."""
+    """Return the fits of 1, 2, … Prony modes. The search ends when two numbers of modes, one after the other, do not
+    lower the summed criterion."""
     largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
     numbers = range(1, min(largest, min(map(uncertainty.supported_modes, sweeps))) + 1)
     if modes != "auto":
@@ -124,8 +126,8 @@ def _modes_for_all(
 
 
 def values_of_sample(fit: Fit) -> dict[str, tuple[float, float]]:
-    """Parameters of a fit with their standard errors: the parameters of `edges.values`, and the strengths of a
-    spectrum."""
+    """Return the parameters of a fit with their standard errors: the parameters of `edges.values`, and the strengths of
+    a spectrum."""
     out = edges.values(fit)
     if fit.kind.effective is not None and fit.parameters is not None:
         rows = zip(fit.kind.names, fit.parameters.values, fit.parameters.standard_errors, strict=True)
@@ -146,20 +148,20 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     return out
 
 
-#: A sample is reported if it differs from the others, and if the probability of such a difference by chance, in any of
-#: the samples, is below this value; and minimum number of samples for this test.
+#: _STRANGE: a sample is reported if the probability that any of the samples differs so much by chance is below this
+#: value. _FEWEST: minimum number of samples for this test.
 _STRANGE, _FEWEST = 0.05, 4
-#: Minimum ratio to the mean of the others from which a sample is reported; and maximum standard error of a logarithm
-#: that is compared.
+#: _APART: a sample is reported if its ratio to the mean of the others is above this value, or below the inverse.
+#: _UNSURE: values whose logarithm has a larger standard error are not compared.
 _APART, _UNSURE = 1.3, 0.5
 #: If moduli of one material differ by this factor, their units may be wrong.
 _OTHER_UNIT = 100.0
 
 
 def outliers(found: Samples) -> list[str]:
-    """A sentence on each sample with a parameter far from the other samples (t-tests on logarithms, Bonferroni
-    correction). Half of the level belongs to the first parameter, a modulus: a wrong gap or radius multiplies all
-    moduli by one factor. The other half belongs to the other parameters.
+    """Return a warning for each sample with a parameter far from the other samples (t-tests on logarithms, Bonferroni
+    correction). Half of the significance level belongs to the first parameter, a modulus, because a wrong gap or radius
+    multiplies all moduli by one factor. The other half belongs to the other parameters.
 
     The strengths of a spectrum are not compared: one strength may grow while its neighbour on the grid falls.
     """
@@ -177,10 +179,10 @@ def outliers(found: Samples) -> list[str]:
             for chance, name, ratio, mean in own
         )
         what = "its units and sizes"
-        if not any(name.endswith(("modulus", "springpot")) for _, name, _, _ in own):  # no parameter is a stress
+        if not any(name.endswith(("modulus", "springpot")) for _, name, _, _ in own):  # none of them is a modulus
             what = "its temperature, the unit of its frequency, and the sample"
         source = Path(found.sweeps[sample].source).name
-        out.append(f"{source}: {which}: check {what}; it widens the population's intervals")
+        out.append(f"{source}: {which}: check {what}. This sample widens the population's intervals")
     if out:
         return out
     name = next((n for n in ("shear_modulus", *found.populations) if n in found.populations), "")
@@ -189,16 +191,16 @@ def outliers(found: Samples) -> list[str]:
 
 
 def _known_logarithms(found: Samples, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The samples that determine the parameter `name`, the logarithms of its values, and the errors of these
-    logarithms."""
+    """Return the indices of the samples that determine the parameter `name`, the logarithms of its values, and their
+    errors."""
     pairs = np.array([found.values(k)[name] for k in range(len(found.fits))])
     known = np.flatnonzero((pairs[:, 0] > 0) & (pairs[:, 1] < _UNSURE * pairs[:, 0]))
     return known, np.log(pairs[known, 0]), pairs[known, 1] / pairs[known, 0]
 
 
 def _strangers(found: Samples, name: str) -> list[tuple[int, float, float, float]]:
-    """Samples with a parameter far from the other samples. For each: its index, the probability that one of all samples
-    is so far away by chance, its ratio to the mean of the others, and this mean.
+    """Return the samples with a parameter far from the other samples. Each entry has the index of the sample, the
+    probability of such a distance by chance in any of the samples, the ratio to the mean of the others, and this mean.
     """
     known, logs, errors = _known_logarithms(found, name)
     out = []
@@ -213,8 +215,8 @@ def _strangers(found: Samples, name: str) -> list[tuple[int, float, float, float
 
 
 def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[str]:
-    """A sentence if some samples have a modulus far above or below the others. It also works for few samples, where no
-    test is possible."""
+    """Return a warning if some samples have a modulus far above or below the others. This check also works for few
+    samples, where no test is possible."""
     order = np.argsort(logs)
     gaps = np.diff(logs[order])
     if not len(gaps) or gaps.max() < np.log(_OTHER_UNIT):
@@ -223,8 +225,8 @@ def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[st
     below, above = ([sources[k] for k in own] for own in (order[:first], order[first:]))
     fewer, way = (above, "above") if len(above) < len(below) else (below, "below")
     return [
-        f"{', '.join(fewer)}: the {name} is {np.exp(gaps.max()):.2g} times {way} that of the other samples: check "
-        "units and sizes; the population's intervals are as wide as that"
+        f"{', '.join(fewer)}: the {name} is a factor of {np.exp(gaps.max()):.2g} {way} that of the other samples: "
+        "check units and sizes. The population's intervals contain this factor"
     ]
 
 
@@ -233,14 +235,14 @@ def _place(name: str) -> int:
 
 
 def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
-    """Prony modes at the means of the population. Modes without a mean are left out. Other parameters without a mean
-    get the median."""
+    """Return Prony modes with the means of the population. Modes without a mean are left out. Other parameters without
+    a mean get the median."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}
     if kind.values is None:
         if "shear_modulus" not in mean:
-            raise InputError("the samples determine no shear modulus together: fit them one by one")
+            raise InputError("the samples together do not determine the shear modulus: fit each sample separately")
         known = [k for k in range(len(populations)) if {f"ratios[{k}]", f"relaxation_times[{k}]"} <= set(mean)]
         ratios, times = (np.array([mean[f"{n}[{k}]"] for k in known]) for n in ("ratios", "relaxation_times"))
         ratios = ratios * min(1.0, (1 - 1e-9) / max(ratios.sum(), 1e-300))

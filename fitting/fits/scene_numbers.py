@@ -35,7 +35,7 @@ class Problem(NamedTuple):
 
 
 def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
-    """Residuals (n,) of all scenes with the parameters `values`, and the worst status code of each scene."""
+    """Return the residuals (n,) of all scenes with the parameters `values`, and the worst status code of each scene."""
     parts, codes = [], []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         result = lj.simulate(lj.with_parameters(scene, values), store=store)
@@ -45,15 +45,15 @@ def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "a
 
 
 def with_solvers(problem: Problem, values: Mapping[str, object]) -> Problem:
-    """The problem with the linear solvers that its scenes need for these parameters. A compiled program cannot choose
-    the solvers, because it does not know the values."""
+    """Return the problem with the linear solvers that its scenes need for these parameters. A compiled program cannot
+    choose the solvers, because the values are unknown at compilation."""
     return problem._replace(scenes=tuple(with_solver(scene, [values]) for scene in problem.scenes))
 
 
 class Unknowns(NamedTuple):
     """The unknowns u (n,) of the fit, and the functions that compute the parameters of the scenes from u."""
 
-    start: np.ndarray  # first u (n,)
+    start: np.ndarray  # starting point u (n,)
     values_of: Callable[[jax.Array], Content]  # u -> parameters of the scenes by dotted name
     natural_of: Callable[[jax.Array], jax.Array]  # u -> the parameters to report (m,)
     names: Sequence[str]  # names of these parameters
@@ -72,9 +72,9 @@ def fit(
         problem: scenes and data.
         unknowns: u, and the functions from u to the parameters of the scenes and to the reported parameters.
         max_iterations, progress: see `levenberg_marquardt_host`.
-        mesh_error: estimate the error of the meshes, and how far it moves the parameters (`mesh_bias`). A warning is
-            given if it moves one by more than the standard error. The estimate needs one more run, and one linear solve
-            per step.
+        mesh_error: estimate the error due to the meshes, and the change of each parameter that it causes (`mesh_bias`).
+            A warning is given if a parameter changes by more than its standard error. The estimate needs one more run,
+            and one linear solve per step.
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
     start, values_of, natural_of, names = unknowns
@@ -99,7 +99,7 @@ def fit(
     seconds = time.perf_counter() - begin
     estimate = estimated(names, natural_of, found, problem.components)
     estimate = _of_alike_noise(problem, natural_of, found, estimate)
-    known = np.all(np.isfinite(estimate.standard_errors))  # else a parameter ran to a limit
+    known = np.all(np.isfinite(estimate.standard_errors))  # otherwise a parameter ran to a limit
     left_out = missing_or_none(problem, values_of(found.u)) if mesh_error and known else None
     if left_out is not None:
         size = float(np.sqrt(np.sum(left_out**2) / problem.components))
@@ -110,14 +110,15 @@ def fit(
 
 
 def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, estimate: Estimate) -> Estimate:
-    """The estimate with standard errors for noise that neighbouring points share, and a warning, if the residuals show
-    such noise."""
+    """Return the estimate with larger standard errors, if the residuals show that the noise differs between components
+    or that the noise of neighbouring points is correlated. Correlated noise also causes a warning."""
     if not np.all(np.isfinite(estimate.standard_errors)):
         return estimate
     r, J = np.asarray(found.residuals), np.asarray(found.jacobian)
     seen = np.concatenate([np.isfinite(d.sd).ravel() for d in problem.data])
     slope = np.asarray(jax.jacfwd(natural_of)(jnp.asarray(found.u)))
-    # The noise of some components may be larger than stated, for example along the depth or where the motion is large.
+    # The noise of some components may be larger than stated, for example in the direction of the depth or where the
+    # motion is large.
     uneven = np.linalg.norm(uneven_root(J[seen], r[seen], slope), axis=1)
     if _many(J, seen):
         larger = np.maximum(uneven / estimate.standard_errors, 1.0)
@@ -133,26 +134,27 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
     if most < 1:
         return estimate
     warnings.warn(
-        f"residuals of points within {alike.length:.2g} m are alike: the noise was smoothed, or the scene misses "
-        f"something. The standard errors are those of such noise, up to {most:.2g} times those of independent noise",
+        f"residuals of points within {alike.length:.2g} m are correlated: the measured field was smoothed, or the "
+        f"scene is inadequate. The standard errors include this correlation, up to {most:.2g} times those of "
+        "independent noise",
         stacklevel=3,
     )
     errors = np.maximum(errors, estimate.standard_errors)
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
 
 
-#: With at least this many components for each parameter, the residuals tell the noise of each component.
+#: With at least this many components per parameter, the residuals show whether the noise differs between components.
 _MANY = 20
 
 
 def _many(J: np.ndarray, seen: np.ndarray) -> bool:
-    """Whether there are enough residuals to tell the noise of each component."""
+    """Return whether there are enough residuals to show differences of the noise between components."""
     return bool(np.count_nonzero(seen) >= _MANY * J.shape[1])
 
 
 def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place (n, 3) [m] of each measured component, and the index (n,) of its group: components of one scene, step and
-    direction."""
+    """Return the position (n, 3) [m] of each measured component, and the index (n,) of its group. A group has the
+    components of one scene, step and direction."""
     places, groups = [], []
     for k, (scene, data) in enumerate(zip(problem.scenes, problem.data, strict=True)):
         points = np.asarray(scene.mesh.points)[np.asarray(data.nodes)]
@@ -164,7 +166,7 @@ def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, 
 
 
 def missing(problem: Problem, values: Content) -> np.ndarray:
-    """Errors of the residuals (n,) that the meshes cause, for scenes with the parameters `values`."""
+    """Return the errors (n,) of the residuals due to the meshes, for scenes with the parameters `values`."""
     rows = []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         scene = lj.with_parameters(scene, values)
@@ -180,21 +182,22 @@ def missing(problem: Problem, values: Content) -> np.ndarray:
 
 
 def missing_or_none(problem: Problem, values: Content) -> np.ndarray | None:
-    """The result of `missing`; or None, with a warning, if the mesh error of a scene cannot be estimated."""
+    """Return the errors (n,) of the residuals due to the meshes (`missing`). Returns None, with a warning, if the mesh
+    error of a scene cannot be estimated."""
     try:
         return missing(problem, values)
     except InputError as e:
-        warnings.warn(f"the effect of the mesh error on the fit is not known: {e}", stacklevel=3)
+        warnings.warn(f"the effect of the mesh error on the fit is unknown: {e}", stacklevel=3)
         return None
 
 
 def with_mesh_as_noise(problem: Problem) -> tuple[Problem, list[float]]:
-    """The problem with the mesh error added to the noise, and the size of this error in each scene, divided by the
-    stated noise [1].
+    """Return the problem with the mesh error added to the noise, and the size of this error in each scene, divided by
+    the stated noise [1].
 
-    The size is a root mean square over the measured components, for the parameters in the scenes. Otherwise a map would
-    explain the mesh error by stiffness. If the mesh error cannot be estimated, the problem stays unchanged, with a
-    warning, and the sizes are NaN.
+    The size is a root mean square over the measured components, for the parameters in the scenes. Without the added
+    noise, a map would compensate the mesh error by a false stiffness. If the mesh error cannot be estimated, a warning
+    is given, the problem stays unchanged, and the sizes are NaN.
     """
     left_out = missing_or_none(problem, {})
     if left_out is None or not np.all(np.isfinite(left_out)):

@@ -1,4 +1,8 @@
-"""Identify a generalised Maxwell model through the simulated rheometer: the torsion of a sample between its plates."""
+"""Identify a generalised Maxwell model through the simulated rheometer: the torsion of a sample between its plates.
+
+The recursion is the update of the viscous memory from time step to time step. The rig is the machine with its sample.
+The linear rig is the same test for small strain, whose moduli are known without a mesh.
+"""
 
 import time
 from collections.abc import Callable
@@ -30,7 +34,8 @@ from liverjax.physics.viscosity import Prony
 
 
 class Simulation(NamedTuple):
-    """Settings of the simulated torsion: geometry [m], law, recursion and resolution."""
+    """Settings of the simulated torsion test: geometry [m], law, time integration of the Prony series, number of time
+    steps and element size."""
 
     radius: float = torsion.RADIUS
     height: float = torsion.HEIGHT
@@ -40,12 +45,12 @@ class Simulation(NamedTuple):
     steps: int = 50
     cell_size: float | None = None
     strain: float = 1e-3  # amplitude at the rim (section 5.2)
-    density: float | None = None  # of the sample [kg/m^3]; None: the instrument has corrected the moduli
-    precompression: float = 0.0  # part of the height at rest by which the plates compress the sample (`compression`)
+    density: float | None = None  # of the sample [kg/m^3]; None: the moduli contain no inertia
+    precompression: float = 0.0  # compression by the plates, divided by the height at rest (`compression`)
 
     @property
     def is_linear(self) -> bool:
-        """Whether the response without a mesh is known. It is known for a small strain, except for a compressed sample
+        """Whether the response without a mesh is known. This is so for small strain, except for a compressed sample
         with inertia."""
         return self.strain <= LINEAR_STRAIN and not (self.density is not None and self.precompression)
 
@@ -59,19 +64,18 @@ class Simulation(NamedTuple):
 
     @property
     def run(self) -> "Simulation":
-        """The simulation that is fitted to data of a sample. A compressed sample is simulated without its inertia,
-        which is subtracted from the data instead: the error of the mesh is known only then."""
+        """The simulation that is fitted to data of a sample. For a compressed sample, the error of the mesh is known
+        only without inertia. The inertia is then subtracted from the data instead."""
         return self._replace(density=None) if self.precompression else self
 
 
-#: Up to this strain at the rim, the linear rig gives the derivatives. Their relative error is below the strain. With
-#: inertia, it is the error of the mesh in the inertial part.
+#: Up to this strain at the rim, the derivatives are computed with the linear rig. The relative error of the derivatives
+#: is below the strain. With inertia, this error is the error of the mesh in the inertial part.
 LINEAR_STRAIN = 1e-2
 
 
 def law_and_prony(model: Maxwell, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
-    """The material of the sample from Prony modes: the law scaled to the G0 of the modes, and the viscosity from the
-    modes."""
+    """Return the material of the sample from Prony modes: the law, scaled to the G0 of the modes, and the viscosity."""
     viscosity = Prony(
         ratios=model.ratios,
         relaxation_times=model.relaxation_times,
@@ -88,14 +92,14 @@ def _and_prior(r: jax.Array, u: jax.Array, kind: Kind) -> jax.Array:
 def simulated_residuals(
     u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
 ) -> tuple[jax.Array, torsion.Moduli]:
-    """Simulated minus measured moduli, divided by their standard deviations (2n,), then the rows of a prior; and the
-    simulated moduli.
+    """Return the residuals and the simulated moduli. The residuals (2n,) are simulated minus measured moduli, divided
+    by their standard deviations. The residuals of a prior follow, if `kind` has one.
 
     Args:
         u: variables of `kind`.
         data: rig, law, angular frequencies (n,) [rad/s], torque amplitudes (n,) [N m], measured moduli G' then G''
             (2n,) [Pa] and their standard deviations.
-        simulation: law, recursion and resolution.
+        simulation: settings of the simulated test.
         kind: the meaning of u. The Prony modes at u are simulated.
     """
     rig, law, omega, torque, measured, scales = data
@@ -107,11 +111,12 @@ def simulated_residuals(
 def with_jacobian(
     u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
 ) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
-    """Residuals, their derivative by u (rows, P), and the simulated moduli. See `simulated_residuals`.
+    """Return the residuals of `simulated_residuals`, their derivatives (rows, P) with respect to u, and the simulated
+    moduli.
 
-    The linear rig without a mesh gives the derivative. The simulation gives it if the strain is large, or if a
-    compressed sample has inertia. With the derivative of the linear rig, Gauss-Newton finds the same minimum in a small
-    part of the time (experiments/benchmarks/torsion_speed.py).
+    The derivatives are those of the linear rig. If the strain is large, or if a compressed sample has inertia, the
+    simulation is differentiated instead. With the derivatives of the linear rig, Gauss-Newton finds the same minimum in
+    a small part of the time (experiments/benchmarks/torsion_speed.py).
     """
     if not simulation.is_linear:
 
@@ -134,7 +139,7 @@ def with_jacobian(
 def small_strain_moduli(
     rig: torsion.Rig, model: Maxwell, law: laws.Law, omega: jax.Array, simulation: Simulation
 ) -> jax.Array:
-    """Complex moduli (n,) [Pa]: the limit of the simulated moduli for small strain, without the error of the mesh."""
+    """Return the limit (n,) [Pa] of the simulated complex moduli for small strain, without the error of the mesh."""
     scaled, prony = law_and_prony(model, law, simulation)
     if simulation.precompression:
         scale = model.shear_modulus / law.shear_modulus()
@@ -146,7 +151,7 @@ def small_strain_moduli(
 
 
 def rig_of(simulation: Simulation) -> torsion.Rig:
-    """The rig of a simulation. Its mesh is coarse if the bias of the mesh is known exactly."""
+    """Return the rig of a simulation. The mesh is coarse if the error of the mesh is known exactly."""
     cell, height = simulation.cell_size, simulation.height
     if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
         cell = torsion.linear_cell_for(simulation.radius, height)
@@ -166,21 +171,22 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
 
 @cache
 def _without_mesh(radius: float, gap: float, law: str, strain: float) -> tuple[Glued, Glued]:
-    """`glued_compression.glued` for the name of a law. A fit needs the result twice, so it is cached."""
+    """Return the result of `glued_compression.glued` for the name of a law. A fit needs this result twice, so it is
+    cached."""
     return glued(radius, gap, laws.typical(law), strain)
 
 
 def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
-    """Rig, law, angular frequencies, torques, measured moduli and their standard deviations: the data of
-    `simulated_residuals`."""
+    """Return the data of `simulated_residuals`: rig, law, angular frequencies, torques, measured moduli and their
+    standard deviations."""
     rig = rig_of(simulation)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
     return rig, laws.typical(simulation.law), jnp.asarray(sweep.angular_frequency), torque, measured, scales
 
 
-#: Results of the closed-form fit that stay valid for the fit through the simulation. OF_THE_DATA: words by which its
-#: warnings are found. KEPT: keys of its details.
+#: Results of the closed-form fit that stay valid for the fit through the simulation. OF_THE_DATA: words that identify
+#: these warnings. KEPT: keys of these details.
 OF_THE_DATA = (
     "modes would follow",
     "about as well as",
@@ -217,12 +223,12 @@ def through_torsion(
     optimizer: str = OPTIMIZERS[0],
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Fit:
-    """Fit the moduli of the simulated rheometer, starting from the closed form.
+    """Fit the moduli of the simulated rheometer. The search begins at the closed-form fit.
 
     Args:
         sweep: data.
         start: closed-form fit with the wanted number of modes, and with the errors of gap and instrument.
-        simulation: geometry, law and resolution.
+        simulation: settings of the simulated test.
         optimizer: one of `OPTIMIZERS`.
         progress: called after every evaluation.
     """
@@ -272,8 +278,8 @@ def through_torsion(
 
 
 def _as_told_before(fit: Fit, start: Fit) -> Fit:
-    """The fit through the simulation, with the warnings and details of the closed form `start` that concern the data,
-    and with its shared errors."""
+    """Return the fit through the simulation with the errors of gap and instrument of the closed-form fit `start`.
+    Warnings and details of `start` are added if they concern the data."""
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
     fit = _with_shared_errors(fit._replace(details=fit.details | of_the_model), start)
@@ -290,9 +296,9 @@ def _with_shared_errors(fit: Fit, start: Fit) -> Fit:
 
 
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
-    """The estimate with the changes of the parameters that mesh and time steps of the simulation cause, to first order.
+    """Return the estimate with the changes of the parameters due to the mesh and due to the time steps, to first order.
 
-    At small strain, both changes follow from moduli without a mesh: moduli by the recursion, and moduli in continuous
+    At small strain, both changes follow from two sets of moduli without a mesh: with the recursion, and in continuous
     time. For a compressed sample, quadratic elements give these moduli, and an estimate of their remaining error is
     added (`glued_compression`).
     """
@@ -318,15 +324,15 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
 
 
 def _of_no_mesh(law: laws.Law, prony: Prony, omega: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
-    """Complex moduli (n,) [Pa] without a mesh, by the recursion and in continuous time."""
+    """Return complex moduli (n,) [Pa] without a mesh, first with the recursion, then in continuous time."""
     return torsion.linear_moduli(law, prony, omega, steps), torsion.linear_moduli(law, prony, omega, None)
 
 
 def _of_held(
     rig: torsion.Rig, material: tuple[laws.Law, Prony], omega: jax.Array, simulation: Simulation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Complex moduli (n,) [Pa] of a compressed sample, by the recursion and in continuous time. They contain an
-    estimate of the error that the meshes of `_without_mesh` leave.
+    """Return complex moduli (n,) [Pa] of a compressed sample, first with the recursion, then in continuous time. Both
+    are corrected by the estimated error of the meshes in `_without_mesh`.
     """
     law, prony = material
     of, moduli = jax.jit(torsion.held)(rig, law), jax.jit(torsion.held_moduli, static_argnums=4)
@@ -341,7 +347,7 @@ def _of_held(
 def _simulation_details(
     simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli
 ) -> dict[str, object]:
-    """Settings and statistics of the simulation, for the report."""
+    """Return settings and statistics of the simulation, for the report."""
     # For a sample without compression whose whole stress relaxes, the bias of the run is the same at every frequency.
     known = simulation.part == "all" and rig.held is None
     rest = rig if rig.held is None else replace(rig, held=None, height=torsion.rest_height(rig))
@@ -366,8 +372,8 @@ def _simulation_details(
 
 
 def largest_shift(closed: Fit, simulated: Fit) -> float:
-    """Largest change of a parameter or of the equilibrium modulus from the closed form to the simulation, divided by
-    its standard error."""
+    """Return the largest change of a parameter or of the equilibrium modulus from the closed form to the simulation,
+    divided by the standard error."""
     (before, _), (after, errors) = (_with_equilibrium(fit) for fit in (closed, simulated))
     shift = np.abs(after - before)
     known = np.isfinite(errors) & (shift > 1e-6 * np.abs(before))
@@ -375,15 +381,15 @@ def largest_shift(closed: Fit, simulated: Fit) -> float:
 
 
 def _with_equilibrium(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters, then the equilibrium modulus, and their standard errors."""
+    """Return the parameters followed by the equilibrium modulus, and their standard errors."""
     u = fit.uncertainty
     rest = u.values[0] * (1 - u.values[1 : 1 + (len(u.values) - 1) // 2].sum())
     return np.append(u.values, rest), np.append(u.standard_errors, uncertainty.equilibrium_error(u))
 
 
 def _bias(closed: Fit, simulated: Fit) -> list[str]:
-    """A warning with the cause if a parameter differs between simulation and closed form by more than its standard
-    error."""
+    """Return a warning, with the cause, for each parameter that differs between simulation and closed form by more than
+    its standard error."""
     shift = simulated.uncertainty.values - closed.uncertainty.values
     errors, out = simulated.uncertainty.standard_errors, []
     each = zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True)
@@ -398,11 +404,11 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
 
 
 def _cause(closed: Fit, simulated: Fit, k: int) -> tuple[str, str]:
-    """What moves parameter k in the simulation, and the remedy."""
-    if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):  # the closed form has none
-        return "the sample's inertia and the discretisation move", "raise --steps to see which it is"
+    """Return what changes parameter k in the simulation, with the verb, and the remedy."""
+    if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):  # closed: no inertia
+        return "the sample's inertia and the discretisation move", "raise --steps to see which of them it is"
     if simulated.details.get("precompression_strain"):
-        return "the plates, which hold the sides of the sample, move", "for smooth plates use closed-form"
+        return "the glued plates, which prevent the sample from widening, move", "for smooth plates use closed-form"
     of_mesh, of_steps = simulated.uncertainty.mesh_bias, simulated.uncertainty.time_step_bias
     if of_mesh is not None and of_steps is not None and abs(of_mesh[k]) > abs(of_steps[k]):
         return "the mesh of the simulation moves", "trust the closed form"

@@ -1,5 +1,5 @@
-"""Hyperelastic laws from stress-stretch curves: least squares from many starts. The fitted laws are kept stable over
-the range of the data."""
+"""Hyperelastic laws, fitted to stress-stretch curves by least squares from many starting points. The fitted laws are
+kept stable over the range of the data."""
 
 import itertools
 import time
@@ -12,7 +12,7 @@ import numpy as np
 import scipy.stats
 
 from fitting.fits.families.hyperelastic import Candidate, ground_state_modulus
-from fitting.fits.families.hyperelastic import candidates as candidates  # where users have it
+from fitting.fits.families.hyperelastic import candidates as candidates  # users import it from this module
 from fitting.fits.honesty.other_minima import of_other_minima
 from fitting.fits.viscoelastic import EXACT
 from fitting.methods.estimate import LOST, errors_and_correlation, noise_factor, spread
@@ -44,7 +44,7 @@ class LawFit(NamedTuple):
     law: Law
     shear_modulus: float
     cost: float  # half the sum of squared relative residuals
-    curve_errors: dict[str, float]  # root mean square, relative to the curve's
+    curve_errors: dict[str, float]  # root mean square of the misfit, divided by that of the curve's stress
     mean_relative_error: float  # root mean square over all points
     aicc: float
     bic: float
@@ -54,27 +54,27 @@ class LawFit(NamedTuple):
     warnings: list[str]
     run_time: float
     compile_time: float
-    limits: dict[str, str]  # parameters that ran away to 0 or infinity
+    limits: dict[str, str]  # parameters that went to 0 or infinity
 
 
-#: Each test may have a factor that the residuals do not show. Such factors are reported if they move a parameter by
-#: more than _HIDDEN standard errors and by more than a part _MOVED of its value.
+#: The stresses of each test may be wrong by a factor that the residuals do not show. Such factors are reported if they
+#: change a parameter by more than _HIDDEN standard errors and by more than a part _MOVED of its value.
 _HIDDEN, _MOVED = 2.0, 0.05
 #: A parameter ran into a limit of its law if two conditions hold. It ended above or below its typical size by more than
-#: RUNAWAY, and its error is at least FREE times its value. The second condition is needed because typical sizes hold
-#: for large strains. At small strains, coefficients of higher terms may be far larger and still determined.
+#: the factor RUNAWAY, and its error is at least FREE times its value. The second condition is needed because typical
+#: sizes hold for large strains. At small strains, coefficients of higher terms may be far larger and still determined.
 RUNAWAY, FREE = 1e6, 30.0
-#: Minimum relative noise for this check: no test is better.
+#: Lower bound of the relative noise in this check, because no test is more accurate.
 _LEAST_NOISE = 1e-3
-#: If an error for uneven noise exceeds the error for equal noise by this factor, the correlation for uneven noise is
-#: used.
+#: Uneven noise differs in size between points. If the standard error for uneven noise exceeds the error for equal noise
+#: by this factor, the correlation for uneven noise is used.
 _UNEVEN = 1.2
 _tangents = jax.jit(lambda law, F: law.tangent(F))
 
 
 def initial_modulus(curves: list[Curve]) -> float:
-    """Scale of the shear modulus [Pa] for the starts: the median of (measured stress) / (stress of a neo-Hookean law
-    with mu = 1 Pa)."""
+    """Return the scale of the shear modulus [Pa] for the starting points: the median of (measured stress) / (stress of
+    a neo-Hookean law with mu = 1 Pa)."""
     unit = laws.NeoHookean(mu=1.0, bulk=None)  # type: ignore[arg-type]  # the sample is incompressible
     ratios = []
     for c in curves:
@@ -84,20 +84,20 @@ def initial_modulus(curves: list[Curve]) -> float:
             ratios.append(np.median(c.stress[keep] / model[keep]))
     positive = [r for r in ratios if r > 0]
     if not positive:
-        raise InputError("the stresses point against the stretches in every curve: check signs and axes")
+        raise InputError("in every curve, the stresses point against the stretches: check signs and axes")
     return float(np.median(positive))
 
 
 def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawFit:
-    """Minimise the squares of the relative misfit (P - P_measured) / (root mean square of the curve); the best of many
-    starts."""
+    """Minimise the sum of squares of the relative misfit (P - P_measured) / (root mean square of the curve's stress).
+    The best minimum from many starting points is returned."""
     scale = initial_modulus(curves)
     F, at = jnp.asarray(np.concatenate([c.F for c in curves])), np.cumsum([0] + [len(c.stress) for c in curves])
     i, j = (jnp.asarray(np.repeat([c.component[k] for c in curves], np.diff(at))) for k in (0, 1))
     sizes = np.repeat([c.scale for c in curves], np.diff(at))
     measured = jnp.asarray(np.concatenate([c.stress for c in curves]) / sizes)
     rows = jnp.arange(F.shape[0])
-    inside = np.setdiff1d(np.arange(1, F.shape[0]), at)  # neighbours within a curve
+    inside = np.setdiff1d(np.arange(1, F.shape[0]), at)  # points whose neighbour before is on the same curve
     driven = np.concatenate([c.driven for c in curves])
     works = np.repeat([c.rises for c in curves], np.diff(at))[inside]
     rising = jnp.asarray(np.where(works, np.sign(driven[inside] - driven[inside - 1]), 0.0))
@@ -122,13 +122,13 @@ def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawF
 def assessed(
     candidate: Candidate, curves: list[Curve], found: Solution, scale: float, times: tuple, of_tests: bool = True
 ) -> LawFit:
-    """The best start, its quality, and warnings for the user.
+    """Return the fit from the best starting point, with its quality and with warnings for the user.
 
-    `of_tests`: each curve is one test, and the residuals are differences of its stress divided by its scale.
+    `of_tests`: whether each curve is one test, with residuals that are differences of its stress divided by its scale.
     """
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))
-    lowest = costs[best] * (1 + 1e-6) + 1e-20  # a start with a cost up to this value reached the minimum
+    lowest = costs[best] * (1 + 1e-6) + 1e-20  # searches with a cost up to this value reached the minimum
     u, J, r = (np.asarray(v)[best] for v in (found.u, found.jacobian, found.residuals))
     n, p = sum(len(c.stress) for c in curves), len(u)
     misfit, k = r[:n], p + 1
@@ -137,7 +137,7 @@ def assessed(
     slope = np.asarray(jax.jit(jax.jacfwd(candidate.values))(u, scale))
     every, _ = errors_and_correlation(spread(J[:n], max(noise, _LEAST_NOISE), slope)[0])
     limits = _run_away(candidate, values, every, scale)
-    # A parameter at its limit has no error. The errors of the other parameters hold for the law at that limit.
+    # A parameter at its limit gets no standard error. The errors of the others hold for the law at that limit.
     known = np.array([name not in limits for name in candidate.names])
     own_slope = slope[np.ix_(known, known)]
     half, s = spread(J[:n, known], noise, own_slope)
@@ -184,28 +184,29 @@ def assessed(
 def _of_other_minima(
     candidate: Candidate, values: np.ndarray, us: np.ndarray, scale: float, curves: list[Curve]
 ) -> list[str]:
-    """`of_other_minima` for the unknowns (S, p) of the starts that reached the minimum."""
+    """Return a warning if some starting points led to the same cost with other parameter values (see
+    `of_other_minima`). `us` (S, p): unknowns at the end of these searches."""
     every = np.asarray(jax.vmap(lambda u: candidate.values(u, scale))(jnp.asarray(us)))
     return of_other_minima(candidate.names, candidate.law, values, every, np.concatenate([c.F for c in curves]))
 
 
-#: First words of the sentence on factors of the tests.
-OWN_FACTORS = "each test seems to have a factor of its own"
+#: First words of the warning about factors of the tests.
+OWN_FACTORS = "the stress of each test seems to have an individual factor"
 
 
 def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: int) -> list[str]:
-    """Sentences on noise that the n points of the tests share."""
+    """Return warnings about noise that is correlated between the n points of the tests."""
     told = []
     if alike is not None:
         told.append(
-            "neighbouring points of a curve share their residuals: the instrument drifts or a test has a factor or an "
-            f"offset of its own, or the law misses something; {n} points measure as much as {alike.independent:.0f} of "
-            "independent noise, and the standard errors are those of such noise"
+            "the residuals of neighbouring points are correlated. Possible causes: drift of the instrument, a "
+            f"calibration factor or offset of one test, or an inadequate law. The {n} points carry the information of "
+            f"{alike.independent:.0f} independent points; the standard errors include this"
         )
     if factors is not None and factors.shown:
         told.append(
-            f"{OWN_FACTORS}, of {100 * factors.deviation:.2g} %, for example from another sample or a wrong size of "
-            f"the sample; the standard errors contain such factors of {tests} tests"
+            f"{OWN_FACTORS}, which scatters by {100 * factors.deviation:.2g} %, for example due to another sample or a "
+            f"wrong size of the sample. The standard errors contain such factors of {tests} tests"
         )
     return told
 
@@ -213,7 +214,8 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
 def _of_hidden_factors(
     factors: FactorNoise | None, names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
-    """A sentence on factors of the tests that the residuals do not show, because the parameters compensate them."""
+    """Return a warning about factors of the tests that the residuals do not show, because the parameters compensate
+    them."""
     if factors is None or factors.shown:
         return []
     much = (factors.moves > _HIDDEN * errors) & (factors.moves > _MOVED * np.abs(values))
@@ -221,10 +223,10 @@ def _of_hidden_factors(
         return []
     worst = int(np.argmax(np.where(much, factors.moves / np.maximum(errors, 1e-300), 0.0)))
     return [
-        "if each test has a factor of its own, as by another sample or a wrong size of it, the residuals hardly show "
-        f"it: factors of {100 * factors.hidden:.2g} % move {names[worst]} by some {factors.moves[worst]:.2g}, and "
-        f"{values[worst]:.4g} ± {errors[worst]:.2g} does not contain this; measure all tests on one sample, or one of "
-        "them on several samples"
+        "the stress of each test may be wrong by an individual factor, for example due to another sample or a wrong "
+        f"size of the sample. The residuals hardly show such factors, but factors of {100 * factors.hidden:.2g} % move "
+        f"{names[worst]} by about {factors.moves[worst]:.2g}, and {values[worst]:.4g} ± {errors[worst]:.2g} does not "
+        "contain this change. Measure all tests on one sample, or one test on several samples"
     ]
 
 
@@ -235,13 +237,13 @@ def _errors_of_law(
     half: np.ndarray,
     of_tests: bool,
 ) -> tuple[np.ndarray, np.ndarray, Alike | None, FactorNoise | None]:
-    """Errors and correlation of the parameters, each error the largest for several kinds of noise; the noise that
-    neighbouring points share; and the factors of the tests.
+    """Return errors and correlation of the parameters, the noise that is correlated between neighbouring points, and
+    the factors of the tests. Each error is the largest one for several kinds of noise.
 
     Args:
         curves: the fitted curves.
         residuals: derivatives J (n, p), misfit (n,) and its standard deviation.
-        slope: derivatives of the parameters by the unknowns (P, p).
+        slope: derivatives (P, p) of the parameters with respect to the unknowns.
         half: square root of the covariance, for equal and independent noise.
         of_tests: see `assessed`. If False, neither factors of tests nor noise that grows with the stress are
             considered.
@@ -254,7 +256,7 @@ def _errors_of_law(
         roots.append(growing_root(J, misfit, fitted, slope))
     alike, factors, counts = None, None, [len(c.stress) for c in curves]
     samples = [sum(len(c.stress) for c in own) for _, own in itertools.groupby(curves, lambda c: c.sample or c.label)]
-    if J.size and noise > EXACT:  # else the residuals are roundoff
+    if J.size and noise > EXACT:  # otherwise the residuals are roundoff
         alike = along_rows(counts, misfit, J, noise, np.linalg.pinv(J))
         factors = factors_of_series(samples, J, misfit, fitted, slope) if of_tests else None
     if alike is not None:
@@ -272,15 +274,18 @@ def _errors_of_law(
 def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool) -> list[str]:
     told = []
     if sum(len(c.stress) for c in curves) <= len(fit.values):
-        told.append(f"as many parameters as points ({len(fit.values)}): the errors of the parameters are not known")
+        told.append(
+            f"the law has as many parameters as there are points, or more ({len(fit.values)}): the errors of the "
+            "parameters are unknown"
+        )
     if not fit.converged:
-        told.append("the fit did not converge from its best start")
+        told.append("the fit did not converge from its best starting point")
     quantile = scipy.stats.t.ppf(0.975, max(1, sum(len(c.stress) for c in curves) - len(fit.values)))
     if fit.limits:
         ran = ", ".join(f"{name} to {end}" for name, end in fit.limits.items())
         told.append(
-            f"the law runs into its limit ({ran}): the limit fits best, with the misfit and G0 given here. The value "
-            "of this parameter has no meaning: use a law without this parameter"
+            f"the law runs into its limit ({ran}). The limit fits best; the given misfit and G0 hold for this limit. "
+            "The value of this parameter has no meaning: use a law without this parameter"
         )
     for name, value, error in zip(fit.names, fit.values, fit.standard_errors, strict=True):
         if name not in fit.limits and not error * quantile < abs(value):
@@ -288,24 +293,28 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
     if not fit.limits and singular[-1] < 1e-7 * singular[0]:
         told.append("the data do not determine some combination of the parameters")
     if fit.starts_at_minimum == 1:
-        told.append("only one start reached the minimum: there may be a better minimum")
+        told.append("only one starting point led to this minimum: there may be a better minimum")
     if held:
         told.append(
-            "without a constraint, the stress would decrease within the range of the data: the fit is kept at the "
-            "edge of stability"
+            "without a constraint, the stress of the law would decrease within the range of the data: the fit stays at "
+            "the edge of stability"
         )
     solid = fit.law + laws.Volumetric(bulk=jnp.asarray(1e3 * abs(fit.shear_modulus)))
     firm = ellipticity(np.asarray(_tangents(solid, jnp.asarray(np.concatenate([c.F for c in curves]))))) > 0
     parts = np.split(firm, np.cumsum([len(c.stress) for c in curves])[:-1])
     lost = [c.label for c, part in zip(curves, parts, strict=True) if not np.all(part)]
     if lost:
-        told.append(f"strong ellipticity is lost within {', '.join(lost)}: do not simulate with these parameters there")
+        told.append(
+            f"the law loses strong ellipticity within the range of {', '.join(lost)}: do not simulate such "
+            "deformations with these parameters"
+        )
     return told
 
 
 def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scale: float) -> dict[str, str]:
-    """Parameters that ended far from every start and that the data do not determine, with the limit of each. `errors`
-    (p,) are the standard errors if all parameters are free. The starts lie within a few times the typical size.
+    """Return the parameters that ended far from every starting point and that the data do not determine, with the limit
+    of each. `errors` (p,) are the standard errors if all parameters are free. The starting points lie within a few
+    times the typical size.
     """
     starts = jnp.asarray(candidate.random(np.random.default_rng(0), STARTS))
     typical = np.median(np.abs(jax.vmap(lambda u: candidate.values(u, scale))(starts)), axis=0)
@@ -322,7 +331,7 @@ _PRELOAD = 0.05
 
 
 def loaded_at_rest(curves: list[Curve]) -> list[str]:
-    """A warning for each curve whose stress is not 0 when its sample is not deformed."""
+    """Return a warning for each curve whose stress is not 0 when the sample is not deformed."""
     told = []
     for curve in curves:
         driven = curve.driven - (0.0 if np.ptp(curve.F[:, 0, 1]) > 0 else 1.0)
@@ -333,22 +342,22 @@ def loaded_at_rest(curves: list[Curve]) -> list[str]:
         offset = np.polyfit(driven[near], curve.stress[near], 1)[1] if np.ptp(driven[near]) > 0 else 0.0
         if abs(offset) > _PRELOAD * curve.scale and np.abs(driven[near]).min() < 0.02 * np.ptp(driven):
             told.append(
-                f"{curve.label}: the stress is {offset:.3g} Pa where the sample is not deformed, but every law has a "
+                f"{curve.label}: the stress is {offset:.3g} Pa where the sample is not deformed. Every law has a "
                 "stress of 0 there: subtract the preload, or compute the stretch with the unloaded length"
             )
     return told
 
 
 def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
-    """A warning for each curve that no law follows."""
+    """Return a warning for each curve that no law follows."""
     told = []
     for curve in curves:
         best = min(fits, key=lambda f: f.curve_errors[curve.label])
         error = best.curve_errors[curve.label]
         if not error < HOPELESS:
             told.append(
-                f"{curve.label}: no law follows this curve, the nearest ({best.label}) misses it by {100 * error:.0f} "
-                "% of its stress: check unit, signs and axes, or fit this curve alone"
+                f"{curve.label}: no law follows this curve. The nearest law ({best.label}) misses the curve by "
+                f"{100 * error:.0f} % of the stress: check unit, signs and axes, or fit this curve alone"
             )
     return told
 
@@ -358,8 +367,8 @@ TIE = 4.0
 
 
 def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
-    """A sentence if other laws follow the `data` ("sweep", "curves") as well as the best law. The best law comes first
-    in `fits`."""
+    """Return a warning if other laws follow the `data` ("sweep", "curves") as well as the best law. The best law comes
+    first in `fits`."""
     best = fits[0]
     others = [f for f in fits[1:] if f.aicc - best.aicc < TIE]
     if not others:
@@ -368,6 +377,6 @@ def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
     moduli = [f.shear_modulus for f in (best, *others)]
     return [
         f"{which} follow the {data} as well as {best.label} does (AICc within {TIE:g}), with G0 from {min(moduli):.4g} "
-        f"to {max(moduli):.4g} Pa: the {data} cannot decide between these laws, and the laws differ beyond the "
-        "measured strains"
+        f"to {max(moduli):.4g} Pa. The {data} cannot decide between these laws, which differ beyond the measured "
+        "strains"
     ]

@@ -1,4 +1,8 @@
-"""Prony modes from a relaxation or creep test with its measured drive, in closed form."""
+"""Prony modes from a relaxation or creep test, in closed form.
+
+The driven quantity is the measured load: the strain in relaxation, the stress in creep. The measured values that are
+fitted belong to the other quantity, the response.
+"""
 
 from collections.abc import Callable
 from functools import lru_cache, partial
@@ -21,31 +25,31 @@ from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: The load moves if it changes from row to row by more than this part of its maximum; and maximum number of loads that
-#: are treated separately.
+#: STILL: the load changes if two successive rows differ by more than this part of its maximum. MOST_LOADS: maximum
+#: number of loads that are treated separately.
 STILL, MOST_LOADS = 0.01, 10
-#: Maximum number of answers (measured responses) that are fitted. From a longer record, answers at about equal steps
-#: of log time are used.
+#: Maximum number of measured values that are fitted. From a longer record, values at about equal steps of log time are
+#: used.
 MOST = 300
-#: Key in `TimeFit.details`, if neighbours share their noise: so many answers with independent noise would tell as
-#: much.
+#: Key in `TimeFit.details` if the noise of neighbouring values is correlated: the number of independent values that
+#: carry the same information.
 INDEPENDENT = "independent_answers"
-#: Key in `TimeFit.details`: whether the noise of all answers has the same size.
+#: Key in `TimeFit.details`: whether the noise of all measured values has the same size.
 CONSTANT_NOISE = "noise_of_constant_size"
-#: Starting points of a fit.
+#: Number of starting points of a fit.
 STARTS = 12
 
 
 class TimeFit(NamedTuple):
-    """Prony modes of a test in time."""
+    """The fit of a relaxation or creep test."""
 
     kind: Kind
     model: Maxwell
     solution: Solution
     uncertainty: Estimate
     converged: bool
-    time: np.ndarray  # (m,) [s] of the fitted answers
-    measured: np.ndarray  # (m,) stress [Pa]; in creep strain [1]
+    time: np.ndarray  # times (m,) [s] of the fitted values
+    measured: np.ndarray  # (m,) stress [Pa], or strain [1] in creep
     fitted: np.ndarray
     scales: np.ndarray  # (m,) divisors of relative errors
     warnings: tuple[str, ...]
@@ -66,10 +70,10 @@ class TimeFit(NamedTuple):
 
 
 def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Divisors (m,) of relative errors: the fitted answers, at least the median of |fit - data|.
+    """Return the divisors (m,) of relative errors: the fitted response, but at least the median of |fit - data|.
 
-    Where the answers pass 0, as in cycles, the divisors are the scales of the residuals. Elsewhere these scales would
-    hide noise: their lower bound is 33 times the noise.
+    If the response changes sign, as in cycles, the divisors are the scales of the residuals. In other tests these
+    scales would hide noise, because their lower bound is 33 times the noise.
     """
     largest = np.abs(measured).max(initial=0.0)
     if min(measured.max(initial=0.0), -measured.min(initial=0.0)) > 0.1 * largest:
@@ -79,7 +83,7 @@ def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray)
 
 @lru_cache(maxsize=8)
 def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
-    """A function from (u, time, driven, rows, answer, scales) to residuals (m,), for relaxation or creep."""
+    """Return a function from (u, time, driven, rows, answer, scales) to residuals (m,), for relaxation or creep."""
     natural = generalised_maxwell.natural_fluid if name == FLUID.name else generalised_maxwell.natural
 
     def residuals(u, time, driven, rows, answer, scales):
@@ -89,12 +93,13 @@ def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
 
 
 def thinned(test: TimeTest) -> np.ndarray:
-    """Rows (m,) to fit: all rows, or about `MOST` rows spread over the log of the time since a load began to move."""
+    """Return the rows (m,) of the test to fit: all rows, or about `MOST` rows spread over the log of the time since a
+    load began to change."""
     rows = np.flatnonzero(test.used)
     if len(rows) <= MOST:
         return rows
     begins = _begins_of_loads(test)
-    # A row at the time at which a load begins belongs to the load before.
+    # A row at the starting time of a load belongs to the load before.
     of_load = np.searchsorted(begins, test.time[rows]) - 1
     picked: list[np.ndarray] = []
     left = MOST
@@ -107,8 +112,8 @@ def thinned(test: TimeTest) -> np.ndarray:
 
 
 def _begins_of_loads(test: TimeTest) -> np.ndarray:
-    """Times [s] at which the driven quantity begins to move, from `TimeTest.begun` on. If there are more than
-    `MOST_LOADS` (for example in cycles), only the first time.
+    """Return the times [s] at which the driven quantity begins to change, from `TimeTest.begun` on. If there are more
+    than `MOST_LOADS` (for example in cycles), only the first time is returned.
     """
     driven = np.abs(test.driven)
     still = max(STILL * float(driven.max()), 8 * noise_of_series(test.driven))
@@ -119,8 +124,8 @@ def _begins_of_loads(test: TimeTest) -> np.ndarray:
 
 
 def _spread_places(time: np.ndarray, number: int) -> np.ndarray:
-    """About `number` indices of rising times (n,) [s] above 0. Times that are far apart in log time are all kept; from
-    the others, some at equal distances are kept.
+    """Return about `number` indices of increasing times (n,) [s] above 0. Times that are far apart in log time are all
+    kept. Of the other times, some at equal distances in log time are kept.
     """
     if len(time) <= number:
         return np.arange(len(time))
@@ -134,8 +139,8 @@ def _spread_places(time: np.ndarray, number: int) -> np.ndarray:
 
 
 def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
-    """Choose the number of modes, and between solid and fluid, by the lowest criterion. Only fits that the test
-    determines can be chosen.
+    """Choose the number of modes, and a solid or a fluid, by the lowest information criterion. A fit can be chosen only
+    if the test determines all its modes.
 
     Args:
         test: data.
@@ -144,7 +149,9 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
     rows = thinned(test)
     largest = (len(rows) - 2) // 2
     if modes != "auto" and not 1 <= int(modes) <= largest:
-        raise InputError(f"{test.source}: --modes {modes} is out of range: give 1 to {largest} for {len(rows)} answers")
+        raise InputError(
+            f"{test.source}: --modes {modes} is out of range: give 1 to {largest} for {len(rows)} measured values"
+        )
     top = min(uncertainty.supported_modes(test), largest)
     numbers = range(1, top + 1) if modes == "auto" else range(int(modes), int(modes) + 1)
     tried = _raised(test, rows, numbers, Kind())
@@ -156,7 +163,8 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
 
 
 def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> list[TimeFit]:
-    """Fits with more and more modes. The search ends after two fits in a row that do not lower the criterion."""
+    """Return fits with more and more modes. The search ends when two fits, one after the other, do not lower the
+    criterion."""
     tried: list[TimeFit] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -173,7 +181,7 @@ def _chosen_model(tried: list[TimeFit], test: TimeTest) -> TimeFit:
 
 
 def criterion(fit: TimeFit) -> float:
-    """The information criterion of `viscoelastic.information_criterion`."""
+    """Return the Bayesian information criterion, as in `viscoelastic.information_criterion`."""
     m, free = len(fit.measured), len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
     return float(m * np.log(max(2 * float(fit.solution.cost) / m, 1e-300)) + free * np.log(m))
 
@@ -196,23 +204,24 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
 
 
 def refitted(fit: TimeFit, test: TimeTest) -> TimeFit:
-    """Prony modes of the same kind and number as in the fit, fitted to another form of its test."""
+    """Return Prony modes of the same kind and number as in the fit, fitted to a changed form of its test."""
     return _one_model(test, thinned(test), fit.modes, fit.kind)
 
 
 def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
-    """A function and its data. The function computes the residuals (m,) from the variables u of the fit and these data.
+    """Return a function and its data. The function computes the residuals (m,) from the variables u of the fit and
+    these data.
 
     Args:
-        test: `TimeTest`.
+        test: data.
         kind: Prony modes of a solid or of a fluid.
     """
     return _residuals(test.kind, kind.name), data_in_time(test)
 
 
 def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
-    """Times (n,), driven quantity (n,), the rows (m,) of the answers among these times, answers (m,) and their scales
-    (m,)."""
+    """Return times (n,), the driven quantity (n,), the indices (m,) of the fitted values among these times, these
+    values (m,), and their scales (m,)."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
     kept[rows] = True
@@ -221,8 +230,8 @@ def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
 
 
 def _corners_in_time(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
-    """For each point (n,): whether the driven quantity has a corner there. It has none if the slope is the same on both
-    sides."""
+    """Return whether the driven quantity has a corner at each point (n,). There is no corner if the derivative is the
+    same on both sides."""
     kept = np.ones(len(time), bool)
     middle = driven[:-2] + (driven[2:] - driven[:-2]) * (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
     kept[1:-1] = np.abs(driven[1:-1] - middle) > 1e-12 * np.max(np.abs(driven))
@@ -236,17 +245,18 @@ def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
 
 
 def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Array:
-    """Predicted measurements: G' then G'' [Pa] at angular frequencies; velocities and attenuations of shear waves; or
-    the answers of a test in time.
+    """Return predicted measurements: G' then G'' [Pa] at angular frequencies, velocities and attenuations of shear
+    waves, or the response in a relaxation or creep test.
 
-    It works with JAX arrays. For a sweep and for dispersion it also works with NumPy arrays (`fitting.methods.host`).
+    The function works with JAX arrays. For a sweep and for dispersion, NumPy arrays work too (`fitting.methods.host`).
 
     Args:
         kind: "sweep", "dispersion", "relaxation" or "creep".
         model: Prony modes.
         at: angular frequencies (n,) [rad/s], or times (n,) [s].
-        drive: for a test in time, the driven quantity (n,) and the rows (m,) of the answers. For dispersion, the
-            density and the indices (m,) of the measured values among velocities [m/s] followed by attenuations [1/m].
+        drive: for relaxation and creep, the driven quantity (n,) and the indices (m,) of the fitted values among the
+            times. For dispersion, the density and the indices (m,) of the measured values among velocities [m/s]
+            followed by attenuations [1/m].
     """
     xp = arrays_of(model.ratios)
     if kind == "sweep":
@@ -262,7 +272,8 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
 
 
 def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
-    """Stress divided by strain (m,) [Pa] at the fitted answers (roughly G(t)), and the times of these answers."""
+    """Return stress divided by strain (m,) [Pa] at the fitted values, which is roughly G(t), and the times (m,) [s] of
+    these values."""
     rows = thinned(test)
     driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
     ratio = answer / np.maximum(driven, 1e-6 * driven.max())
@@ -270,16 +281,16 @@ def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
 
 
 def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and right-hand side of a linear least-squares problem: its unknowns are the equilibrium modulus and the
-    strengths of modes with these times, its residuals are relative."""
+    """Return matrix and right-hand side of a linear least-squares problem with relative residuals. The unknowns are the
+    equilibrium modulus and the strengths of modes with these times."""
     modulus, at = apparent(test)
     A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
     return A / modulus[:, None], np.ones(len(at))
 
 
 def _starts(test: TimeTest, modes: int, kind: Kind) -> np.ndarray:
-    """Starts with times spread over the decades of the test. Non-negative least squares on the apparent modulus gives
-    the strengths."""
+    """Return starting points with times spread over the decades of the test. Non-negative least squares on the apparent
+    modulus gives the strengths."""
     each = generalised_maxwell.times_over(test.resolved, modes, STARTS)
     found = [generalised_maxwell.start_at_times(times, *apparent_equations(test, times)) for times in each]
     return np.stack([generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u for u in found])
@@ -328,7 +339,8 @@ ELASTIC = "elastic"
 
 
 def _without_relaxation(test: TimeTest, chosen: TimeFit) -> dict[str, float] | None:
-    """The modulus of an elastic material, if it explains the test as well as the chosen fit; else None."""
+    """Return the modulus of an elastic material if this material explains the test as well as the chosen fit, otherwise
+    None."""
     rows = thinned(test)
     x, y, s = test.driven[rows], test.answer[rows], _scales(test, rows)
     square = float(np.sum((x / s) ** 2))
@@ -346,18 +358,17 @@ def _without_relaxation(test: TimeTest, chosen: TimeFit) -> dict[str, float] | N
 def _told_of_elastic(elastic: dict[str, float]) -> str:
     return (
         "the test shows no relaxation: an elastic material of {shear_modulus:.4g} ± {standard_error:.2g} Pa explains "
-        "it as well; ratios and relaxation times have no meaning here, and this is the value of G0 and of the "
-        "equilibrium modulus"
+        "it as well. This modulus is both G0 and the equilibrium modulus; ratios and relaxation times have no meaning"
     ).format(**elastic)
 
 
 def structured_misfit(fit: TimeFit) -> list[str]:
-    """A sentence if the residuals keep their sign over many answers."""
+    """Return a warning if the residuals keep their sign over many values."""
     residuals = fit.fitted - fit.measured
     runs, chance = kramers_kronig.runs_probability(residuals)
     if chance >= kramers_kronig.CHANCE or fit.relative_errors.max() <= viscoelastic.EXACT:
         return []
     return [
-        f"structured misfit: the residuals change sign {runs - 1} times over {len(residuals)} answers (by chance: "
-        f"{chance:.1g}); the model misses something, or neighbouring answers share their noise"
+        f"structured misfit: the residuals change sign only {runs - 1} times in {len(residuals)} values (probability "
+        f"by chance {chance:.1g}). The model is inadequate, or the noise of neighbouring values is correlated"
     ]

@@ -2,7 +2,7 @@
 
 Tests are sweeps, relaxation, creep, and phase velocities of shear waves.
 
-Every test has its own noise. The size of this noise is estimated during the fit, from the residuals of the test.
+The noise of every test is different. Its size is estimated during the fit, from the residuals of the test.
 """
 
 import time
@@ -25,15 +25,16 @@ from fitting.waves.dispersion import Dispersion
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Number of rounds (fit, then new weights), minimum relative noise of a test, and number of starts.
+#: ROUNDS: number of rounds, each a fit and new weights. QUIETEST: minimum relative noise of a test. STARTS: number of
+#: starting points.
 ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
-#: The tests do not agree if the noise of a test in the common fit, divided by its noise in a fit to this test alone,
-#: exceeds this ratio.
+#: The tests contradict each other if the noise of a test in the common fit, divided by its noise in a fit to this test
+#: alone, exceeds this ratio.
 APART = 1.5
 #: A warning is given if the misfit exceeds this value.
 MISSED = 0.05
-#: Maximum number of additional modes in a fit to one test, and the minimum decrease of the criterion that an additional
-#: mode must bring (Kass and Raftery 1995).
+#: MORE: maximum number of additional modes in a fit to one test. CLEARLY: minimum decrease of the information criterion
+#: for an additional mode (Kass and Raftery 1995).
 MORE, CLEARLY = 2, 10.0
 
 Measured = Sweep | TimeTest | Dispersion
@@ -51,12 +52,12 @@ class Share(NamedTuple):
     name: str  # sweep, dispersion, relaxation or creep
     source: str
     points: int  # number of measured values
-    noise: float  # relative to the scales, from the common fit; given standard deviations are not reduced
+    noise: float  # in the common fit, divided by the scales; given standard deviations are not reduced
     alone: float  # the same noise from a fit to this test alone
     misfit: float  # relative misfit of the common fit
     misfit_alone: float  # relative misfit of the fit to this test alone
     mean_relative_error: float
-    errors_without: np.ndarray  # (P,) standard errors without this test, at the common fit
+    errors_without: np.ndarray  # standard errors (P,) without this test, for the common fit
 
 
 class Together(NamedTuple):
@@ -69,7 +70,7 @@ class Together(NamedTuple):
     uncertainty: Estimate
     converged: bool
     shares: list[Share]
-    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], velocities then attenuations, or the answers
+    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], velocities then attenuations, or the response
     tried: list[Content]
     warnings: tuple[str, ...]
     run_time: float
@@ -84,7 +85,8 @@ class Together(NamedTuple):
 
 
 def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
-    """Arrays from which a test is predicted, its measured values, and the scales of these values."""
+    """Return the arrays from which a test is predicted, the measured values of the test, and the scales of these
+    values."""
     if isinstance(test, Sweep):
         return (test.angular_frequency,), np.concatenate([test.storage, test.loss]), np.concatenate(test.deviations)
     if isinstance(test, Dispersion):
@@ -95,8 +97,9 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """Divisors for relative errors of the measured values. Mostly these are the values themselves. In tests in time
-    they have a lower bound. For a loss modulus that scatters with the phase angle, the divisor is |G*|."""
+    """Return the divisors for relative errors of the measured values. Mostly these are the values themselves. In
+    relaxation and creep the divisors have a lower bound. If errors of the phase angle cause the scatter of the loss
+    modulus, the divisor is |G*|."""
     _, measured, scales = reported_numbers(test)
     if isinstance(test, Sweep) and test.sd_estimated:
         return np.concatenate([test.storage, np.hypot(test.storage, test.loss)])
@@ -104,19 +107,20 @@ def sizes_of(test: Measured) -> np.ndarray:
 
 
 def _sizes_beside(test: Measured, fitted: np.ndarray) -> np.ndarray:
-    """`sizes_of` a test whose fit gives these values."""
+    """Return the divisors for relative errors (`sizes_of`) of a test, if the fit predicts the values `fitted`."""
     sizes = sizes_of(test)
     return time_tests.relative_sizes(reported_numbers(test)[1], fitted, sizes) if isinstance(test, TimeTest) else sizes
 
 
 def least_noise(test: Measured) -> float:
-    """Lower bound of the noise of a test, relative to its scales. It is 1 if standard deviations are given: they are
-    not reduced."""
+    """Return the lower bound of the noise of a test, divided by its scales. The bound is 1 if standard deviations are
+    given, because these are not reduced."""
     return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
 
 
 def tests_evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (…, m) of all tests, in the order of the tests, and their Jacobian (…, m, P) at u (…, P), in NumPy."""
+    """Return the residuals (…, m) of all tests, in the order of the tests, and their derivatives (…, m, P) at u (…, P),
+    in NumPy."""
 
     def one(name: str, at: tuple, measured: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if name in ("relaxation", "creep"):
@@ -131,7 +135,7 @@ def tests_evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> 
 
 
 def name_of(test: Measured) -> str:
-    """Name of the kind of test: sweep, dispersion, relaxation or creep."""
+    """Return the kind of test: sweep, dispersion, relaxation or creep."""
     if isinstance(test, TimeTest):
         return test.kind
     return "sweep" if isinstance(test, Sweep) else "dispersion"
@@ -140,10 +144,11 @@ def name_of(test: Measured) -> str:
 def fit(
     tests: Sequence[Measured], modes: int | str = "auto", progress: Callable[[str], None] = lambda text: None
 ) -> Together:
-    """Choose the number of modes by the lowest criterion. Only fits that the tests together determine can be chosen.
+    """Choose the number of modes by the lowest information criterion. A fit can be chosen only if the tests together
+    determine all its modes.
 
     Args:
-        tests: two or more.
+        tests: two or more tests.
         modes: number of modes, or "auto".
         progress: called with the name of each fit.
     """
@@ -167,7 +172,7 @@ def fit(
 
 
 def resolved_by(tests: Sequence[Measured]) -> tuple[float, float]:
-    """Shortest and longest relaxation time [s] that at least one of the tests resolves."""
+    """Return the shortest and the longest relaxation time [s] that at least one of the tests resolves."""
     ends = np.array([t.resolved for t in tests])
     return float(ends[:, 0].min()), float(ends[:, 1].max())
 
@@ -175,7 +180,8 @@ def resolved_by(tests: Sequence[Measured]) -> tuple[float, float]:
 def _raised_together(
     tests: list[Measured], band: ResolvedBand, numbers: range, kind: Kind, progress: Callable
 ) -> list[Together]:
-    """Fits with more and more modes. The search ends after two fits in a row that do not lower the criterion."""
+    """Return fits with more and more modes. The search ends when two fits, one after the other, do not lower the
+    criterion."""
     tried: list[Together] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -193,7 +199,7 @@ def _able(fit: Together, band: ResolvedBand) -> bool:
 
 
 def criterion_of_all(fit: Together) -> float:
-    """Bayesian information criterion; the noise of each test is estimated from the fit."""
+    """Return the Bayesian information criterion. The noise of each test is estimated from the fit."""
     total = sum(s.points for s in fit.shares)
     free = len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
     return float(sum(s.points * 2 * np.log(s.noise) for s in fit.shares) + free * np.log(total))
@@ -223,7 +229,7 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
 def misfits(
     tests: list[Measured], data: list, residuals: np.ndarray, noise: np.ndarray, free: float
 ) -> tuple[list[Share], list[np.ndarray]]:
-    """The misfit of each test, and the values that the fit predicts for this test.
+    """Return the misfit of each test, and the values that the fit predicts for each test.
 
     Args:
         tests: K tests.
@@ -246,10 +252,11 @@ def misfits(
 
 
 def over_own_noise(found: Solution, shares: list[Share], ratio: np.ndarray) -> Solution:
-    """The solution with the residuals of each test divided by the noise found for this test. `ratio` (K,): used noise /
-    found noise.
+    """Return the solution with the residuals of each test divided by the noise found for this test. `ratio` (K,): noise
+    that was used in the fit, divided by the noise that was found.
 
-    Rows of a prior are multiplied by the mean ratio, because the weight of a prior refers to the mean noise.
+    Residuals of a prior are multiplied by the geometric mean of the ratios, because the weight of a prior refers to the
+    mean noise.
     """
     factor = np.repeat(ratio, [s.points for s in shares])
     prior = np.full(len(found.residuals) - len(factor), np.exp(np.mean(np.log(ratio))))
@@ -262,7 +269,8 @@ def _size_of_noise(residuals: np.ndarray, freedom: float) -> float:
 
 
 def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: float) -> np.ndarray:
-    """Relative noise of each test: the root of the sum of its squared residuals, divided by its degrees of freedom."""
+    """Return the relative noise of each test: the root of (sum of its squared residuals, divided by its degrees of
+    freedom)."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals, np.cumsum(counts)[:-1])
     out = []
@@ -272,8 +280,8 @@ def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.n
 
 
 def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
-    """Starts (S, P) with times spread over the decades of the tests. Non-negative least squares on the moduli of the
-    tests gives the strengths."""
+    """Return starting points (S, P) with times spread over the decades of the tests. Non-negative least squares on the
+    moduli of the tests gives the strengths."""
     out = []
     for times in generalised_maxwell.times_over(band.resolved, modes, STARTS):
         A, b = (np.concatenate(rows) for rows in zip(*(_apparent(t, times) for t in tests), strict=True))
@@ -283,8 +291,8 @@ def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: K
 
 
 def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and right-hand side of a linear least-squares problem for the equilibrium modulus and the strengths of the
-    modes; its residuals are relative."""
+    """Return matrix and right-hand side of a linear least-squares problem with relative residuals. The unknowns are the
+    equilibrium modulus and the strengths of the modes."""
     if isinstance(test, TimeTest):
         return time_tests.apparent_equations(test, times)
     b = np.concatenate(_moduli_of(test))
@@ -293,7 +301,7 @@ def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _moduli_of(test: Sweep | Dispersion) -> tuple[np.ndarray, ...]:
-    """G' and G'' [Pa]. Velocities alone give only one modulus, about |G*|."""
+    """Return G' and G'' [Pa]. Velocities alone give only one modulus, about |G*|."""
     if isinstance(test, Sweep):
         return test.storage, test.loss
     if test.attenuation is None:
@@ -337,12 +345,12 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     )
 
 
-#: The rise of a load matters if the time between two rows is above this part of a relaxation time.
+#: The rise of a load matters if it takes longer than this part of a relaxation time.
 _SHORT = 0.2
 
 
 def _of_rises(chosen: Together) -> list[str]:
-    """A sentence on each load that rises between two rows, if modes relax meanwhile."""
+    """Return a warning for each load that rises between two rows of the file, if modes relax during this time."""
     own = chosen.model.relaxation_times[np.asarray(chosen.model.ratios) > 0.01]
     out = []
     for test in (t for t in chosen.tests if isinstance(t, TimeTest)):
@@ -351,34 +359,34 @@ def _of_rises(chosen: Together) -> list[str]:
             continue
         out.append(
             f"no row of {test.source} shows how the load changed between {test.time[row - 1]:.4g} and "
-            f"{test.time[row]:.4g} s, and a straight change is assumed: if it was a step, G0 and the short relaxation "
-            "times are wrong; give more rows there"
+            f"{test.time[row]:.4g} s, and a straight change is assumed. If the change was a step, G0 and the short "
+            "relaxation times are wrong: give more rows there"
         )
     return out
 
 
 def disagreements(shares: list[Share]) -> list[str]:
-    """A sentence on each test that the common fit misses by much more than a fit to this test alone."""
+    """Return a warning for each test whose misfit is much larger in the common fit than in a fit to this test alone."""
     return [
-        f"the tests do not agree: {s.source or s.name} is missed by {100 * s.misfit:.2g} % in the common fit, but "
-        f"only by {100 * s.misfit_alone:.2g} % in a fit to this test alone: look for another temperature, strain or "
-        "sample"
+        f"the tests do not agree: the misfit of {s.source or s.name} is {100 * s.misfit:.2g} % in the common fit, but "
+        f"only {100 * s.misfit_alone:.2g} % in a fit to this test alone. Look for another temperature, strain or sample"
         for s in shares
         if s.noise > APART * s.alone and s.misfit > 0.01
     ]
 
 
 def missed(shares: list[Share]) -> list[str]:
-    """A sentence on each test that both the common fit and a fit to this test alone miss."""
+    """Return a warning for each test with a large misfit both in the common fit and in a fit to this test alone."""
     return [
-        f"{viscoelastic.MISSES} of {s.source or s.name} by {100 * s.misfit:.2g} %: try another --model, or look at them"
+        f"{viscoelastic.MISSES} of {s.source or s.name} by {100 * s.misfit:.2g} %: try another --model, or look at the "
+        "data"
         for s in shares
         if s.misfit > MISSED and s.noise <= APART * s.alone
     ]
 
 
 def structured(fit: Together) -> list[str]:
-    """A sentence on each test whose residuals keep their sign over many values."""
+    """Return a warning for each test whose residuals keep their sign over many values."""
     out = []
     for test, fitted in zip(fit.tests, fit.fitted, strict=True):
         residuals = fitted - reported_numbers(test)[1]
@@ -389,15 +397,16 @@ def structured(fit: Together) -> list[str]:
             runs, chance = kramers_kronig.runs_probability(part)
             if chance < kramers_kronig.CHANCE:
                 out.append(
-                    f"structured misfit of {test.source or name_of(test)}{what}: the residuals change sign {runs - 1} "
-                    f"times over {len(part)} values (by chance: {chance:.1g}); the model misses something, or the "
-                    "tests do not agree there"
+                    f"structured misfit of {test.source or name_of(test)}{what}: the residuals change sign only "
+                    f"{runs - 1} times in {len(part)} values (probability by chance {chance:.1g}). The model is "
+                    "inadequate, or the tests do not agree there"
                 )
     return out
 
 
 def _shares(fit: Together) -> list[Share]:
-    """The contribution of each test: the errors without this test, and the misfit of a fit to this test alone."""
+    """Return the contribution of each test: the errors without this test, and the misfit of a fit to this test
+    alone."""
     u = np.asarray(fit.solution.u)
     vector = host.with_jacobian(partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)[1]
     rows = np.asarray(fit.solution.jacobian)
@@ -405,11 +414,11 @@ def _shares(fit: Together) -> list[Share]:
 
 
 def _residuals_alone(fit: Together, k: int) -> np.ndarray:
-    """Residuals of all tests, divided by their scales, from a fit to test k alone. The residuals of the other tests are
-    0.
+    """Return the residuals of all tests, divided by their scales, from a fit to test k alone. The residuals of the
+    other tests are 0.
 
-    This fit has as many modes as the common fit, or more modes if they follow the test better. If tests contradict each
-    other, their common fit may have too few modes.
+    This fit has as many modes as the common fit, or more if additional modes follow the test better. If tests
+    contradict each other, their common fit may have too few modes.
     """
     parts = [reported_numbers(t) for t in fit.tests]
     # Infinite standard deviations exclude a test.
@@ -425,7 +434,8 @@ def _residuals_alone(fit: Together, k: int) -> np.ndarray:
         return best
     lowest = _criterion_alone(best, count, free)
     for modes in range(fit.modes, fit.modes + MORE + 1):
-        # If the moduli of this test are far from the moduli of the others, the starts of all tests are no good starts.
+        # If the moduli of this test are far from the moduli of the others, the starting points of all tests are not
+        # good.
         starts = starts_of_all([fit.tests[k]], own, modes, fit.kind)
         r, free = np.asarray(from_starts(evaluate, starts, data).residuals), starts.shape[1]
         criterion = _criterion_alone(r, count, free)
@@ -435,20 +445,20 @@ def _residuals_alone(fit: Together, k: int) -> np.ndarray:
 
 
 def _criterion_alone(r: np.ndarray, count: int, free: int) -> float:
-    """Bayesian information criterion of a fit with `free` parameters to the `count` values of one test."""
+    """Return the Bayesian information criterion of a fit with `free` parameters to the `count` values of one test."""
     return float(2 * count * np.log(max(_size_of_noise(r, count), QUIETEST)) + free * np.log(count))
 
 
 def shares_by_rows(
     fit: Together, jacobian: np.ndarray, slope: np.ndarray, values: np.ndarray, alone: Callable[[int], np.ndarray]
 ) -> list[Share]:
-    """The shares of the tests: the errors from the rows of the other tests only, and the misfit of a fit to each test
-    alone.
+    """Return the contributions of the tests: the errors from the residuals of the other tests only, and the misfit of a
+    fit to each test alone.
 
     Args:
         fit: the common fit.
-        jacobian: derivatives of the residuals of all tests by u; rows of a prior may follow.
-        slope: derivatives of the reported parameters by u.
+        jacobian: derivatives of the residuals of all tests with respect to u; rows of a prior may follow.
+        slope: derivatives of the reported parameters with respect to u.
         values: the reported parameters.
         alone: function from the index of a test to the residuals, divided by their scales, of a fit to this test alone.
             The rows are in the order of the common fit.

@@ -29,7 +29,7 @@ class Kind(NamedTuple):
 
     name: str = "prony"
     maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
-    names: tuple[str, ...] = ()  # of the model's parameters; empty: the modes are the parameters
+    names: tuple[str, ...] = ()  # names of the model's parameters; empty: the modes are the parameters
     units: tuple[str, ...] = ()
     values: Callable[[Array], Array] | None = None  # u -> parameters of the model (P,)
     prior: Callable[[Array], Array] | None = None  # u -> residuals of the prior, after those of the data
@@ -38,7 +38,7 @@ class Kind(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A fitted model with all that a report needs."""
+    """A fitted model with all results for a report."""
 
     method: str
     model: Maxwell
@@ -61,13 +61,14 @@ class Fit(NamedTuple):
         return len(self.model.ratios)
 
     def relative_errors(self, sweep: Sweep) -> np.ndarray:
-        """|fit / data - 1| of G' then G'' (2n,)."""
+        """Return |fit / data - 1| (2n,) of G' then G''."""
         data = np.concatenate([sweep.storage, sweep.loss])
         return np.abs(np.concatenate([self.storage, self.loss]) / data - 1)
 
 
 def timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
-    """Result, seconds of compilation, seconds of the run. A function is not compiled again for the same shapes."""
+    """Return the result, the time [s] of compilation and the time [s] of the run. For the same shapes, a function is
+    compiled once."""
     begin = time.perf_counter()
     arguments = jax.tree.map(jnp.asarray, arguments)
     leaves, tree = jax.tree.flatten(arguments)
@@ -77,7 +78,7 @@ def timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
     return result, middle - begin, time.perf_counter() - middle
 
 
-@lru_cache(maxsize=16)  # fits of several samples, and of parts of a band, use one program
+@lru_cache(maxsize=16)  # fits of several samples, or of parts of a band, use the same program
 def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
     arguments = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
     return jax.jit(function).lower(*arguments).compile()
@@ -85,7 +86,7 @@ def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
 
 @lru_cache(maxsize=16)
 def best_of(minimise: Callable, residuals: Callable) -> Callable[..., Solution]:
-    """The lowest minimum over starting points (S, P)."""
+    """Return a function that finds the lowest minimum from several starting points (S, P)."""
 
     def best(starts, *data):
         found = jax.vmap(lambda u: minimise(residuals, u, *data))(starts)
@@ -102,18 +103,18 @@ def check_modes(sweep: Sweep, modes: int) -> None:
     if isinstance(modes, bool) or not isinstance(modes, (int, np.integer)):
         raise InputError(f"modes = {modes!r} must be a whole number: give e.g. 2, or call choose_modes")
     if largest < 1:
-        raise InputError(f"{sweep.source or 'sweep'}: one frequency determines no mode: measure at more frequencies")
+        raise InputError(f"{sweep.source or 'sweep'}: one frequency determines no mode, so measure at more frequencies")
     if modes < 1:
         raise InputError(f"--modes {modes} must be at least 1, or auto")
     if modes > largest:
         raise InputError(
             f"{sweep.source or 'sweep'}: {largest + 1} different frequencies cannot determine the {2 * modes + 1} "
-            f"parameters of {modes} modes; use at most --modes {largest}"
+            f"parameters of {modes} modes: use at most --modes {largest}"
         )
 
 
 def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimizer: str = "levenberg-marquardt") -> Fit:
-    """Fit the closed-form moduli from several starts, and keep the best minimum.
+    """Fit the closed-form moduli from several starting points, and return the best minimum.
 
     Args:
         sweep: data; residuals are divided by `sweep.deviations`.
@@ -129,7 +130,8 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
 
 
 def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer: str = OPTIMIZERS[0]) -> Fit:
-    """The best fit of Prony modes over `starts` (S, P). `kind` tells whether they are a solid or a fluid."""
+    """Return the best fit of Prony modes from the starting points `starts` (S, P). `kind` states whether the modes form
+    a solid or a fluid."""
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()
@@ -141,13 +143,13 @@ def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer:
 
 
 def residuals_of(kind: Kind) -> Callable[..., Array]:
-    """The function for residuals of Prony modes of a solid or a fluid, in NumPy or JAX."""
+    """Return the function for the residuals of Prony modes of a solid or a fluid, in NumPy or JAX."""
     return generalised_maxwell.fluid_residuals if kind.name == FLUID.name else generalised_maxwell.residuals
 
 
 def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling: float, details: Content) -> Fit:
-    """The closed-form fit at a minimum over the variables u of `kind`. The first residuals of `found` belong to the
-    data."""
+    """Return the closed-form fit for the minimum `found` over the variables u of `kind`. The first residuals of `found`
+    are those of the data."""
     scales, measured = np.concatenate(sweep.deviations), np.concatenate([sweep.storage, sweep.loss])
     storage, loss = np.split(np.asarray(found.residuals)[: len(measured)] * scales + measured, 2)
     simulated = BestPoint("closed-form", found, storage, loss)
@@ -155,17 +157,18 @@ def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling:
 
 
 class BestPoint(NamedTuple):
-    """A minimum and the moduli there [Pa]."""
+    """A minimum, and the moduli [Pa] at this minimum."""
 
     method: str
     solution: Solution
     storage: np.ndarray
     loss: np.ndarray
-    advice: tuple[str, ...] = ()  # given if the simulation broke down
+    advice: tuple[str, ...] = ()  # remedies, if the simulation failed
 
 
 def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float], details: Content) -> Fit:
-    """The fit at a minimum, with its errors and warnings. `seconds`: time of the run, and time of compilation."""
+    """Return the fit at a minimum, with its errors and warnings. `seconds`: time of the run, and time of
+    compilation."""
     found, storage, loss = at.solution, at.storage, at.loss
     spread = uncertainty.estimate(found, sweep.noise_given, kind.maxwell, (2 * len(storage), kind.effective))
     own = None
@@ -192,8 +195,8 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
 def _of_noise_shown(
     estimate: Estimate, natural_of: Callable[[Array], Array], found: Solution, omega: np.ndarray
 ) -> Estimate:
-    """The estimate with standard errors for the noise that the residuals show: noise that repeated measurements at one
-    frequency share, or noise of different size in G' and G''."""
+    """Return the estimate with standard errors for the noise that the residuals show. This may be noise that is
+    correlated between repeated measurements at one frequency, or noise of different size in G' and G''."""
     J, r, slope = np.asarray(found.jacobian), np.asarray(found.residuals), with_slope(natural_of, found.u)[1]
     root = _of_repeats(J, r, slope, omega)
     if root is None:
@@ -206,9 +209,9 @@ def _of_noise_shown(
 
 
 def _of_repeats(J: np.ndarray, r: np.ndarray, slope: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
-    """Square root of the covariance for noise that repeated values of G', or of G'', at one frequency share. None if
-    there is no such noise."""
-    of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G' and G'' do not share a factor
+    """Return the square root of the covariance for noise that is correlated between repeated values of G', or of G'',
+    at one frequency. Returns None if there is no such noise."""
+    of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G' and G'' have separate factors
     _, group, counts = np.unique(of_row, return_inverse=True, return_counts=True)
     if np.median(counts) < 2:
         return None
@@ -217,14 +220,14 @@ def _of_repeats(J: np.ndarray, r: np.ndarray, slope: np.ndarray, omega: np.ndarr
     return shared.root if shared is not None and shared.shown else None
 
 
-#: N modes without an equilibrium modulus: their ratios add up to one.
+#: N modes without an equilibrium modulus; the ratios add up to one.
 FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
 
 
 def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> tuple[str, ...]:
-    """A sentence with the worst point, if the model does not follow the data."""
-    # If the loss modulus scatters with the phase angle, its relative error is large where it is small. So it is
-    # compared with |G*|.
+    """Return a warning with the worst point, if the model does not follow the data."""
+    # If errors of the phase angle cause the scatter of the loss modulus, small loss moduli have large relative errors.
+    # So their errors are divided by |G*|.
     size = np.hypot(sweep.storage, sweep.loss) if sweep.sd_estimated else sweep.loss
     e = np.abs(np.concatenate([storage / sweep.storage - 1, (loss - sweep.loss) / size]))
     if e.mean() < 0.05 and e.max() < 0.3:
@@ -238,30 +241,30 @@ def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> 
 
 
 def identifiable(fit: Fit, sweep: Sweep) -> bool:
-    """Whether the fit converged and no warning advises against one of its modes."""
+    """Return whether the fit converged and no warning advises against one of its modes."""
     return bool(fit.converged and not uncertainty.superfluous(sweep, fit.uncertainty))
 
 
 def number_of_parameters(fit: Fit) -> float:
-    """Number of parameters; for a model with a prior, the effective number."""
+    """Return the number of parameters, or the effective number for a model with a prior."""
     return len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
 
 
 def mean_square(fit: Fit) -> float:
-    """Mean square of the residuals of the data, with a lower bound at roundoff: below it, exact fits differ only by
-    chance."""
+    """Return the mean square of the residuals of the data, with a lower bound at roundoff. Below this bound, exact fits
+    differ only by chance."""
     m = 2 * len(fit.storage)
     return max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, ZERO)
 
 
 def information_criterion(fit: Fit) -> float:
-    """Bayesian information criterion m ln(RSS/m) + k ln m, for k parameters and m residuals with an estimated noise
-    level."""
+    """Return the Bayesian information criterion m ln(RSS/m) + k ln m for k parameters and m residuals with an estimated
+    noise level. RSS is the sum of the squared residuals."""
     m = 2 * len(fit.storage)
     return float(m * np.log(mean_square(fit)) + number_of_parameters(fit) * np.log(m))
 
 
-#: Below this relative residual, a fit is exact to the digits of any data.
+#: A fit with relative residuals below this value is exact; no data have so many digits.
 EXACT = 1e-7
 
 
@@ -274,8 +277,9 @@ def choose_modes(
     """Raise the number of modes while the criterion falls and every mode is identifiable, or until the fit is exact.
     Return the chosen fit and all tried fits. `progress` is called with the name of each fit.
 
-    One failure may be a local minimum, so the search ends at the second failure in a row. If the computation for a
-    number of modes breaks down, this also is a failure. A warning names it, and the other fits are kept.
+    A single failure may be a local minimum, so the search ends when two numbers of modes fail one after the other. If
+    the computation for a number of modes breaks down, this is a failure too. A warning names this number, and the other
+    fits are kept.
     """
     cap = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
     tried: list[Fit] = []
@@ -302,7 +306,7 @@ def choose_modes(
         if failures == 2:
             break
     if chosen is None:
-        raise InputError(f"{sweep.source or 'sweep'}: no number of modes could be fitted ({broken[1]}); check the data")
+        raise InputError(f"{sweep.source or 'sweep'}: no number of modes could be fitted ({broken[1]}): check the data")
     table = [
         {
             "modes": f.modes,
@@ -324,34 +328,38 @@ def choose_modes(
 
 
 def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int, str]) -> list[str]:
-    """Warnings on fits with other numbers of modes: a closer fit that was not chosen, and fits that failed."""
+    """Return warnings about fits with other numbers of modes: a closer fit that was not chosen, and fits that
+    failed."""
     out = []
     closer = min(tried, key=information_criterion)
     if information_criterion(closer) < information_criterion(chosen) - 10:
         errors = [float(np.mean(f.relative_errors(sweep))) for f in (closer, chosen)]
         out.append(closer_but_not_chosen(closer.modes, errors, closer.converged))
     for modes, reason in broken.items():
-        out.append(f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}) and could not be chosen")
+        out.append(
+            f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}), so they could not be chosen"
+        )
     return out
 
 
 def closer_but_not_chosen(modes: int, errors: list[float], converged: bool) -> str:
-    """A sentence on a number of modes with a lower criterion; `errors`: mean errors of this and of the chosen fit."""
+    """Return a warning about a number of modes with a lower criterion. `errors`: mean relative errors with this number
+    and of the chosen fit."""
     reason = "the data leave some of their parameters free" if converged else "their fit did not converge"
     a, b = (100 * e for e in errors)
     return (
-        f"{modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but {reason}; "
+        f"{modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but {reason}: "
         f"--modes {modes} uses them anyway"
     )
 
 
-#: Words of the warnings that come first, in order of importance.
+#: Words that identify the most important warnings, in order of importance.
 MISSES, SHORT = "the fit misses the data", "the test ends before the material has relaxed"
 IMPORTANT = ("did not converge", MISSES, "Kramers-Kronig", "that relaxes", "structured misfit", SHORT, "half decade")
 
 
 def by_importance(sentences: Sequence[str]) -> tuple[str, ...]:
-    """Warnings in the order of `IMPORTANT`. The other warnings follow in their given order."""
+    """Return the warnings in the order of `IMPORTANT`. The other warnings follow in their given order."""
 
     def place(sentence: str) -> int:
         return next((k for k, words in enumerate(IMPORTANT) if words in sentence), len(IMPORTANT))

@@ -1,1 +1,1 @@
-"""Master curves: sweeps at several temperatures are shifted to one temperature."""
+"""Master curves: sweeps at several temperatures are shifted to one reference temperature."""

@@ -1,4 +1,4 @@
-"""The master curve of sweeps at several temperatures: its points, and the laws of its shift factors."""
+"""The master curve of sweeps at several temperatures: its points, and laws for the shift factors."""
 
 from typing import NamedTuple
 
@@ -14,19 +14,21 @@ from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: A sentence is given if the distance of a sweep from the common curve exceeds FAR_OFF and SCATTERS times the scatter
-#: of the points, or if the error of a factor exceeds LOOSE [decades].
+#: A warning is given if the distance of a sweep from the common curve exceeds both FAR_OFF and SCATTERS times the
+#: scatter of the points. Another is given if the error of a shift factor exceeds LOOSE [decades].
 FAR_OFF, SCATTERS, LOOSE = 0.05, 2.0, 0.3
-#: The spline alone may cause distances from the curve up to this.
+#: The spline alone may cause relative distances from the curve up to this value.
 SMOOTH = 1e-3
-#: Factors of the moduli are reported if the probability of such a better match by chance is below this.
+#: Factors of the moduli (vertical shifts) are reported if chance improves the match as much with a probability below
+#: this.
 CHANCE = 1e-3
-#: Factors of the moduli are reported only if they reduce the distance from one curve to less than this part.
+#: Factors of the moduli are reported only if they reduce the distance of the sweeps from one curve below this part of
+#: its value.
 BETTER = 0.8
 
 
 class MasterCurve(NamedTuple):
-    """All sweeps at the reference temperature."""
+    """All sweeps, shifted to the reference temperature."""
 
     sweep: Sweep
     parts: list[Sweep]  # the shifted sweeps, in the order of the temperatures
@@ -39,8 +41,8 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
 
     Args:
         data: two or more sweeps.
-        reference: temperature [K]; None: the middle temperature. The nearest measured temperature is used.
-        vertical: also find factors of the moduli. This is not possible if the shift factors are given.
+        reference: reference temperature [K]; None: the middle temperature. The nearest measured temperature is used.
+        vertical: also find factors of the moduli. This is not possible if the file gives the shift factors.
     """
     T = data.temperatures
     place = len(T) // 2 if reference is None else int(np.argmin(np.abs(T - reference)))
@@ -78,27 +80,28 @@ def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
 
 
 def _scatter_of_points(sweeps: list[Sweep]) -> float:
-    """Relative scatter of the points about a smooth curve: the median over all sweeps; 0 if there are too few
-    points."""
+    """Return the relative scatter of the points about a smooth curve, as the median over all sweeps. It is 0 if there
+    are too few points."""
     each = [scatter(*merged(s.angular_frequency, G)) for s in sweeps for G in (s.storage, s.loss)]
     known = [own for own in each if np.isfinite(own)]
     return float(np.median(known)) if known else 0.0
 
 
 def _sentences(found: Shifts, noise: float) -> list[str]:
-    """Notes on the shifts, and warnings if superposition is not valid. `noise`: scatter of the points."""
+    """Return notes on the shifts, and warnings if superposition is not valid. `noise`: relative scatter of the
+    points."""
     T = celsius(found.temperatures)
     out = [
-        f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; they lie "
-        f"{100 * found.apart:.2g} % from one smooth curve"
+        f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; their "
+        f"root mean square distance from one smooth curve is {100 * found.apart:.2g} %"
     ]
     far = [k for k in np.argsort(-found.misfit) if found.misfit[k] > max(FAR_OFF, SCATTERS * noise)]
     if far:
         listed = ", ".join(f"{T[k]:.4g} °C {100 * found.misfit[k]:.2g} %" for k in far[:4])
         more = f" and {len(far) - 4} more" if len(far) > 4 else ""
         out.append(
-            f"superposition does not hold everywhere: sweeps lie off the common curve by ({listed}{more}); leave these "
-            "temperatures out, or try --vertical"
+            f"superposition is not valid at all temperatures (distance from the common curve: {listed}{more}): leave "
+            "these temperatures out, or try --vertical"
         )
     loose = [k for k in range(len(T)) if found.log_a_errors[k] > LOOSE]
     if loose:
@@ -108,10 +111,10 @@ def _sentences(found: Shifts, noise: float) -> list[str]:
 
 
 def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
-    """A sentence if the sweeps match much better when their moduli have factors too (F-test)."""
+    """Return a note if the sweeps match much better when their moduli have factors too (F-test)."""
     try:
         other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
-        # Both fits use the same kind of curve, which is fine enough for each of them.
+        # Both fits use the same distance of knots, which is small enough for each of them.
         knots = min(found.knots, other.knots)
         alone, both = (
             shifts.found(sweeps, found.temperatures, found.reference, vertical, (knots,)) for vertical in (False, True)
@@ -132,15 +135,15 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     moved = np.abs(other.log_a - found.log_a) / np.maximum(found.log_a_errors, 1e-12)
     k = int(np.argmax(moved))
     return [
-        f"the moduli have factors too ({b.min():.3g} to {b.max():.3g}): with --vertical the sweeps lie "
+        f"the moduli have factors too ({b.min():.3g} to {b.max():.3g}). With --vertical, the sweeps lie "
         f"{100 * other.apart:.2g} % from one curve instead of {100 * found.apart:.2g} %, and log10 a at {T[k]:.4g} °C "
-        f"is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}, and this error does "
-        "not contain the difference: give --vertical"
+        f"is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}. The stated error does "
+        "not contain this difference: give --vertical"
     ]
 
 
 def shift_numbers(found: MasterCurve) -> Content:
-    """The part `shift` of the details in fit.json."""
+    """Return the part `shift` of the details in fit.json."""
     s = found.shifts
     return {
         "reference_temperature_C": float(celsius(s.temperatures[s.reference])),

@@ -1,11 +1,11 @@
 """Time-temperature superposition: shift factors that bring sweeps at several temperatures onto one smooth curve.
 
 The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
-a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency. Least squares give the curve
-together with all factors. So no model of the material is needed, and every factor has a standard error. The data decide
-the distance between the knots of the spline. A curve that follows the noise would be steeper than the true curve. The
-errors of the factors depend on its slope and would be too small. Source: Ferry (1980), Viscoelastic properties of
-polymers, chapter 11.
+a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency. The curve and all factors are fitted
+together by least squares. So no model of the material is needed, and every factor has a standard error. The distance
+between the knots of the spline is chosen from the data. A curve that follows the noise would be steeper than the true
+curve. The errors of the factors depend on the slope of the curve and would then be too small. Source: Ferry (1980),
+Viscoelastic properties of polymers, chapter 11.
 """
 
 from collections.abc import Sequence
@@ -18,14 +18,15 @@ from fitting.readers.frequency_sweep import Sweep, merged, scatter
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
-#: Distances between two knots [decades] that are tried; and weight of the third differences of the spline, which is
-#: needed for knots without data.
+#: KNOTS: distances between two knots [decades] that are tried. SMOOTH: weight of the penalty on third differences of
+#: the spline coefficients, which is needed for knots without data.
 KNOTS, SMOOTH = (0.4, 0.6, 0.9, 1.35, 2.0, 3.0), 1e-3
-#: Maximum step of a factor in one iteration [decades]; the iteration ends if all steps are below the second value.
+#: LONGEST: maximum step of a factor in one iteration [decades]. The iteration ends if all steps are below CONVERGED.
 LONGEST, CONVERGED = 0.3, 1e-6
-#: For the first shift: the part of a sweep that must overlap its neighbour, and the shifts that are tried [decades].
+#: For the first estimate of a shift. OVERLAP: part of a sweep that must overlap its neighbour. REACH: shifts that are
+#: tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
-#: Two sweeps match if their mean square distance, divided by the variance of their noise, is at most this.
+#: Two sweeps match if their mean square distance, divided by the variance of their noise, is at most this value.
 WITHIN = 2.0
 
 
@@ -38,14 +39,14 @@ class Shifts(NamedTuple):
     log_a_errors: np.ndarray  # (K,) standard errors; 0 at the reference and for given factors
     log_b: np.ndarray  # (K,) log10 of b_T; 0 without vertical shifts
     log_b_errors: np.ndarray
-    misfit: np.ndarray  # (K,) root mean square distance from the curve, relative
+    misfit: np.ndarray  # (K,) relative root mean square distance of each sweep from the curve
     covariance: np.ndarray  # (K, K) of `log_a`; neighbours are matched to each other, so their errors are correlated
     knots: float  # decades between two knots of the curve
     given: bool = False
 
     @property
     def apart(self) -> float:
-        """Root mean square distance of all points from the curve, relative."""
+        """Relative root mean square distance of all points from the curve."""
         return float(np.sqrt(np.mean(self.misfit**2)))
 
 
@@ -56,14 +57,14 @@ def found(
     vertical: bool = False,
     tried: Sequence[float] = KNOTS,
 ) -> Shifts:
-    """Find shift factors by least squares. The distance of the knots is chosen by Akaike's corrected information
+    """Find shift factors by least squares. The distance between the knots is chosen by Akaike's corrected information
     criterion.
 
     Args:
         sweeps: K sweeps.
         temperatures: (K,) [K], ascending.
         reference: index of the sweep that is not shifted.
-        vertical: whether the moduli have factors b_T too.
+        vertical: whether factors b_T of the moduli are fitted too.
         tried: distances between two knots of the curve [decades] to try.
 
     Raises:
@@ -82,18 +83,18 @@ def found(
 
 
 def _in_decades(sweeps: Sequence[Sweep]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """log10 of the frequencies, of G' and of G'', for every sweep."""
+    """Return log10 of the frequencies [rad/s], of G' and of G'' [Pa] for every sweep."""
     return [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
 
 
 def sum_of_squares(sweeps: Sequence[Sweep], shifts: Shifts) -> float:
-    """Sum of the squares of the relative distances of all G' and G'' from the curve."""
+    """Return the sum of the squares of the relative distances of all G' and G'' from the curve."""
     return float(np.array([2 * len(s.storage) for s in sweeps]) @ shifts.misfit**2)
 
 
 def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
-    """The result with the lowest corrected information criterion. `factors`: number of fitted factors. If the data
-    determine none of the curves, the coarsest curve.
+    """Return the result with the lowest corrected information criterion. If the data determine none of the curves,
+    return the result with the coarsest curve. `factors`: number of fitted factors.
     """
     data = 2 * sum(len(s.storage) for s in sweeps)
 
@@ -114,13 +115,13 @@ def _at_knots(
     free: np.ndarray,
     knots: float,
 ) -> Shifts:
-    """The factors for a curve with a given distance of its knots.
+    """Fit the factors for a curve with a given distance between its knots.
 
     Args:
         sweeps: K sweeps.
         at: temperatures (K,) [K], and the index of the sweep that is not shifted.
-        first: log a (K,) and log b (K,) to begin with.
-        free: (2, K) whether each log a and log b is fitted.
+        first: starting values of log a (K,) and log b (K,).
+        free: whether each log a and each log b is fitted (2, K).
         knots: distance between two knots [decades].
     """
     columns, (log_a, log_b) = _in_decades(sweeps), first
@@ -143,8 +144,8 @@ def _at_knots(
 
 
 def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, log_a: np.ndarray) -> Shifts:
-    """The result for known factors without errors, given as log10 of a_T (K,). The other arguments are the same as for
-    `found`."""
+    """Return the result for given factors without errors. `log_a`: log10 of a_T (K,). The other arguments are the same
+    as for `found`."""
     none, exact = np.zeros(len(sweeps)), np.zeros((len(sweeps),) * 2)
     every = [
         Shifts(temperatures, reference, log_a, none, none, none, misfit, exact, knots, given=True)
@@ -155,8 +156,8 @@ def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: i
 
 
 def _gap(columns: list, log_a: np.ndarray) -> list[int] | None:
-    """The two sweeps on both sides of a gap that the shifts leave; None if there is no gap. Only the smoothness of the
-    curve would determine their distance."""
+    """Find a gap between the shifted sweeps, across which only the smoothness of the curve would determine their
+    distance. Returns the sweeps on both sides, or None if there is no gap."""
     ends = [(c[0][0] + a, c[0][-1] + a) for c, a in zip(columns, log_a, strict=True)]
     order = sorted(range(len(ends)), key=lambda k: ends[k][0])
     last = order[0]
@@ -170,14 +171,14 @@ def _gap(columns: list, log_a: np.ndarray) -> list[int] | None:
 def _refuse_gap(columns: list, shifts: Shifts) -> None:
     T, other = sorted(celsius(shifts.temperatures[_gap(columns, shifts.log_a) or [0, 1]]))
     raise InputError(
-        f"the sweeps at {T:.4g} and {other:.4g} °C do not overlap where they lie best: the data do not say how "
-        "far apart they are; measure between these temperatures or at more frequencies, or give the factors "
+        f"the sweeps at {T:.4g} and {other:.4g} °C do not overlap after the best shifts, so the data do not determine "
+        "the shift between them: measure between these temperatures or at more frequencies, or give the factors "
         "in a column shift_factor"
     )
 
 
 def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray, knots: float) -> np.ndarray:
-    """Relative root mean square distance (K,) of the shifted sweeps from their common curve."""
+    """Return the relative root mean square distance (K,) of the shifted sweeps from their common curve."""
     columns = _in_decades(sweeps)
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     place = np.repeat(np.arange(len(columns)), [len(c[0]) for c in columns])
@@ -190,13 +191,15 @@ def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.n
 
 
 def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, knots: float) -> int:
-    """Number of coefficients of the curve of G' for shifted sweeps; the curve of G'' has as many."""
+    """Return the number of spline coefficients of the curve of G' for shifted sweeps. The curve of G'' has the same
+    number."""
     x = np.concatenate([np.log10(s.angular_frequency) + a for s, a in zip(sweeps, log_a, strict=True)])
     return _basis(x, knots)[0].shape[1]
 
 
 def _basis(x: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values and slopes (n, C) of the cubic splines at x. Their knots are at most `apart` from each other."""
+    """Return values and derivatives (n, C) of the C cubic B-splines at x (n,). Neighbouring knots are at most `apart`
+    from each other."""
     low, high = x.min() - 1e-6, x.max() + 1e-6
     count = max(2, int(np.ceil((high - low) / apart)) + 1)
     inner = np.linspace(low, high, count)
@@ -217,7 +220,7 @@ def _smoothness(size: int) -> np.ndarray:
 
 
 def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: float) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and right-hand side of a Gauss-Newton step for log a (K), log b (K) and the coefficients of both
+    """Return matrix and right-hand side of a Gauss-Newton step for log a (K), log b (K) and the coefficients of both
     curves."""
     K, counts = len(columns), [len(c[0]) for c in columns]
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
@@ -233,17 +236,19 @@ def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: 
         right.append(y - B @ c)
     smooth = np.kron(np.eye(2), _smoothness(size))
     A = np.vstack([*rows, np.hstack([np.zeros((len(smooth), 2 * K)), smooth])])
-    return A, np.concatenate([*right, np.zeros(len(smooth))])  # the coefficients are at their minimum already
+    return A, np.concatenate([*right, np.zeros(len(smooth))])  # the coefficients are already at their minimum
 
 
 def _covariance(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
-    """Covariance of all unknowns. The first `data` rows belong to the data; the other rows keep the curve smooth."""
+    """Return the covariance of all unknowns. The first `data` rows of A and b belong to the data; the other rows keep
+    the curve smooth."""
     inverse = np.linalg.pinv(A)[:, :data]
     return inverse @ inverse.T * np.sum(b[:data] ** 2) / max(1, data - A.shape[1])
 
 
 def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:
-    """First values of the shifts: each sweep is matched to its neighbour, beginning at the reference."""
+    """Return starting values of the shifts (K,) [decades]: each sweep is matched to its neighbour, beginning at the
+    reference."""
     log_a = np.zeros(len(columns))
     for way in (range(reference + 1, len(columns)), range(reference - 1, -1, -1)):
         before = reference
@@ -260,7 +265,7 @@ def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np
 
 
 def _over(fixed: tuple, moving: tuple) -> float | None:
-    """The shift [decades] at which one sweep is nearest to its neighbour; None if no shift matches.
+    """Return the shift [decades] at which one sweep is nearest to its neighbour. Returns None if no shift matches.
 
     Among all shifts that match within the noise, the shift with the longest overlap is used: at a wrong shift, a few
     points may match by chance.
@@ -276,10 +281,10 @@ def _over(fixed: tuple, moving: tuple) -> float | None:
         score = max(float(np.mean(np.square(apart))), noise), -int(inside.sum())
         if score < best:
             best, where = score, float(s)
-    return where if best[0] < 0.25 else None  # half a decade apart: no match
+    return where if best[0] < 0.25 else None  # sweeps half a decade apart do not match
 
 
 def _variance(columns: tuple) -> float:
-    """Mean variance of the noise of log10 G' and log10 G''; 0 if there are too few points."""
+    """Return the mean variance of the noise of log10 G' and log10 G''. It is 0 if there are too few points."""
     each = [scatter(*merged(10.0 ** columns[0], 10.0 ** columns[j])) / np.log(10) for j in (1, 2)]
     return float(np.mean(np.square(each))) if np.all(np.isfinite(each)) else 0.0

@@ -12,7 +12,8 @@ from fitting.readers.rheometer import REPEATED, SORTED, read_all_sweeps
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
-#: Temperatures closer than this [K] count as one temperature: an instrument holds its set point within some tenths.
+#: Temperatures closer than this [K] count as one temperature, because an instrument keeps its temperature within some
+#: tenths.
 SAME = 1.0
 
 
@@ -21,7 +22,7 @@ class AtTemperatures(NamedTuple):
 
     sweeps: list[Sweep]
     temperatures: np.ndarray  # (K,) [K], ascending
-    shift_factors: np.ndarray | None  # (K,) a_T; None: not in the files
+    shift_factors: np.ndarray | None  # (K,) a_T; None: the files do not give them
 
 
 def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
@@ -56,7 +57,7 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
 
 
 def joined(sweeps: Sequence[Sweep]) -> Sweep:
-    """All points of several sweeps, sorted by frequency."""
+    """Return one sweep with all points of several sweeps, sorted by frequency."""
     omega = np.concatenate([s.angular_frequency for s in sweeps])
     order = np.argsort(omega, kind="stable")
     storage, loss = (np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage", "loss"))
@@ -70,7 +71,7 @@ def joined(sweeps: Sequence[Sweep]) -> Sweep:
 
 
 def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, float, Sweep]]:
-    """Temperature [K], shift factor (NaN: not known) and points for each temperature in a table."""
+    """Return temperature [K], shift factor (NaN: unknown) and points for each temperature in a table."""
     raw = sweep.raw or {}
     if "temperature" in raw:
         T = raw["temperature"]
@@ -90,8 +91,8 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     group[order] = np.concatenate([[0], np.cumsum(np.diff(T[order]) >= SAME)])
     factors = raw.get("shift_factor", np.full(len(T), np.nan))
     if np.any(factors <= 0):
-        raise InputError(f"{path}: a shift_factor of {factors.min():g} is not above 0: it is a factor of frequencies")
-    if group.max() > 0:  # every temperature has the same frequencies
+        raise InputError(f"{path}: shift_factor = {factors.min():g} is not above 0: give positive factors of frequency")
+    if group.max() > 0:  # frequencies repeat because every temperature has the same ones
         sweep = sweep._replace(notes=tuple(note for note in sweep.notes if REPEATED not in note and note != SORTED))
     out = []
     for k in range(group.max() + 1):

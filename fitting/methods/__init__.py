@@ -1,1 +1,1 @@
-"""Least squares, uncertainty, the generalised Maxwell model, priors."""
+"""Methods of the fits: least squares, uncertainty, the generalised Maxwell model and priors."""

@@ -1,8 +1,8 @@
-"""Convert any linear viscoelastic model to Prony modes for the simulation; the largest error over the band is known.
+"""Convert any linear viscoelastic model to Prony modes for the simulation, and compute the largest error in the band.
 
-The relaxation times are fixed, equally spaced on a log axis. The strengths come from non-negative least squares of the
-relative errors of G' and G''. As long as the set of non-zero strengths stays the same, the strengths are linear in the
-moduli of the model. So the conversion has derivatives.
+The relaxation times are fixed, equally spaced on a log axis. The strengths (moduli of the modes) minimise the squares
+of the relative errors of G' and G''; no strength is negative. As long as the same strengths are above zero, the
+strengths are linear in the moduli of the model. So the conversion can be differentiated.
 """
 
 from collections.abc import Callable
@@ -13,20 +13,21 @@ import numpy as np
 from fitting.methods.generalised_maxwell import Maxwell, non_negative
 from fitting.methods.host import Array, arrays_of
 
-#: Maximum relative error of G' and of G'' over the band in a conversion.
+#: Maximum relative error of G' and G'' in the band that a conversion may have.
 ALLOWED = 0.01
-#: Frequencies per decade for the conversion and its check, margins of the times [decades], and maximum number of modes.
+#: PER_DECADE: frequencies per decade at which a conversion is computed and checked. MARGINS: distances [decades] of the
+#: longest and the shortest relaxation time from the ends of the band. MOST: maximum number of modes.
 PER_DECADE, MARGINS, MOST = 20, (0.0, 0.25, 0.5, 1.0, 2.0), 60
 
 
 class Conversion(NamedTuple):
-    """The linear map from moduli at `omega` to Prony modes."""
+    """The linear map from the moduli of a model at `omega` to the Prony modes that represent this model."""
 
     omega: np.ndarray  # (n,) [rad/s], over the band
     times: np.ndarray  # (N,) [s], descending
     solid: bool  # whether the first strength is an equilibrium modulus
-    strengths_of: np.ndarray  # (N + solid, 2n): strengths [Pa] from G' then G''
-    error: float  # largest relative error of G' and G'', for the converted model
+    strengths_of: np.ndarray  # (N + solid, 2n): matrix from the moduli (G', then G'') to the strengths [Pa]
+    error: float  # largest relative error of G' and G'' of the model that was converted
 
 
 def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.ndarray:
@@ -39,13 +40,14 @@ def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.n
 def convert(
     moduli: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], low: float, high: float, solid: bool
 ) -> Conversion:
-    """Find the smallest number of modes with an error below `ALLOWED`, or else the best fit with at most `MOST` modes.
+    """Find the smallest number of modes with an error below `ALLOWED`. If there is none, use the best fit with at most
+    `MOST` modes.
 
     Args:
         moduli: function from angular frequencies (n,) [rad/s] to G' and G'' (n,) [Pa].
-        low, high: ends of the band [rad/s].
-        solid: whether the model has an equilibrium modulus. If the modes need an equilibrium modulus, they get one in
-            any case.
+        low, high: ends of the frequency band [rad/s].
+        solid: whether the model has an equilibrium modulus. If False, the modes get one only if their error is too
+            large without it.
     """
     decades = np.log10(high / low)
     omega = np.geomspace(low, high, max(12, int(decades * PER_DECADE) + 1))
@@ -66,21 +68,21 @@ def convert(
         if best[0] < ALLOWED:
             break
     assert best is not None
-    if not solid and best[0] > ALLOWED:  # a small exponent: nearly a spring
+    if not solid and best[0] > ALLOWED:  # for example a springpot with a small exponent, nearly a spring
         with_rest = convert(moduli, low, high, solid=True)
         if with_rest.error < best[0]:
             return with_rest
     error, times, strengths, A = best
     kept = strengths[solid:] > 1e-9 * strengths.sum()
     columns = np.concatenate([[True], kept]) if solid else kept
-    if solid and strengths[0] <= 1e-12 * strengths.sum():  # a modulus of zero stays zero and has no slope
+    if solid and strengths[0] <= 1e-12 * strengths.sum():  # a modulus of zero stays zero, with derivative 0
         solid, columns = False, np.concatenate([[False], kept])
     weighed = A[:, columns] / target[:, None]
     return Conversion(omega, times[kept], solid, np.linalg.pinv(weighed) / target, error)
 
 
 def modes(conversion: Conversion, moduli: tuple[Array, Array]) -> Maxwell:
-    """Prony modes of G' and G'' (…, n) at `conversion.omega`, in NumPy or JAX."""
+    """Return the Prony modes for the moduli G' and G'' (…, n) [Pa] at `conversion.omega`, in NumPy or JAX."""
     xp = arrays_of(*moduli)
     strengths = xp.concatenate(moduli, axis=-1) @ conversion.strengths_of.T
     total = xp.sum(strengths, axis=-1)

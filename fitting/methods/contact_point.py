@@ -1,8 +1,8 @@
-"""Modulus and contact point of a force-depth curve whose force is linear in the modulus.
+"""Fit the modulus and the contact point of a force-depth curve, if the force is proportional to the modulus.
 
-F = E f(d - d0), and F = 0 before contact. A straight base line may be added. For a given contact point d0, the force is
-linear in all other unknowns. So only d0 is searched, on a grid and then between grid points (variable projection; Golub
-and Pereyra 1973).
+The force is F = E f(d - d0) at depth d, with the modulus E and the contact point d0. Before contact, F = 0. A straight
+base line may be added. For a given d0, the force is linear in all other unknowns. So only d0 is searched, first on a
+grid and then between the points of the grid (variable projection; Golub and Pereyra 1973).
 """
 
 from collections.abc import Callable
@@ -17,26 +17,26 @@ from fitting.methods.noise.alike_noise import Alike, along_rows
 from fitting.methods.noise.uneven_noise import uneven_root
 
 _GRID = 200
-#: Relative noise below which residuals are roundoff.
+#: If the noise, divided by the fitted force, is below this value, the residuals are roundoff.
 _NOISELESS = 1e-7
 
 
 class ContactFit(NamedTuple):
-    """Modulus and contact point. Their standard errors are right for several kinds of noise: equal at all points,
-    growing with the force, or shared by neighbours."""
+    """Fitted modulus and contact point. Their standard errors are valid for noise that is equal at all points, that
+    grows with the force, or that is correlated between neighbouring points."""
 
     modulus: float  # E [Pa]
     contact_point: float  # d0 [m]
-    standard_errors: np.ndarray  # of both (2,)
+    standard_errors: np.ndarray  # (2,) of modulus [Pa] and contact point [m]
     correlation: float
     noise: float  # standard deviation of the force [N]
     residuals: np.ndarray  # (n,) [N]
-    before: int  # points before contact
+    before: int  # number of points before contact
     offset: float = 0.0  # force reading without contact [N]
     offset_error: float = 0.0
-    tilt: float = 0.0  # rise of the base line over all depths [N]
+    tilt: float = 0.0  # rise of the base line from the smallest to the largest depth [N]
     tilt_error: float = 0.0
-    independent: float | None = None  # number of points with independent noise that tell as much; None: all points
+    independent: float | None = None  # number of independent points with the same information; None: all points
 
     @property
     def quantile(self) -> float:
@@ -58,9 +58,10 @@ def fit_contact(
     Args:
         depth: (n,) [m].
         force: (n,) [N].
-        unit_force: function from depths after contact (n,) [m], negative before contact, to force per unit modulus (n,)
-            [N/Pa].
-        base: force without contact: "zero", "constant" (the sensor's offset is unknown) or "line" (it drifts).
+        unit_force: function that returns the force per unit modulus (n,) [N/Pa] for depths after contact (n,) [m].
+            These depths are negative before contact.
+        base: model of the force without contact: "zero", "constant" (unknown offset of the sensor) or "line" (the
+            sensor also drifts).
     """
     span = float(np.ptp(depth))
     line = np.stack([np.ones(len(depth)), (depth - depth.mean()) / span], axis=1)[:, : BASES.index(base)]
@@ -77,7 +78,7 @@ def fit_contact(
         numbers, A = linear(start)
         return float(np.sum((force - A @ numbers) ** 2))
 
-    # The contact may lie before the first point, but not after the last.
+    # The contact point may lie before the first measured depth, but not after the last one.
     grid = np.linspace(depth.min() - 0.5 * span, depth.max() - 1e-3 * span, _GRID)
     k = int(np.argmin([misfit(start) for start in grid]))
     low, high = grid[max(k - 1, 0)], grid[min(k + 1, _GRID - 1)]
@@ -88,13 +89,13 @@ def fit_contact(
     E = float(numbers[0])
     h = 1e-5 * span
     slope = (unit_force(depth - start - h) - unit_force(depth - start + h)) / (2 * h)
-    # Derivatives by ln E, by d0 / span, and by the base line in units of the largest force.
+    # Derivatives with respect to ln E, d0 / span, and the base line's coefficients divided by the largest force.
     J = np.column_stack([A[:, 0] * E, E * slope * span, line * np.abs(force).max()])
     residuals = force - A @ numbers
     noise = float(np.sqrt(residuals @ residuals / (len(force) - J.shape[1])))
     sizes, correlation, alike = _errors_of_any_noise(J, residuals, noise)
     independent = None if alike is None else alike.independent
-    # Offset and tilt, then their errors. They are 0 if the base line does not have them.
+    # Offset and tilt, then their errors. Each is 0 if the chosen base line does not have this term.
     (offset, tilt), (offset_error, tilt_error) = (
         np.append(v, np.zeros(2))[:2] for v in (numbers[1:], sizes[2:] * np.abs(force).max())
     )
@@ -105,8 +106,8 @@ def fit_contact(
 
 
 def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> tuple[np.ndarray, float, Alike | None]:
-    """Errors of all unknowns (the largest over several kinds of noise), the correlation of the first two unknowns, and
-    the noise that neighbours share."""
+    """Return the standard errors of all unknowns, the correlation of the first two unknowns, and the noise that is
+    correlated between neighbouring points. Each error is the largest over several kinds of noise."""
     equal = noise * np.linalg.pinv(J)
     roots = [equal, uneven_root(J, residuals, np.eye(J.shape[1]))]
     alike = None
@@ -119,23 +120,25 @@ def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> 
     return np.max(errors, axis=0), float(correlations[largest][0, 1]), alike
 
 
-#: Even with a tilt, contact has not begun in this part of the approach; and minimum number of points there.
+#: _FREE: part of the approach in which contact has not begun, even if the base line has a tilt. _FEWEST: minimum number
+#: of points there.
 _FREE, _FEWEST = 0.7, 8
-#: A tilt counts if its size divided by its error exceeds _SEEN for the approach alone, and _CLEAR for the whole fit.
+#: A tilt is used only if |tilt| / standard error exceeds _SEEN in a fit of the approach alone and _CLEAR in the fit of
+#: the whole curve.
 _SEEN, _CLEAR = 2.0, 4.0
 
 
 def fit_with_offset(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray]) -> ContactFit:
-    """The result of `fit_contact`. If enough points are before contact, the offset of the sensor is an unknown too.
+    """Fit modulus and contact point. If enough points are before contact, the offset of the sensor is fitted too.
 
-    The zero of a sensor is never exact, and its error moves the contact point by more than the noise. Without points
-    before contact, offset and contact point cannot be distinguished. Then the zero of the sensor is used.
+    The zero of a force sensor is never exact. The error of this zero moves the contact point more than the noise does.
+    Without points before contact, offset and contact point cannot be distinguished. Then the offset is assumed to be 0.
     """
     plain, free = (fit_contact(depth, force, unit_force, base) for base in BASES[:2])
     if free.before < _FEWEST or not free.modulus > 0:
         return plain
-    # With a large offset, the plain fit takes the offset for a contact force and has no points before contact. Then the
-    # offset is used only if the fit becomes clearly better and if the force does not rise before contact.
+    # If the offset is large, the plain fit explains it as a contact force and has no points before contact. In this
+    # case, the offset is used only if the fit becomes clearly better and the force does not rise before contact.
     better = np.sum(plain.residuals**2) - np.sum(free.residuals**2) > _CLEAR**2 * free.noise**2
     slope, error = _slope_and_error(depth[depth <= free.contact_point], force[depth <= free.contact_point])
     flat = abs(slope) < _SEEN * error
@@ -143,7 +146,7 @@ def fit_with_offset(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[
 
 
 def _slope_and_error(depth: np.ndarray, force: np.ndarray) -> tuple[float, float]:
-    """Slope of a straight line through points [N/m], and its standard error."""
+    """Return the slope [N/m] of a straight line fitted to force over depth, and the standard error of this slope."""
     x, y = depth - depth.mean(), force - force.mean()
     square = max(float(x @ x), 1e-300)
     slope = float(x @ y / square)
@@ -153,12 +156,12 @@ def _slope_and_error(depth: np.ndarray, force: np.ndarray) -> tuple[float, float
 def fit_without_tilt(
     depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], plain: ContactFit
 ) -> ContactFit | None:
-    """The fit with a straight base line, if the force rises or falls during the approach and the whole curve confirms
-    this; else None.
+    """Fit with a straight base line if the force rises or falls during the approach and the fit of the whole curve
+    confirms this. Otherwise return None.
 
     Args:
         depth, force, unit_force: see `fit_contact`.
-        plain: fit without this base line.
+        plain: fit without a tilt of the base line.
     """
     free = depth < depth.min() + _FREE * (plain.contact_point - depth.min())
     if free.sum() < _FEWEST or not np.ptp(depth[free]) > 0:

@@ -1,4 +1,4 @@
-"""The result of every fit: parameters, their standard errors and correlation, from the Jacobian at the minimum."""
+"""The result of a fit: parameters, standard errors and correlation, computed from the Jacobian at the minimum."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ import scipy.special
 from fitting.methods import host
 from fitting.methods.least_squares import Solution
 
-#: This value replaces an infinite error in a covariance. Its square is still finite.
+#: Value that replaces an infinite error in a covariance. The square of this value is still finite.
 LOST = 1e140
 
 
@@ -24,20 +24,20 @@ class Estimate(NamedTuple):
     correlation: np.ndarray
     chi2: float  # sum of the squares of residual / given scale
     components: int  # number of measured values
-    noise: float  # factor on the given scales: 1, or estimated from the residuals
+    noise: float  # standard deviation of the data / given scales: 1, or estimated from the residuals
     freedom: float  # components minus the (effective) number of unknowns
     iterations: int
     converged: bool
-    codes: tuple[int, ...] = ()  # worst code of each simulation
+    codes: tuple[int, ...] = ()  # worst status code of each simulation
     seconds: float = 0.0
-    mesh_bias: np.ndarray | None = None  # (P,) error of the values by the simulation's mesh; None: not known
-    time_step_bias: np.ndarray | None = None  # (P,) error of the values by the time steps
-    shared: np.ndarray | None = None  # (P, s) columns of `root` for errors that all points share: gap, instrument
+    mesh_bias: np.ndarray | None = None  # (P,) error of the values due to the mesh; None: unknown
+    time_step_bias: np.ndarray | None = None  # (P,) error of the values due to the time steps
+    shared: np.ndarray | None = None  # (P, s) columns of `root`: errors common to all points (gap, instrument)
     mesh_over_noise: float | None = None  # root mean square of the mesh error in the data / noise
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the parameters (P, P)."""
+        """Covariance (P, P) of the parameters."""
         return self.root @ self.root.T
 
     @property
@@ -54,16 +54,17 @@ def estimated(
     deviations_given: bool = True,
     effective: float | None = None,
 ) -> Estimate:
-    """The estimate at a minimum. The delta method transforms the covariance of u to the reported parameters.
+    """Return the estimate at a minimum. The delta method converts the covariance of the unknowns u to the reported
+    parameters.
 
     Args:
         names: names of the parameters to report.
-        natural_of: function from u to these parameters (P,).
-        found: minimum over u. If its arrays are NumPy arrays, `natural_of` must work in `host.with_jacobian`.
-        components: number of measured residuals. The other residuals are 0 and have no effect.
-        deviations_given: see `noise_factor`.
-        effective: number of parameters that the data determine, if u has a prior. The rows of the prior then follow the
-            `components` rows of the data.
+        natural_of: function that computes these parameters (P,) from the unknowns u.
+        found: result of the search over u. If it has NumPy arrays, `natural_of` must work in `host.with_jacobian`.
+        components: number of residuals that come from measured values. The other residuals are 0 and have no effect.
+        deviations_given: whether the standard deviations of the data are given, see `noise_factor`.
+        effective: effective number of parameters that the data determine, if u has a prior. The residuals of the prior
+            then follow the `components` residuals of the data.
     """
     u, jacobian, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
     if effective is not None:
@@ -92,53 +93,56 @@ def estimated(
 
 
 def with_slope(natural_of: Callable[[jax.Array], jax.Array], u: host.Array) -> tuple[np.ndarray, np.ndarray]:
-    """The reported parameters (P,) and their derivatives by u. If u is a NumPy array, nothing is compiled."""
+    """Return the reported parameters (P,) and their derivatives with respect to u. If u is a NumPy array, nothing is
+    compiled."""
     if isinstance(u, np.ndarray):
-        with np.errstate(over="ignore", invalid="ignore"):  # a fit that diverged is reported by its errors
+        with np.errstate(over="ignore", invalid="ignore"):  # a diverged fit gets infinite errors
             return host.with_jacobian(natural_of, u)
     return np.asarray(natural_of(u)), np.asarray(jax.jacfwd(natural_of)(u))
 
 
 def noise_factor(residuals: np.ndarray, freedom: float, deviations_given: bool) -> float:
-    """The noise, divided by the scales of the residuals.
+    """Return the standard deviation of the noise, divided by the scales of the residuals.
 
     If no standard deviations are given, the noise is estimated from the residuals. Given standard deviations are used
-    unchanged, unless the residuals are larger. Then the misfit enlarges the errors. Errors are never reduced (the rule
-    of the Particle Data Group).
+    unchanged, unless the residuals are larger. In that case, the errors are enlarged in the ratio of the residuals to
+    the deviations. They are never reduced (the rule of the Particle Data Group).
     """
     estimate = float(np.sqrt(np.sum(residuals**2) / max(1, freedom)))
     return max(1.0, estimate) if deviations_given else estimate
 
 
 def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Square root A of the covariance A A^T of natural parameters (delta method), and scaled singular values.
+    """Return the square root A of the covariance A A^T of the reported parameters (delta method), and the singular
+    values of the scaled Jacobian.
 
     Args:
-        jacobian: derivatives of the residuals by unconstrained parameters u.
+        jacobian: derivatives of the residuals with respect to the unconstrained parameters u.
         noise: standard deviation of a residual.
-        to_natural: derivatives of the natural parameters by u.
+        to_natural: derivatives of the reported parameters with respect to u.
     """
-    if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # the fit could not begin, so nothing is known
+    if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # the fit could not begin: all errors are infinite
         return np.full((len(to_natural), jacobian.shape[1]), np.inf), np.zeros(min(jacobian.shape))
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
-    # A direction that the data do not determine gets 1e14 times the error of the best known direction, and not infinity
-    # times zero.
+    # A direction that the data do not determine gets 1e14 times the error of the best determined direction. An infinite
+    # error would give infinity times zero.
     with np.errstate(over="ignore", invalid="ignore"):  # a parameter that diverged has no finite error
         root = noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0])
     return np.clip(np.where(np.isfinite(root), root, LOST), -LOST, LOST), s
 
 
 def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors (P,) and correlation (P, P) from the square root of a covariance."""
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite if nothing is known
+    """Return standard errors (P,) and correlation (P, P) from the square root of a covariance."""
+    with np.errstate(over="ignore", invalid="ignore"):  # errors may be infinite
         covariance = root @ root.T
         errors = np.sqrt(np.diag(covariance))
         return errors, covariance / np.maximum(np.outer(errors, errors), 1e-300)
 
 
 def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
-    """The estimate with one more error (P,) that all points share. It is independent of the other errors."""
+    """Return the estimate with one more systematic error, common to all points. `direction` (P,): change of the
+    parameters if this error is one standard deviation. It is independent of the other errors."""
     root = np.column_stack([estimate.root, direction])
     errors, correlation = errors_and_correlation(root)
     lost = ~np.isfinite(estimate.standard_errors)
@@ -149,8 +153,8 @@ def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
 
 
 def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
-    """The estimate with the shared errors of `other`. Each error keeps its size relative to the value of its
-    parameter."""
+    """Return the estimate with the systematic errors (`shared`) of `other` added. The ratio of each error to the value
+    of its parameter stays the same."""
     if other.shared is None:
         return estimate
     known = other.values != 0
@@ -160,18 +164,19 @@ def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
     return estimate
 
 
-#: The first-order estimate `mesh_bias` is used up to this relative change of a parameter by the mesh.
+#: The first-order estimate `mesh_bias` is used up to this relative change of a parameter due to the mesh.
 LARGEST_BIAS = 0.3
 #: If the standard error exceeds this many times the value, the data do not determine the parameter.
 UNKNOWN = 100.0
 
 
 def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], missing: np.ndarray) -> np.ndarray:
-    """Change of the parameters (P,) by the meshes: J^+ times `missing` (n,), the errors of the meshes in the data over
-    the noise.
+    """Return the change (P,) of the parameters due to the errors of the meshes, to first order. `missing` (n,): errors
+    of the meshes in the simulated data, divided by the noise.
 
-    It is of first order. It is accurate if the mesh errors are below a quarter and the parameters are not nearly
-    dependent. Subtract it once to correct the parameters.
+    The change of the unknowns u is J^+ `missing`, with the Jacobian J of the residuals. It is accurate if the mesh
+    errors are below 25 % and the parameters are not nearly dependent. Subtract the result once to correct the
+    parameters.
     """
     J, (_, to_natural) = np.asarray(found.jacobian), with_slope(natural_of, found.u)
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(missing))):
@@ -180,29 +185,29 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
 
 
 def bias_sentences(estimate: Estimate) -> list[str]:
-    """Warnings if the mesh moves a parameter by more than its standard error, or by too much for a first-order
+    """Return warnings if the mesh changes a parameter by more than its standard error, or too much for a first-order
     estimate."""
     bias, values = estimate.mesh_bias, np.asarray(estimate.values)
     if bias is None:
         return []
     errors = estimate.standard_errors
     unknown = np.flatnonzero(np.isfinite(errors) & (errors > UNKNOWN * np.abs(values)))
-    if len(unknown):  # their bias is only enlarged roundoff
+    if len(unknown):  # their bias is only amplified roundoff
         names = ", ".join(estimate.names[k] for k in unknown)
         return [
             f"the data do not determine {names}: the standard errors are more than {UNKNOWN:g} times the values, and "
-            "another mesh does not help; displacements without a force determine only ratios of moduli: give a "
+            "another mesh does not help. Displacements without a force determine only ratios of moduli. Give a "
             "traction or a measured force, or fit fewer parameters"
         ]
     lost = np.flatnonzero(~(np.abs(bias) <= LARGEST_BIAS * np.abs(values)) & ~(np.abs(bias) <= errors))
     if len(lost):
         names = ", ".join(estimate.names[k] for k in lost)
         return [
-            f"the mesh moves {names} by a third or more: with this mesh, the data do not determine these parameters; "
+            f"the mesh moves {names} by a third or more, so the data do not determine these parameters with this mesh: "
             "refine the mesh"
         ]
     more = np.flatnonzero(np.abs(bias) > estimate.standard_errors)
     if not len(more):
         return []
     each = ", ".join(f"{estimate.names[k]} by {bias[k]:.2g}" for k in more)
-    return [f"the mesh moves {each}, more than the standard error: subtract mesh_bias, or refine the mesh"]
+    return [f"the mesh moves {each}, which is more than the standard error: subtract mesh_bias, or refine the mesh"]

@@ -1,7 +1,8 @@
 """The generalised Maxwell model: its closed-form moduli, an unconstrained parametrisation, and starting points.
 
-G(t) = G0 (1 - sum_i g_i (1 - exp(-t/tau_i))), see section 5.2 of the chapter. g_i are ratios of G0 (Table 2 prints Pa).
-The formulas work with NumPy and JAX arrays, also with additional leading axes (see `fitting.methods.host`).
+The relaxation modulus is G(t) = G0 (1 - sum_i g_i (1 - exp(-t/tau_i))), see section 5.2 of the chapter. The g_i are
+ratios [1] to G0 (Table 2 of the chapter prints the unit Pa). The formulas work with NumPy and JAX arrays, also with
+additional leading axes (see `fitting.methods.host`).
 """
 
 from typing import NamedTuple
@@ -24,12 +25,12 @@ class Maxwell(NamedTuple):
 
     @property
     def equilibrium_modulus(self) -> Array:
-        """G0 (1 - sum g_i) [Pa]."""
+        """Equilibrium modulus G0 (1 - sum g_i) [Pa]."""
         return self.shear_modulus * (1 - self.ratios.sum(axis=-1))
 
 
 def moduli(model: Maxwell, omega: Array) -> tuple[Array, Array]:
-    """G' and G'' [Pa] at angular frequencies omega (n,) [rad/s]."""
+    """Return storage modulus G' and loss modulus G'' (n,) [Pa] at angular frequencies omega (n,) [rad/s]."""
     xp = arrays_of(model.ratios, omega)
     x = omega[:, None] * model.relaxation_times[..., None, :]
     ratios = model.ratios[..., None, :]
@@ -40,7 +41,8 @@ def moduli(model: Maxwell, omega: Array) -> tuple[Array, Array]:
 
 
 def weighed(model: Maxwell, relaxing: float, equilibrium: float) -> Maxwell:
-    """The model with the moduli of its modes multiplied by `relaxing`, and its equilibrium modulus by `equilibrium`."""
+    """Return the model with the moduli of its modes multiplied by `relaxing` and its equilibrium modulus multiplied by
+    `equilibrium`."""
     xp = arrays_of(*model)
     G0 = xp.asarray(model.shear_modulus)
     each = relaxing * G0[..., None] * model.ratios
@@ -49,11 +51,11 @@ def weighed(model: Maxwell, relaxing: float, equilibrium: float) -> Maxwell:
 
 
 def natural(u: Array) -> Maxwell:
-    """The model from unconstrained parameters u (2N + 1,).
+    """Return the model from unconstrained parameters u (2N + 1,).
 
-    u contains log G0, then the logits of the ratios against the equilibrium part, then the log of the longest time,
-    then the logs of the gaps between log times. By the softmax, every ratio is positive and the sum of the ratios is
-    below 1. By the gaps, the times descend.
+    In this order, u contains log G0, the logs of ratio / equilibrium part (N,) and the log of the longest time. The
+    last entries are the logs of the differences between neighbouring log times (N - 1,). The softmax makes every ratio
+    positive and the sum of the ratios smaller than 1. The positive differences make the times descend.
     """
     n = (u.shape[-1] - 1) // 2
     return Maxwell(
@@ -62,20 +64,21 @@ def natural(u: Array) -> Maxwell:
 
 
 def _softmax_shares(logits: Array) -> Array:
-    """Softmax (N + 1,) of logits (N,) and a last logit 0."""
+    """Return the softmax (N + 1,) of the logits (N,) and one more logit, which is 0."""
     xp = arrays_of(logits)
     logits = xp.concatenate([logits, xp.zeros((*logits.shape[:-1], 1), logits.dtype)], axis=-1)
     share = xp.exp(logits - xp.max(logits.real, axis=-1, keepdims=True))  # the largest is exp(0)
     return share / xp.sum(share, axis=-1, keepdims=True)
 
 
-#: Upper bound of the logarithm of a gap. At larger gaps the time is 0 in any case, and the exponential must not
-#: overflow.
+#: Upper bound of the log of the difference between two log times. For larger differences the shorter time is 0 in any
+#: case; the bound prevents an overflow of the exponential.
 _FARTHEST = 30.0
 
 
 def _times_of_gaps(u: Array) -> Array:
-    """Descending relaxation times (N,) from log(first time) and the logs of the gaps between log times."""
+    """Return descending relaxation times (N,) [s] from log(first time) and the logs of the differences between log
+    times."""
     xp = arrays_of(u)
     apart = xp.exp(xp.minimum(u[..., 1:], _FARTHEST))
     gaps = xp.concatenate([xp.zeros_like(u[..., :1]), xp.cumsum(apart, axis=-1)], axis=-1)
@@ -83,7 +86,8 @@ def _times_of_gaps(u: Array) -> Array:
 
 
 def unconstrained(model: Maxwell) -> Array:
-    """Inverse of `natural`. Relaxation times are sorted. Ratios must be positive, with a sum below 1."""
+    """Return the unconstrained parameters u (2N + 1,) of a model: the inverse of `natural`. Relaxation times are
+    sorted. Ratios must be positive, with a sum below 1."""
     xp = arrays_of(*model)
     order = xp.argsort(-xp.asarray(model.relaxation_times))
     g, log_tau = xp.asarray(model.ratios)[order], xp.log(xp.asarray(model.relaxation_times)[order])
@@ -93,26 +97,26 @@ def unconstrained(model: Maxwell) -> Array:
 
 
 def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array) -> Array:
-    """(model - data) / scale of G' then G'', (2n,); `scales` (2n,) [Pa]."""
+    """Return the residuals (2n,): (model - data) / scale, first of G', then of G''. `scales` (2n,) [Pa]."""
     xp = arrays_of(u)
     return (xp.concatenate(moduli(natural(u), omega), axis=-1) - xp.concatenate([storage, loss])) / scales
 
 
 def natural_fluid(u: Array) -> Maxwell:
-    """The model without an equilibrium modulus, from u (2N,). It is like `natural`, but the last mode takes the place
-    of the equilibrium part."""
+    """Return the model without an equilibrium modulus from u (2N,). It is computed as in `natural`, but the last mode
+    replaces the equilibrium part."""
     n = u.shape[-1] // 2
     return Maxwell(arrays_of(u).exp(u[..., 0]), _softmax_shares(u[..., 1:n]), _times_of_gaps(u[..., n:]))
 
 
 def fluid_residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array) -> Array:
-    """The function `residuals` for a model without an equilibrium modulus."""
+    """Return the residuals (2n,) of a model without an equilibrium modulus, in the same form as `residuals`."""
     xp = arrays_of(u)
     return (xp.concatenate(moduli(natural_fluid(u), omega), axis=-1) - xp.concatenate([storage, loss])) / scales
 
 
 def fluid_of(u: np.ndarray) -> np.ndarray:
-    """u of `natural_fluid` (2N,) from u of `natural` (2N + 1,): the equilibrium part is left out."""
+    """Convert u of `natural` (2N + 1,) to u of `natural_fluid` (2N,): the equilibrium part is left out."""
     n = (len(u) - 1) // 2
     ratios = natural(u).ratios
     return np.concatenate([u[:1], np.log(ratios[:-1] / ratios[-1]), u[n + 1 :]])
@@ -124,14 +128,15 @@ def largest_number_of_modes(sweep: Sweep) -> int:
 
 
 def mode_columns(omega: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Moduli G' then G'' (2n, 1 + K) of an equilibrium modulus of 1 Pa, and of modes of 1 Pa."""
+    """Return the moduli (2n, 1 + K), G' then G''. The first column is for an equilibrium modulus of 1 Pa, each other
+    column for one mode with a strength of 1 Pa."""
     x = omega[:, None] * times
     bottom = np.column_stack([np.zeros(len(omega)), x / (1 + x**2)])
     return np.vstack([np.column_stack([np.ones(len(omega)), x**2 / (1 + x**2)]), bottom])
 
 
 class Spectrum(NamedTuple):
-    """The best fit with any number of Maxwell modes."""
+    """The best fit of the data with any number of Maxwell modes."""
 
     times: np.ndarray
     strengths: np.ndarray  # [Pa], >= 0
@@ -152,7 +157,7 @@ def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
 
 
 def non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
-    """The x >= 0 for which A x is nearest to b, and the distance.
+    """Return the x >= 0 for which A x is nearest to b, and the distance |A x - b|.
 
     If relaxation times are close, columns are nearly equal, and the active-set method may cycle. Then SciPy's bounded
     least squares is used, which always returns its best point.
@@ -167,12 +172,13 @@ def non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
     return x / norm, float(rest)
 
 
-#: Above this misfit, no number of modes describes the data even roughly. Then columns or units are wrong.
+#: If the misfit exceeds this value, no number of modes describes the data even roughly: columns or units are wrong.
 HOPELESS = 0.3
 
 
 def refuse_impossible(sweep: Sweep) -> Spectrum:
-    """The dense spectrum. An `InputError` is raised if no generalised Maxwell solid is near the data."""
+    """Return the spectrum on the dense grid. Raises `InputError` if no generalised Maxwell solid describes the data
+    even roughly."""
     check_sweep(sweep)
     dense = spectrum(sweep)
     if dense.misfit > HOPELESS:
@@ -191,8 +197,9 @@ def refuse_impossible(sweep: Sweep) -> Spectrum:
 
 
 def starts(sweep: Sweep, modes: int, dense: Spectrum, count: int = 24, seed: int = 0) -> np.ndarray:
-    """Starting points (count, 2N + 1). The first has evenly spread times, the second cuts the dense spectrum into N
-    groups, the others have random log-uniform times.
+    """Return starting points u (count, 2N + 1) of a search. The relaxation times of the first point are evenly spread
+    on the log axis. The second point has one time in each of N parts of the dense spectrum with equal strength. The
+    other points have random log-uniform times.
 
     For given times, the problem is linear in the strengths, so non-negative least squares gives the strengths.
     """
@@ -205,7 +212,7 @@ def starts(sweep: Sweep, modes: int, dense: Spectrum, count: int = 24, seed: int
 
 
 def _grouped(dense: Spectrum, modes: int, low: float, high: float) -> np.ndarray:
-    """Log times that divide the spectrum into parts of equal strength."""
+    """Return one log time for each of N parts of the spectrum with equal strength."""
     if dense.strengths.sum() <= 0:
         return np.linspace(low, high, modes)
     share = np.cumsum(dense.strengths) / dense.strengths.sum()
@@ -213,7 +220,7 @@ def _grouped(dense: Spectrum, modes: int, low: float, high: float) -> np.ndarray
 
 
 def _start(sweep: Sweep, times: np.ndarray) -> np.ndarray:
-    for k in range(1, len(times)):  # keep the gaps representable
+    for k in range(1, len(times)):  # keep neighbouring times apart, so that the logs of their differences are finite
         times[k] = min(times[k], times[k - 1] * np.exp(-0.05))
     scale = np.concatenate(sweep.deviations)
     A = mode_columns(sweep.angular_frequency, times) / scale[:, None]
@@ -221,18 +228,18 @@ def _start(sweep: Sweep, times: np.ndarray) -> np.ndarray:
 
 
 def start_at_times(times: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Starting point (2N + 1,) with the given times (N,) [s]. Equilibrium modulus and strengths x solve A x = b by
-    least squares."""
+    """Return the starting point u (2N + 1,) with the given times (N,) [s]. The equilibrium modulus and the strengths x
+    solve A x = b by non-negative least squares."""
     strengths, _ = non_negative(A, b)
     total = strengths.sum()
-    share = np.maximum(strengths / total, 0.01)  # a softmax cannot start at zero
+    share = np.maximum(strengths / total, 0.01)  # a softmax cannot represent zero
     share = share / share.sum()
     return np.asarray(unconstrained(Maxwell(total, share[1:], times)))
 
 
 def times_over(resolved: tuple[float, float], modes: int, count: int) -> list[np.ndarray]:
-    """Relaxation times (N,) [s], descending, for `count` starts. The first start has times evenly over the decades, the
-    others random times."""
+    """Return relaxation times (N,) [s], descending, for `count` starting points. They are evenly spread on the log axis
+    for the first point and random for the others."""
     low, high = np.log(resolved)
     rng = np.random.default_rng(0)
     grids = [np.linspace(low, high, modes + 2)[1:-1]]

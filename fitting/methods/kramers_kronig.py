@@ -1,14 +1,15 @@
-"""Checks of the data without a model: causality and effects of the instrument; and a test for structure in residuals.
+"""Checks of measured moduli without a model (causality, effects of the instrument), and a test of residuals.
 
-Every material that relaxes has a spectrum of non-negative strengths. With x = omega tau, the moduli of each term fulfil
+Every material that relaxes has a spectrum of terms with a relaxation time tau and a non-negative strength. With x =
+omega tau, the moduli of each term fulfil
 
     0 <= dG'/d ln(omega) <= G''      and      |dG''/d ln(omega)| <= G''
 
-because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). If data violate these bounds by more than their scatter, they contain more
-than the material. At high frequencies, the inertia of the instrument violates the bounds: it adds a term to G' that
-grows as omega^2. This is called the mark of the instrument. At low frequencies, the start of the test may violate them.
-The distance between the data and the best spectrum of any shape tests the whole band. It tests the Kramers-Kronig
-relation together with non-negative dissipation.
+because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). If data violate these bounds by more than their scatter, not only the
+material determines them. At high frequencies, the inertia of the instrument violates the bounds: it adds a term to G'
+that grows as omega^2. This is called the mark of the instrument. At low frequencies, the transient at the start of the
+test may violate the bounds. The distance between the data and the best spectrum of any shape tests the whole band. This
+distance tests the Kramers-Kronig relation together with non-negative dissipation.
 """
 
 import math
@@ -20,22 +21,23 @@ import scipy.special
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.readers.frequency_sweep import FEWEST, Sweep, merged, scatter, some
 
-#: A violation of the bounds counts if it exceeds SIGNIFICANT standard deviations of the scatter and the part NEGLIGIBLE
-#: of the modulus.
+#: A violation of the bounds counts if it exceeds both SIGNIFICANT standard deviations of the scatter and NEGLIGIBLE
+#: times the modulus.
 SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
-#: A sentence is given if the relative distance of the best spectrum exceeds FAR [1] and FAR_RATIO times the scatter.
+#: A warning is given if the relative distance of the best spectrum from the data exceeds FAR and FAR_RATIO times the
+#: scatter.
 FAR, FAR_RATIO = 0.01, 5.0
-#: Below this probability, the signs of the residuals are called structured.
+#: If the signs of the residuals are less probable than this by chance, the misfit is called structured.
 CHANCE = 0.005
 
 
 class Consistency(NamedTuple):
-    """Checks of a sweep without any model."""
+    """Results of the checks of a sweep."""
 
-    misfit: float  # root mean square distance of the best non-negative spectrum, relative
+    misfit: float  # relative root mean square distance of the best non-negative spectrum from the data
     scatter: float  # relative scatter of neighbouring points about a smooth curve
-    breaches: tuple[tuple[float, float, str], ...]  # intervals [rad/s] and the bound that is violated
-    onset: float | None  # last frequency [rad/s] before the instrument's mark, within half a decade of the end
+    breaches: tuple[tuple[float, float, str], ...]  # intervals [rad/s] and the violated bound
+    onset: float | None  # last frequency [rad/s] before the instrument's mark, in the last half decade
 
     @property
     def far(self) -> bool:
@@ -57,7 +59,8 @@ def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
 
 
 def without_instrument(sweep: Sweep) -> Sweep:
-    """The points before the instrument's mark. The points after it become `grey`, and a note tells which they are.
+    """Return the sweep without the points after the instrument's mark. These points are moved to `grey`, and a note
+    names them.
 
     The search is repeated with the remaining points until no mark is found. Only the last half decade of the sweep is
     searched.
@@ -76,8 +79,8 @@ def without_instrument(sweep: Sweep) -> Sweep:
     low, high = (omega / (2 * np.pi) for omega in (here.angular_frequency[-1], sweep.angular_frequency[-1]))
     note = (
         f"{lost.sum()} of {len(lost)} points above {low:.4g} Hz {'is' if lost.sum() == 1 else 'are'} left out: {told}, "
-        "which is the mark of the instrument (its inertia adds a term that grows as frequency^2) and of no material "
-        f"that relaxes; --max-frequency {_rounded_up(high):.4g} keeps all points"
+        "which is the mark of the instrument. Its inertia adds a term that grows as frequency^2; no material that "
+        f"relaxes shows this. --max-frequency {_rounded_up(high):.4g} keeps all points"
     )
     grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
     grey = grey if sweep.grey is None else np.concatenate([sweep.grey, grey])
@@ -85,8 +88,8 @@ def without_instrument(sweep: Sweep) -> Sweep:
 
 
 def onset_of(sweep: Sweep) -> tuple[float, str] | None:
-    """Last frequency [rad/s] before the instrument's mark, within half a decade of the end; and the bound that is
-    violated."""
+    """Find the instrument's mark in the last half decade. Returns the last frequency [rad/s] before the mark and the
+    violated bound, or None if there is no mark."""
     omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
     noise, each = scatter(omega, storage), _noise_of_loss(sweep, scatter(omega, loss))
     for k in range(len(omega) - 1):
@@ -98,21 +101,22 @@ def onset_of(sweep: Sweep) -> tuple[float, str] | None:
 
 
 def _noise_of_loss(sweep: Sweep, same: float) -> np.ndarray:
-    """Relative noise of G'' at every frequency: `same`, or more if the phase scatters and G'' is small."""
+    """Return the relative noise of G'' at every frequency. It is `same`, or larger if the phase scatters and G'' is
+    small."""
     if sweep.sd_estimated and sweep.loss_sd is not None:
         return np.maximum(same, sweep.loss_sd / sweep.loss)
     return np.full(len(np.unique(sweep.angular_frequency)), same)
 
 
 def _breach(omega, storage, loss, noise) -> str:
-    """A text on the bound that two neighbouring points violate, or an empty text."""
+    """Return a text with the bound that two neighbouring points violate, or an empty text."""
     step = math.log(omega[1] / omega[0])
-    # This is the largest possible rise: G'' between the points is largest if it changes as fast as the bound allows.
+    # Upper bound of the rise of G': between the points, G'' is largest if it changes as fast as its own bound allows.
     most = step * min(max(loss) * math.exp(step / 2), math.inf)
     rise, sd = storage[1] - storage[0], noise[0] * math.hypot(*storage)
     margin = max(SIGNIFICANT * sd, NEGLIGIBLE * max(storage))
     if rise > most + margin:
-        return "G' rises by more than its loss allows"
+        return "G' rises by more than G'' allows"
     if -rise > margin:
         return "G' falls"
     if abs(math.log(loss[1] / loss[0])) > step + max(SIGNIFICANT * math.hypot(*noise[1]), NEGLIGIBLE):
@@ -121,49 +125,50 @@ def _breach(omega, storage, loss, noise) -> str:
 
 
 def sentences(found: Consistency, sweep: Sweep) -> list[str]:
-    """Sentences on the data for the user, each with its remedy."""
+    """Return warnings about the data for the user, each with a remedy."""
     out, last = [], sweep.angular_frequency[-1] / (2 * np.pi)
     if found.onset is not None:
         hertz, bound = found.onset / (2 * np.pi), next(why for low, _, why in found.breaches if low == found.onset)
         out.append(
             f"above {hertz:.3g} Hz the storage modulus changes as in no material that relaxes "
-            f"({bound}): the mark of the instrument, whose inertia adds a term that grows as "
-            f"frequency^2; no model follows these points, leave them out with --max-frequency {_rounded_up(hertz):.4g}"
+            f"({bound}): the mark of the instrument. Its inertia adds a term that grows as frequency^2. "
+            f"No model describes these points: leave them out with --max-frequency {_rounded_up(hertz):.4g}"
         )
     inner = [b for b in found.breaches if found.onset is None or b[0] < found.onset]
     if inner:
         low, high, why = inner[0]
         start = low == sweep.angular_frequency[0]
         cause = "the start of the test, or a drift" if start else "an outlier, a drift, or the instrument"
-        more = f" (and {len(inner) - 1} more places)" if len(inner) > 1 else ""
+        more = f" (and in {len(inner) - 1} more intervals)" if len(inner) > 1 else ""
         out.append(
             f"between {low / (2 * np.pi):.3g} and {high / (2 * np.pi):.3g} Hz{more} {why}, by more than the scatter of "
-            f"the points: no material that relaxes can do this; look for {cause}"
+            f"the points. This is possible in no material that relaxes: look for {cause}"
         )
     if found.far:
         out.append(
-            "the data do not agree with themselves (Kramers-Kronig): the best spectrum of any shape is "
-            f"{100 * found.misfit:.2g} % away on average up to {last:.3g} Hz, but the points scatter only by "
-            f"{100 * found.scatter:.2g} %. Look for drift, or strain beyond the linear range: no model can come closer"
+            "G' and G'' contradict each other (Kramers-Kronig): the best spectrum of any shape differs from them by "
+            f"{100 * found.misfit:.2g} % on average up to {last:.3g} Hz, but the points scatter by only "
+            f"{100 * found.scatter:.2g} %. No model can come closer. Look for drift, or strain beyond the linear range"
         )
     return out
 
 
 def _rounded_up(hertz: float) -> float:
-    """The value rounded up to four digits, so that a limit of this value does not exclude the point."""
+    """Return the value rounded up to four digits. A frequency limit of this value then does not exclude the point."""
     unit = 10.0 ** (math.floor(math.log10(hertz)) - 3)
     return math.ceil(hertz / unit) * unit
 
 
-#: Nearly all residuals have one sign if so many of one sign are less probable than this; and the mean of the other
-#: residuals, divided by the mean of these, from which the others are outliers.
+#: _ONE_SIDED: if so many equal signs are less probable than this by chance, nearly all residuals have one sign.
+#: _OUTLIERS: residuals of the rarer sign are outliers if their mean size exceeds this many times the mean size of the
+#: others.
 _ONE_SIDED, _OUTLIERS = 1e-4, 3.0
 
 
 def runs_probability(residuals: np.ndarray) -> tuple[int, float]:
-    """Number of runs of equal sign, and the probability of at most so many runs in random order (Wald and Wolfowitz
-    1940). The order says nothing if nearly all residuals (n,) have one sign. Then the result is the probability of so
-    many equal signs, unless a few outliers cause them.
+    """Return the number of runs (groups of consecutive residuals with equal sign) and the probability of at most this
+    number in random order (Wald and Wolfowitz 1940). If nearly all residuals (n,) have one sign, their order gives no
+    information. Then the second result is the probability of so many equal signs, unless a few outliers cause them.
     """
     residuals = np.asarray(residuals)[np.asarray(residuals) != 0]
     up = residuals > 0
@@ -175,7 +180,7 @@ def runs_probability(residuals: np.ndarray) -> tuple[int, float]:
     one_sided = equal_signs < _ONE_SIDED and not (len(few) and few.mean() > _OUTLIERS * many.mean())
     if len(few) == 0 or one_sided:
         return runs, equal_signs
-    # Of r runs, one sign has r // 2 runs, and the other sign has as many or one more.
+    # Among r runs, one sign has r // 2 runs. The other sign has the same number, or one more.
     r = np.arange(2, runs + 1)
     k, more = r // 2, r // 2 + r % 2
     ways = np.logaddexp(_log_splits(a, k) + _log_splits(b, more), _log_splits(a, more) + _log_splits(b, k))
@@ -183,20 +188,21 @@ def runs_probability(residuals: np.ndarray) -> tuple[int, float]:
 
 
 def _log_splits(n: int, parts: np.ndarray | int) -> np.ndarray:
-    """Logarithm of the number of ways to divide n ordered points into runs, C(n - 1, parts - 1); -inf if there is no
-    way."""
+    """Return the logarithm of the number of ways to divide n ordered points into `parts` runs, C(n - 1, parts - 1). It
+    is -inf if there is no way."""
     top, low = n - 1, np.asarray(parts) - 1
     log = scipy.special.gammaln
     return np.where(low <= top, log(n) - log(low + 1) - log(np.maximum(top - low, 0) + 1), -np.inf)
 
 
-#: Words about the standard errors in a sentence on structured residuals.
+#: Part of the warning about a structured misfit. Other modules replace this text if the errors contain the misfit.
 NOT_CONTAINED = "the standard errors do not contain it"
 
 
 def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple[dict, list[str]]:
-    """Runs test of the residuals of G' and of G'', ordered by frequency: its results, and a sentence. Repeated
-    measurements at one frequency may share their noise, so they count once.
+    """Test the signs of the residuals of G' and of G'', ordered by frequency, with a runs test. Returns its results,
+    and one warning if the misfit is structured. The noise of repeated measurements at one frequency may be correlated,
+    so they count once.
     """
     numbers, told = {}, []
     omega, storage, loss = merged(omega, storage, loss)
@@ -205,11 +211,12 @@ def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple
         numbers[name] = {"runs": runs, "probability": chance}
         if chance < CHANCE:
             told.append(
-                f"of {name} change sign {runs - 1} times over {len(omega)} frequencies (by chance: {chance:.1g})"
+                f"of {name} change sign {runs - 1} times over {len(omega)} frequencies (probability by chance: "
+                f"{chance:.1g})"
             )
     if not told:
         return numbers, []
     return numbers, [
-        f"structured misfit: the residuals {' and those '.join(told)}; the model misses something that is no noise, "
+        f"structured misfit: the residuals {' and those '.join(told)}. The model misses something that is not noise, "
         f"and {NOT_CONTAINED}: use the total errors, or another --model"
     ]

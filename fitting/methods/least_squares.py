@@ -1,5 +1,5 @@
-"""Nonlinear least squares: Levenberg-Marquardt, compiled or in NumPy, and BFGS of jax.scipy. The same code serves JAX
-and NumPy arrays. Leading axes of the arrays may be for many fits at once.
+"""Nonlinear least squares: Levenberg-Marquardt, compiled or in NumPy, and BFGS of jax.scipy. The same code works with
+JAX and NumPy arrays. Leading axes of the arrays may hold many fits, which then run at once.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ class State(NamedTuple):
     r: Array
     J: Array
     trial: Array
-    predicted: Array  # predicted decrease of the cost by the trial
+    predicted: Array  # predicted decrease of the cost at the trial point
     damping: Array
     growth: Array
     iterations: Array
@@ -45,13 +45,13 @@ class State(NamedTuple):
 #: A fit has converged if the undamped step would decrease the cost by less than GAIN (relative). A mean squared
 #: residual below ZERO counts as zero. MAX_DAMPING is the upper bound of the damping.
 GAIN, ZERO, MAX_DAMPING = 1e-10, 1e-26, 1e12
-#: The best of many fits may use this many times the maximum number of iterations.
+#: The best of many fits may use the maximum number of iterations times this factor.
 LONGER = 8
 
 
 def _damped_steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Array]:
-    """The damped step, the decrease of the cost expected from this step, and that from the undamped step. All come from
-    one SVD."""
+    """Return the damped step, the expected decrease of the cost by this step, and the expected decrease by the undamped
+    step. All three come from one SVD."""
     xp = host.arrays_of(J)
     scale = xp.maximum(xp.linalg.norm(J, axis=-2), 1e-300)
     U, s, Vt = xp.linalg.svd(J / scale[..., None, :], full_matrices=False)
@@ -63,7 +63,7 @@ def _damped_steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Arr
 
 
 def begin(u: Array, n_residuals: int, damping: float = 1e-3) -> State:
-    """The first state: its trial point is u (…, P)."""
+    """Return the first state, with the trial point u (…, P)."""
     xp, dtype, fits = host.arrays_of(u), u.dtype, u.shape[:-1]
     no = xp.full(fits, False)
     return State(
@@ -85,12 +85,12 @@ def _cost(r: Array) -> Array:
 
 
 def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
-    """Go to the trial point if it is better, else raise the damping (Nielsen 1999). Then propose the next trial
+    """Go to the trial point if it is better. Otherwise raise the damping (Nielsen 1999). Then propose the next trial
     point."""
     xp = host.arrays_of(s.u)
     first = s.iterations < 0
     cost, cost_new = _cost(s.r), _cost(r)
-    # This is False for NaN. A point without finite derivatives is refused, because no step could follow.
+    # `better` is False for NaN. A point without finite derivatives is rejected, because no next step could be computed.
     better = (cost_new < cost) & xp.all(xp.isfinite(J), axis=(-2, -1))
     rho = xp.where(first, 0.5, (cost - cost_new) / xp.where(s.predicted > 0, s.predicted, 1.0))
     easier = xp.where(first, s.damping, s.damping * xp.maximum(1 / 9, 1 - (2 * rho - 1) ** 3))
@@ -99,8 +99,8 @@ def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
     J = xp.where(better[..., None, None], J, s.J)
     cost = xp.minimum(cost, xp.where(better, cost_new, cost))
     step, predicted, left = _damped_steps(J, r, damping)
-    # No step lowers the cost, however short it is. If the remaining gain is at roundoff, the fit has converged as far
-    # as the arithmetic allows.
+    # `exhausted`: even a very short step does not lower the cost. If the remaining decrease is at roundoff, the fit has
+    # converged as far as the arithmetic allows.
     exhausted = damping > MAX_DAMPING
     at_roundoff = xp.isfinite(cost_new) & ((left <= 1e-4 * cost) | (cost <= 1e-14 * r.shape[-1]))
     converged = (left <= gain * cost) | (cost <= ZERO * r.shape[-1]) | (exhausted & at_roundoff)
@@ -119,7 +119,7 @@ def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
 
 
 def solution(s: State) -> Solution:
-    """The result from the state of one fit."""
+    """Return the result of one fit from its last state."""
     xp = host.arrays_of(s.u)
     norms = xp.linalg.norm(s.J, axis=0) * xp.linalg.norm(s.r)
     cosine = xp.max(xp.abs(s.J.T @ s.r) / xp.where(norms > 0, norms, 1.0))
@@ -127,7 +127,8 @@ def solution(s: State) -> Solution:
 
 
 def with_jacobian(residuals: Callable[..., jax.Array]) -> Callable[..., tuple[jax.Array, jax.Array]]:
-    """A function that returns (r, dr/du) for a residual function of (u, …), in one forward-mode pass."""
+    """Convert a residual function of (u, …) to a function that returns (r, dr/du), in one pass of forward-mode
+    differentiation."""
 
     def evaluate(u: jax.Array, *data: Any) -> tuple[jax.Array, jax.Array]:
         def twice(u):
@@ -161,18 +162,19 @@ Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 
 
 def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iterations: int = 200) -> Solution:
-    """The best of the minima that Levenberg-Marquardt finds from starts (S, P), in NumPy. Nothing is compiled.
+    """Return the best minimum that Levenberg-Marquardt finds from the starting points (S, P), in NumPy. Nothing is
+    compiled.
 
-    If the best point has not converged yet, only this point is iterated further. With too few modes for a wide curve,
-    convergence is slow.
+    If the search for the best point has not converged, only this search is continued. For example, convergence is slow
+    if a model has too few modes for a wide curve.
 
     Args:
-        evaluate: function of (u, *data), for example `host.with_jacobian` of a function of both.
+        evaluate: function of (u, *data), for example `host.with_jacobian` applied to a residual function.
         starts: starting points (S, P).
         data: further arguments of `evaluate`.
         max_iterations: maximum number of iterations of each fit; `LONGER` times as many for the best fit.
     """
-    # The matrices are small. With more threads, eigenvectors took 50 times as long while other programs ran.
+    # The matrices are small. With several threads, their decomposition took 50 times as long while other programs ran.
     with one_blas_thread():
         found = _best_minimum(evaluate, starts, data, max_iterations)
         if found.converged or found.iterations < max_iterations:
@@ -182,7 +184,8 @@ def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iteratio
 
 
 def _best_minimum(evaluate: Evaluate, starts: np.ndarray, data: tuple, max_iterations: int) -> Solution:
-    """The lowest point reached from starts (S, P). All starts are iterated at once."""
+    """Return the point with the lowest cost that is reached from the starting points (S, P). All are iterated at
+    once."""
     going: np.ndarray = np.arange(len(starts))
     s: Any = None
     with np.errstate(all="ignore"):  # a trial that overflows is a bad one
@@ -205,10 +208,12 @@ def levenberg_marquardt_host(
     max_iterations: int = 20,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Solution:
-    """The same iteration in Python, for residuals that take seconds and a start near the minimum.
+    """Minimise |r|^2 / 2 by Levenberg-Marquardt in Python, for residuals that take seconds to compute. The starting
+    point must be near the minimum.
 
-    `progress` is called after every evaluation. The iteration stops if a step would lower the cost by less than a part
-    1e-8. Such a step is about 1e-3 standard errors.
+    `progress` is called with the number of iterations and the cost after every evaluation. The iteration stops if a
+    step would lower the cost by less than 1e-8 times the cost. Such a step changes a parameter by about 1e-3 standard
+    errors.
     """
     trial: jax.Array = start
     s: Any = None
@@ -223,10 +228,11 @@ def levenberg_marquardt_host(
 
 
 def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol: float = 1e-8) -> Solution:
-    """Solve the same problem by BFGS of `jax.scipy.optimize`. `gtol` is the tolerance for the gradient of the cost.
+    """Minimise |residuals(u, *data)|^2 / 2 by BFGS of `jax.scipy.optimize`. `gtol` is the tolerance for the gradient of
+    the cost.
 
-    Its line search often ends at roundoff before gtol is reached. So convergence is judged as in Levenberg-Marquardt:
-    by the decrease of the cost that a least-squares step would still give.
+    The line search of BFGS often ends at roundoff before gtol is reached. So convergence is judged as in
+    Levenberg-Marquardt, by the decrease of the cost that a least-squares step would still give.
     """
 
     def cost(u):
@@ -237,5 +243,5 @@ def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol
     r, J = with_jacobian(residuals)(found.x, *data)
     s = accept(begin(found.x, r.shape[0]), r, J)
     _, _, left = _damped_steps(J, r, s.damping)
-    near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the second condition: more exact than any data
+    near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the second condition: far below any noise
     return solution(s._replace(iterations=jnp.asarray(found.nit), converged=s.converged | near))

@@ -1,15 +1,17 @@
 """One parameter of several samples: its mean, its spread between samples, and the interval for a new sample.
 
-The logarithm y_i of sample i has the mean mu, a spread s between samples and an error e_i: y_i ~ N(mu, s^2 + e_i^2). s
-is estimated by restricted maximum likelihood. The interval of mu follows Hartung and Knapp (2001), Statistics in
-Medicine 20. The interval of a new sample uses Student's t with n - 1 degrees of freedom, which is exact if the errors
-are small (Higgins, Thompson and Spiegelhalter (2009), J. R. Stat. Soc. A 172, use n - 2). If the errors may hide s, the
-interval over all s is used if it is wider.
+The logarithm y_i of the parameter of sample i is normally distributed: y_i ~ N(mu, s^2 + e_i^2). Here, mu is the mean,
+s the standard deviation between samples (the spread) and e_i the error of y_i. The spread s is estimated by restricted
+maximum likelihood. The interval of mu follows Hartung and Knapp (2001), Statistics in Medicine 20. The interval of a
+new sample uses Student's t with n - 1 degrees of freedom. This is exact if the errors are small (Higgins, Thompson and
+Spiegelhalter (2009), J. R. Stat. Soc. A 172, use n - 2). If the errors e_i are so large that s is uncertain, a second
+interval is averaged over all s. The wider interval is used.
 
-Few samples tell little about s. So the values of the samples moved towards the mean are means over all s. The weights
-are the restricted likelihood and a half-Cauchy prior of scale 1 (Gelman 2006, Bayesian Analysis 1, 515). The errors of
-these values contain the errors of s and mu. The interval of Hartung and Knapp is too narrow if a few samples have most
-of the weight. Then the interval of the mean over all s is used if it is wider.
+Few samples determine s poorly. The values of the samples are moved towards the mean (shrinkage). The moved values are
+averages over all s. Their weights are the restricted likelihood and a half-Cauchy prior of scale 1 (Gelman 2006,
+Bayesian Analysis 1, 515). The standard deviations of the moved values contain the errors of s and mu. The interval of
+Hartung and Knapp is too narrow if a few samples have most of the weight. Then the interval averaged over all s is used
+if it is wider.
 """
 
 from typing import NamedTuple
@@ -21,12 +23,13 @@ import scipy.stats
 from liverjax.core.errors import InputError
 
 #: The interval of Hartung and Knapp is too narrow if the effective number of samples, divided by the real number, is
-#: below this.
+#: below this value.
 EVEN = 0.8
-#: If the mean variance of the errors, divided by the variance between samples, exceeds this, the best value of the
+#: If the mean variance of the errors, divided by the variance between samples, exceeds this value, the estimated
 #: variance between samples is not reliable.
 UNSURE = 0.25
-#: A value below this part of the mean that its sample does not determine is not a sample of this population.
+#: If a sample does not determine its value, and the value is below this part of the mean, the sample is not part of the
+#: population.
 BELOW = 1e-3
 
 
@@ -36,14 +39,14 @@ class Population(NamedTuple):
     mean: float  # geometric mean
     spread: float  # standard deviation of the logarithms between samples
     mean_interval: tuple[float, float]
-    new_interval: tuple[float, float]  # for a new sample
-    pooled: np.ndarray  # (n,) values of the samples, moved towards the mean by their errors; NaN: see `BELOW`
-    pooled_errors: np.ndarray  # (n,) standard deviations of their logarithms
+    new_interval: tuple[float, float]  # interval of a new sample
+    pooled: np.ndarray  # (n,) values of the samples, moved towards the mean; NaN: see `BELOW`
+    pooled_errors: np.ndarray  # (n,) standard deviations of the logarithms of `pooled`
 
 
 def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
-    """Mean and spread of positive values (n,) with standard errors (n,). None if fewer than two values are
-    determined."""
+    """Estimate mean and spread of the population from positive values (n,) with standard errors (n,). Returns None if
+    fewer than two values are determined."""
     values, errors = np.asarray(values, float), np.asarray(errors, float)
     if values.ndim != 1 or values.shape != errors.shape or np.any(errors < 0):
         raise InputError(f"values {values.shape}, errors {errors.shape}: give one error of at least 0 per value (n,)")
@@ -64,8 +67,8 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     elif np.mean(v) > UNSURE * variance:
         intervals = intervals[0], _hull(intervals[1], over.interval(1.0))
     pooled, pooled_errors = np.full((2, len(values)), np.nan)
-    # Samples that determine nothing are treated like a new sample. A value far below the others belongs to another
-    # material.
+    # Samples that do not determine their value are treated like a new sample. A value far below the others belongs to
+    # another material.
     silent = ~known & (values > BELOW * np.exp(mean))
     pooled[silent], pooled_errors[silent] = over.moved(np.zeros(silent.sum()), np.full(silent.sum(), 1e12))
     pooled[known], pooled_errors[known] = over.moved(y, v)
@@ -85,7 +88,7 @@ def _hull(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]
 
 
 class _Spreads(NamedTuple):
-    """Spreads s (K,) with their weights; and for each spread, the mean and the variance of the mean."""
+    """Possible spreads s (K,) with their weights, and for each spread the mean and the variance of this mean."""
 
     s: np.ndarray
     weight: np.ndarray
@@ -93,8 +96,8 @@ class _Spreads(NamedTuple):
     variance: np.ndarray
 
     def moved(self, y: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values y (n,) with error variances v, moved towards the mean; and the standard deviations of the moved
-        values."""
+        """Return the values y (n,) with error variances v (n,), moved towards the mean, and the standard deviations of
+        the moved values."""
         trust = self.s[:, None] ** 2 / (self.s[:, None] ** 2 + v)
         at = self.mean[:, None] + trust * (y - self.mean[:, None])
         variances = trust * v + (1 - trust) ** 2 * self.variance[:, None]
@@ -102,8 +105,8 @@ class _Spreads(NamedTuple):
         return middle, np.sqrt(self.weight @ (variances + (at - middle) ** 2))
 
     def interval(self, share: float) -> tuple[float, float]:
-        """The 95 % interval of the mean. `share` of the variance between samples is added: 1 gives the interval for a
-        new sample."""
+        """Return the 95 % interval of the mean. `share`: part of the variance between samples that is added; 1 gives
+        the interval of a new sample."""
         sd = np.sqrt(self.variance + share * self.s**2)
         ends = float(np.min(self.mean - 40 * sd)), float(np.max(self.mean + 40 * sd))
 
@@ -116,7 +119,7 @@ class _Spreads(NamedTuple):
 
 
 def _over_spreads(y: np.ndarray, v: np.ndarray) -> _Spreads:
-    """Spreads with their weights from the restricted likelihood and the prior."""
+    """Return a grid of spreads with their weights from the restricted likelihood and the prior."""
     size = float(np.sqrt(np.var(y) + np.mean(v)))
     s = np.concatenate([[0.0], np.geomspace(1e-4 * size, max(100 * size, 30.0), 400)])
     w = 1 / (v + s[:, None] ** 2)
@@ -128,7 +131,7 @@ def _over_spreads(y: np.ndarray, v: np.ndarray) -> _Spreads:
 
 
 def _variance_between(y: np.ndarray, v: np.ndarray) -> float:
-    """The variance between samples with the highest restricted likelihood."""
+    """Return the variance between samples with the highest restricted likelihood."""
     top = 10 * float(np.var(y, ddof=1)) + 1e-24
 
     def minus(variance):
@@ -145,7 +148,8 @@ def _variance_between(y: np.ndarray, v: np.ndarray) -> float:
 
 
 def _weighted_mean(y: np.ndarray, v: np.ndarray, variance: float) -> tuple[float, float]:
-    """Weighted mean, and its standard error from the scatter. This is not below the standard error from the errors."""
+    """Return the weighted mean and its standard error. The standard error comes from the scatter of the values. It is
+    at least the standard error that follows from their errors."""
     w = 1 / (v + variance)
     mean = float(np.sum(w * y) / np.sum(w))
     q = float(np.sum(w * (y - mean) ** 2) / (len(y) - 1))

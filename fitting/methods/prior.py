@@ -1,9 +1,10 @@
 """The Matérn prior: a smooth random field on a mesh (Lindgren, Rue and Lindstroem 2011).
 
 The field m solves (kappa^2 - Laplace) m = white noise, with kappa = 1 / length. In three dimensions, this gives the
-covariance sd^2 exp(-distance / length). With the lumped mass M and the stiffness L of linear tetrahedra, m = A^-1
-M^(1/2) z, where z is independent standard normal and A = (kappa^2 M + L) / (sd sqrt(8 pi kappa)). The normal derivative
-of m is 0 at the boundary, so sd is larger there. sd is largest in corners.
+covariance sd^2 exp(-distance / length). With the lumped mass M and the stiffness L of linear tetrahedra, the discrete
+solution is m = A^-1 M^(1/2) z. The entries of z are independent and standard normal, and A = (kappa^2 M + L) / (sd
+sqrt(8 pi kappa)). The normal derivative of m is 0 at the boundary. Therefore the standard deviation is larger there,
+and largest in corners.
 """
 
 import math
@@ -17,15 +18,15 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 
 class Prior(NamedTuple):
-    """A prior in factorised form on the host, for the functions below."""
+    """The prior as a factorised sparse matrix in SciPy, for the functions below."""
 
-    solver: Any  # factor of kappa^2 M + L
+    solver: Any  # LU factorisation of kappa^2 M + L
     root_mass: np.ndarray  # (V,) square root of the lumped mass
     scale: float  # sqrt(8 pi kappa), for a field of standard deviation 1
 
 
 def prior(mesh: TetMesh, length: float) -> Prior:
-    """The prior of a field at the vertices with standard deviation 1 and correlation length `length` [m]."""
+    """Return the prior of a field at the vertices with standard deviation 1 and correlation length `length` [m]."""
     kappa, n = 1 / length, mesh.number_of_vertices
     tets, volumes = np.asarray(mesh.tetrahedra), np.asarray(mesh.volumes)
     D = np.moveaxis(np.asarray(mesh.shape_vectors), -1, 0)
@@ -39,20 +40,20 @@ def prior(mesh: TetMesh, length: float) -> Prior:
 
 
 def field_at_nodes(p: Prior, z: np.ndarray) -> np.ndarray:
-    """The field m from z, (V,) or (V, k)."""
+    """Return the field m at the nodes, (V,) or (V, k), from independent standard normal z of the same shape."""
     root = p.root_mass if z.ndim == 1 else p.root_mass[:, None]
     return p.scale * p.solver.solve(root * z)
 
 
 def to_whitened(p: Prior, g: np.ndarray) -> np.ndarray:
-    """The transpose of `field_at_nodes`: derivatives by z, from derivatives by m."""
+    """Convert derivatives with respect to m to derivatives with respect to z (the transpose of `field_at_nodes`)."""
     root = p.root_mass if g.ndim == 1 else p.root_mass[:, None]
     return p.scale * root * p.solver.solve(g)
 
 
 def variances(p: Prior, modes: np.ndarray, kept: np.ndarray, chunk: int = 512) -> tuple[np.ndarray, np.ndarray]:
-    """Variances (V,) without and with the data. Along the directions `modes`, the data reduce the variance to the part
-    `kept`.
+    """Return the variances (V,) of the field without and with the data. Along the directions `modes`, the data reduce
+    the variance to the part `kept`.
 
     Args:
         modes: orthonormal directions of z (V, k).

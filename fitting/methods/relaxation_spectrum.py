@@ -1,12 +1,12 @@
-"""A spectrum on a fixed grid of relaxation times. Strengths are not negative. Where the data do not determine them,
-they are smooth.
+"""Fit a relaxation spectrum on a fixed grid of relaxation times, with non-negative strengths (moduli of the modes).
+Where the data do not determine the strengths, they are smooth.
 
-For fixed times, the moduli are linear in the strengths, so there is only one minimum. The unit of a strength is the
-size of the data at omega = 1 / tau. A penalty with a weight acts on the second differences of the strengths. Method:
-Honerkamp and Weese (1989), Macromolecules 22. Grid and weight are chosen by the highest restricted likelihood (Wahba
-1985, Ann. Stat. 13). The errors from this choice contain the true values about as often as they should. The information
-criterion would choose a larger weight, and its errors would contain the true values less often
-(`experiments/identification/coverage.py`).
+For fixed relaxation times, the moduli are linear in the strengths, so the fit has only one minimum. Each strength is
+divided by the measured |G*| at omega = 1 / tau. A weighted penalty on the second differences of the strengths makes
+them smooth. Method: Honerkamp and Weese (1989), Macromolecules 22. Grid and weight are chosen by the highest restricted
+likelihood (Wahba 1985, Ann. Stat. 13). The intervals from this choice contain the true values about as often as they
+should. The information criterion would choose a larger weight, and the intervals would contain the true values less
+often (`experiments/identification/coverage.py`).
 """
 
 from collections.abc import Sequence
@@ -18,44 +18,45 @@ from fitting.methods.generalised_maxwell import mode_columns, non_negative
 from fitting.methods.host import Array, arrays_of, exponential
 from fitting.readers.rheometer import Sweep
 
-#: Grids that are tried [times per decade], decades of the grid beyond the band on each side, and weights that are
-#: tried.
+#: GRIDS: grids that are tried [times per decade]. MARGIN: decades of the grid beyond the band on each side. WEIGHTS:
+#: weights of the penalty that are tried.
 GRIDS, MARGIN, WEIGHTS = (2, 3), 1.0, np.logspace(-6, 4, 31)
-#: A strength counts as determined by the data if its relative standard error is below this.
+#: The data determine a strength if its relative standard error is below this value.
 CARRIED = 0.5
 
 
 class GridSpectrum(NamedTuple):
-    """Strengths at fixed times, with the weight and the criterion."""
+    """Strengths at fixed relaxation times, with the weight of the penalty and the criteria of the choice."""
 
     times: np.ndarray  # (K,) [s], descending; only times with a strength above zero
     strengths: np.ndarray  # (K,) [Pa]
     equilibrium: float  # [Pa], 0 for a fluid
     per_decade: int
     smoothing: float  # weight of the second differences
-    prior: np.ndarray  # (R, 1 + K): rows of the penalty on equilibrium modulus and strengths [1/Pa]
-    effective: float  # number of parameters that the data determine
+    prior: np.ndarray  # (R, 1 + K): matrix of the penalty on equilibrium modulus and strengths [1/Pa]
+    effective: float  # effective number of parameters that the data determine
     criterion: float  # information criterion, for the comparison with other models
-    evidence: float  # -2 log of the restricted likelihood, up to a constant, with the noise estimated
-    decades: float  # number of decades of times whose strengths the data determine
-    places: np.ndarray  # (K,) indices of these times in the whole grid
+    evidence: float  # -2 log of the restricted likelihood, up to a constant, with estimated noise
+    decades: float  # number of decades of relaxation times at which the data determine the strengths
+    places: np.ndarray  # (K,) indices of `times` in the whole grid
 
 
 def fit(sweep: Sweep) -> GridSpectrum:
-    """The spectrum with the grid and the weight that have the highest restricted likelihood."""
+    """Fit the spectrum with the grid and the weight that have the highest restricted likelihood."""
     return min((at(sweep, grid, w) for grid in GRIDS for w in WEIGHTS), key=lambda found: found.evidence)
 
 
 def fit_all(sweeps: Sequence[Sweep]) -> list[GridSpectrum]:
-    """Spectra of several samples on one grid and with one weight. Both are chosen by the highest restricted likelihood
-    of all samples together."""
+    """Fit the spectra of several samples on a common grid and with a common weight. Both are chosen by the highest
+    restricted likelihood of all samples together."""
     band = min(s.resolved[0] for s in sweeps), max(s.resolved[1] for s in sweeps)
     every = ([at(s, grid, w, band) for s in sweeps] for grid in GRIDS for w in WEIGHTS)
     return min(every, key=lambda found: sum(f.evidence for f in found))
 
 
 def at(sweep: Sweep, per_decade: int, smoothing: float, band: tuple[float, float] | None = None) -> GridSpectrum:
-    """The spectrum for one grid and one weight. This convex problem is solved exactly. `band`: range of times [s]."""
+    """Fit the spectrum for one grid and one weight. This convex problem is solved exactly. `band`: range of relaxation
+    times [s] that the data resolve; by default that of the sweep."""
     omega = sweep.angular_frequency
     times = grid_of_times(*(band or sweep.resolved), per_decade)
     size = np.exp(np.interp(-np.log(times), np.log(omega), np.log(np.hypot(sweep.storage, sweep.loss))))
@@ -78,23 +79,23 @@ class GridOfTimes(NamedTuple):
 
 
 def grid_of_times(low: float, high: float, per_decade: int) -> np.ndarray:
-    """Times (K,) [s], descending, for data that resolve times from `low` to `high`."""
+    """Return relaxation times (K,) [s], descending, for data that resolve times from `low` to `high` [s]."""
     ends = np.log10(high) + MARGIN, np.log10(low) - MARGIN
     return np.logspace(*ends, int(np.ceil((ends[0] - ends[1]) * per_decade)) + 1)
 
 
 def second_differences(count: int, smoothing: float) -> np.ndarray:
-    """Rows (K - 2, 1 + K) of the penalty on the second differences of the strengths."""
+    """Return the matrix (K - 2, 1 + K) of the penalty on the second differences of the strengths."""
     rows = np.column_stack([np.zeros(count - 2), np.diff(np.eye(count), 2, axis=0)])
     return np.sqrt(smoothing) * rows
 
 
 def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) -> GridSpectrum:
-    """The spectrum at a minimum, with its effective number of parameters.
+    """Return the spectrum at a minimum, with its effective number of parameters.
 
     Args:
         x: equilibrium modulus and strengths (1 + K,) in `grid.unit`.
-        A: derivatives (m, 1 + K) of the residuals of the data by x.
+        A: derivatives (m, 1 + K) of the residuals of the data with respect to x.
         r: residuals of the data (m,).
         grid: grid of the strengths.
     """
@@ -123,10 +124,10 @@ def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) ->
 
 
 def moduli_of_logarithms(u: Array, omega: np.ndarray, times: np.ndarray, solid: bool) -> tuple[Array, Array]:
-    """G' and G'' (…, n) [Pa] for strengths with the logarithms u (…, K), in NumPy or JAX.
+    """Return G' and G'' (…, n) [Pa] from the logarithms u (…, K) of the strengths, in NumPy or JAX.
 
     Args:
-        u: logarithms of the strengths. If the material is `solid`, the first is the logarithm of the equilibrium
+        u: logarithms of the strengths. If the material is `solid`, the first entry is the logarithm of the equilibrium
             modulus.
         omega: angular frequencies (n,) [rad/s].
         times: relaxation times [s].
@@ -137,7 +138,8 @@ def moduli_of_logarithms(u: Array, omega: np.ndarray, times: np.ndarray, solid: 
 
 
 def _restricted_likelihood(x: np.ndarray, A: np.ndarray, r: np.ndarray, L: np.ndarray) -> float:
-    """Compute `GridSpectrum.evidence`. The prior leaves (columns of L - rows of L) parameters free."""
+    """Return -2 log of the restricted likelihood, up to a constant. The penalty L (rows, columns) leaves columns - rows
+    parameters without a prior."""
     square = max(float(r @ r + np.sum((L @ x) ** 2)), 1e-300)
     with np.errstate(divide="ignore"):
         both = 2 * np.sum(np.log(np.abs(np.diag(np.linalg.qr(np.vstack([A, L]), mode="r")))))

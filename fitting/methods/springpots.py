@@ -1,14 +1,15 @@
-"""Fractional models in closed form, made of springs and springpots. Their moduli are powers of the frequency.
+"""Fractional models in closed form, made of springs and springpots.
 
-A springpot has the complex modulus V (i omega)^alpha, between a spring (alpha = 0) and a dashpot (alpha = 1). Sources:
-Bagley and Torvik (1983), J. Rheol. 27; Schiessel et al. (1995), J. Phys. A 28. All models here are special cases of
-one:
+A springpot has the complex modulus V (i omega)^alpha. It lies between a spring (alpha = 0) and a dashpot (alpha = 1).
+Sources: Bagley and Torvik (1983), J. Rheol. 27; Schiessel et al. (1995), J. Phys. A 28. All models here are special
+cases of one model:
 
     G* = E (i omega)^gamma + 1 / (1 / (V (i omega)^alpha) + 1 / (W (i omega)^beta))     gamma, beta < alpha
 
-where some of the six parameters are absent. The code divides frequencies by the middle of the band, x = omega /
-reference, so that all fits have similar starts and scales. Real and imaginary parts are computed separately, in NumPy
-or JAX. u may have additional leading axes (see `fitting.methods.host`).
+A model may lack some of the six parameters E, V, W, alpha, beta and gamma. The code divides frequencies by the middle
+of the band, x = omega / reference, so that all fits have similar starting points and scales. Real and imaginary parts
+are computed separately, in NumPy or JAX. The vector u of the unknowns may have additional leading axes (see
+`fitting.methods.host`).
 """
 
 from collections.abc import Callable
@@ -23,23 +24,23 @@ from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, from_starts
 from fitting.readers.rheometer import Sweep
 
-#: Number of entries of u: log E, logit gamma / alpha, log V, logit alpha, log W, logit beta / alpha.
+#: Number of entries of u: log E, logit(gamma / alpha), log V, logit(alpha), log W, logit(beta / alpha).
 SIZE = 6
 
 
 class Fractional(NamedTuple):
-    """One fractional model: which of the six entries of u are free, the reported parameters, and the formulas."""
+    """One fractional model: indices of the entries of u that are free, reported parameters, and formulas."""
 
     name: str
     free: tuple[int, ...]  # indices in u
     names: tuple[str, ...]
     units: tuple[str, ...]
-    values: Callable[[Array, float], Array]  # full u, reference [rad/s] -> (P,)
+    values: Callable[[Array, float], Array]  # (all six entries of u, reference [rad/s]) -> (P,)
     formula: Callable[..., np.ndarray]  # (i omega, values) -> G* [Pa], as in the literature
 
     @property
     def solid(self) -> bool:
-        """Whether there is an equilibrium modulus."""
+        """Whether the model has an equilibrium modulus."""
         return 0 in self.free and 1 not in self.free
 
     @property
@@ -49,22 +50,24 @@ class Fractional(NamedTuple):
 
 
 def _orders(u: Array) -> tuple[Array, Array, Array]:
-    """alpha, beta, gamma."""
+    """Return the exponents alpha, beta and gamma."""
     xp = arrays_of(u)
     alpha, beta, gamma = (0.5 * (1 + xp.tanh(0.5 * u[..., k])) for k in (3, 5, 1))
     return alpha, alpha * beta, alpha * gamma
 
 
 def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> tuple[Array, Array]:
-    """Real and imaginary part (n,) [Pa] of G* at s = x e^(i angle), from all six entries u; x (n,) = |s| / reference.
+    """Return real and imaginary part (n,) [Pa] of G* at the complex frequency s, from all six entries of u.
 
-    The default angle means s = i omega: this gives G' and G''.
+    x (n,) is |s| / reference, and `angle` is the argument of s. The default angle means s = i omega, which gives G' and
+    G''.
     """
     xp = arrays_of(u, x)
     alpha, beta, gamma = (exponent[..., None] for exponent in _orders(u))
     gamma, beta = switches[1] * gamma, switches[3] * beta
-    E, V, W = (u[..., k, None] + n * xp.log(x) for k, n in ((0, gamma), (2, alpha), (4, beta)))  # logarithms of sizes
-    least = xp.where(switches[2] > 0, xp.minimum(V.real, W.real), V.real)  # unit of both pots: no overflow
+    # Logarithms of the absolute moduli, and a common unit of both springpots that prevents overflow.
+    E, V, W = (u[..., k, None] + n * xp.log(x) for k, n in ((0, gamma), (2, alpha), (4, beta)))
+    least = xp.where(switches[2] > 0, xp.minimum(V.real, W.real), V.real)
     own, in_row = xp.exp(least - V), switches[2] * xp.exp(least - W)
     real = own * xp.cos(angle * alpha) + in_row * xp.cos(angle * beta)
     imaginary = own * xp.sin(angle * alpha) + in_row * xp.sin(angle * beta)
@@ -72,7 +75,8 @@ def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> t
     return beside * xp.cos(angle * gamma) + row * real, beside * xp.sin(angle * gamma) + row * imaginary
 
 
-#: Relaxation times per decade in `as_modes`, and decades of relaxation times beyond the shortest and the longest time.
+#: DENSE: relaxation times per decade in `as_modes`. BEYOND: decades of relaxation times below the shortest and above
+#: the longest time of a response.
 DENSE, BEYOND = 6, (3.0, 3.0)
 
 
@@ -83,21 +87,21 @@ def times_of_modes(low: float, high: float) -> np.ndarray:
 
 
 def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwell:
-    """Many Prony modes that represent the relaxation spectrum of the model, for responses in time.
+    """Return many Prony modes that represent the relaxation spectrum of the model, for responses in the time domain.
 
     The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converges
-    exponentially. Two more terms replace the slower and the faster times. They are chosen so that G* is exact at one
-    slow and one fast real s.
+    exponentially. An equilibrium modulus and one fast mode replace the slower and the faster times. They are chosen so
+    that G* is exact at one small and one large real s.
 
     Args:
         u, switches: see `moduli`.
         times: (K,) [s], descending, with a constant ratio, see `times_of_modes`.
-        reference: the frequency [rad/s] that u uses as unit.
+        reference: the frequency [rad/s] that is the unit of frequencies in u.
     """
     xp = arrays_of(u, times)
     step = xp.log(times[0] / times[1])
     H = step * moduli(u, switches, 1 / (times * reference), np.pi)[1] / np.pi
-    ends = xp.stack([1e3 / times[0], 1e-2 / times[-1]])  # so that each of the two terms acts fully there
+    ends = xp.stack([1e3 / times[0], 1e-2 / times[-1]])  # slower times act as a spring there, faster as a dashpot
     fast = times[-1] / 3
 
     x = xp.outer(ends, times)
@@ -114,13 +118,14 @@ def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwe
 def springpot_residuals(
     u: Array, switches: Array, x: Array, storage: np.ndarray, loss: np.ndarray, scales: np.ndarray
 ) -> Array:
-    """(model - data) / scale of G' then G'', (2n,); `scales` (2n,) [Pa]."""
+    """Return the residuals (2n,): (model - data) / scale, first of G', then of G''. `scales` (2n,) [Pa]."""
     found = arrays_of(u).concatenate(moduli(u, switches, x), axis=-1)
     return (found - np.concatenate([storage, loss])) / scales
 
 
 def _strength(log_size: Array, exponent: Array, reference: float) -> Array:
-    """Strength [Pa s^exponent] of a springpot. `log_size`: logarithm of its modulus [Pa] at the reference frequency."""
+    """Return the strength [Pa s^exponent] of a springpot. `log_size`: log of its |modulus| [Pa] at the reference
+    frequency."""
     return arrays_of(log_size).exp(log_size - exponent * np.log(reference))
 
 
@@ -193,14 +198,14 @@ FRACTIONAL = (
 
 
 def full(model: Fractional, u: Array) -> Array:
-    """All six entries (…, 6) from the free entries (…, P). Entries that the model does not have are 0."""
+    """Return all six entries (…, 6) of u from the free entries (…, P). Entries that the model does not have are 0."""
     xp = arrays_of(u)
     nothing = xp.zeros_like(u[..., 0])
     return xp.stack([u[..., model.free.index(k)] if k in model.free else nothing for k in range(SIZE)], axis=-1)
 
 
 def best_minimum(model: Fractional, sweep: Sweep, starts: np.ndarray, scales: np.ndarray | None = None) -> Solution:
-    """The best minimum over the free entries of u, from starts (S, P).
+    """Return the best minimum over the free entries of u that is found from the starting points (S, P).
 
     Args:
         model: the fractional model.
@@ -218,12 +223,13 @@ def best_minimum(model: Fractional, sweep: Sweep, starts: np.ndarray, scales: np
 
 
 def reference_frequency(sweep: Sweep) -> float:
-    """The middle of the band [rad/s], on the log axis."""
+    """Return the middle of the band [rad/s] on the log axis."""
     return float(np.sqrt(sweep.angular_frequency[0] * sweep.angular_frequency[-1]))
 
 
 def starting_points(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
-    """Starting points (count, SIZE): first, two springpots that cross inside or near the band; then random points."""
+    """Return starting points u (count, SIZE). In the first ones, two springpots have equal moduli at a frequency inside
+    or near the band. The others are random."""
     rng = np.random.default_rng(seed)
     size = np.log(np.hypot(sweep.storage, sweep.loss))
     half = 0.5 * np.log(sweep.angular_frequency[-1] / sweep.angular_frequency[0])
@@ -237,7 +243,8 @@ def starting_points(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
     return np.concatenate([np.array(ordered), spread])[:count]
 
 
-#: Frequencies at which the two springpots are equally stiff: distance from the middle, in half bands.
+#: Frequencies at which both springpots have equal moduli: distance from the middle of the band, divided by its half
+#: width.
 _CROSSINGS = (-1.5, -0.75, 0.0, 0.75, 1.5)
 
 
@@ -246,6 +253,7 @@ def _logit(p: np.ndarray | float) -> np.ndarray:
 
 
 def _softer_pot(level: float, smaller: float, alpha: float, log_x: float) -> list[float]:
-    """Start u for two springpots with the exponents `alpha` and `smaller` that are equally stiff at log_x."""
+    """Return the starting point u of two springpots with exponents `alpha` and `smaller` and equal moduli at log x =
+    `log_x`."""
     ratio = float(_logit(min(smaller / alpha, 0.95)))
     return [level, ratio, level - (alpha - smaller) * log_x, float(_logit(alpha)), level, ratio]

@@ -1,17 +1,18 @@
-"""The generalised Maxwell model in time, in closed form: stress for a given strain, and strain for a given stress.
+"""Closed-form response of the generalised Maxwell model in time: stress for a given strain, strain for a given stress.
 
-The input is linear between its points. For such an input, the convolution is exact. Relaxation is a sum over the modes.
-Creep is the same model solved for the strain. With b_i = sqrt(g_i / tau_i), the eigenvalues -r_k and eigenvectors q_k
-of
+The input is linear between its points. For such an input, the convolution is exact. In relaxation, the stress is a sum
+over the modes. In creep, the same equation is solved for the strain. With b_i = sqrt(g_i / tau_i), the eigenvalues -r_k
+and eigenvectors q_k of
 
     S = b b^T - diag(1 / tau)
 
 give the retardation modes, with rates r_k >= 0 and weights (q_k . b)^2 (Gross 1953, Mathematical structure of the
-theories of viscoelasticity). A fluid has one rate of 0, because it flows.
+theories of viscoelasticity). For a fluid, one rate is 0, because a fluid flows without limit.
 
-Fits compute the same in NumPy, with derivatives by hand (`residuals_with_jacobian`), so that nothing is compiled. The
-derivatives follow the recursions. The derivatives of the retardation modes are the first-order changes of eigenvalues
-and eigenvectors of S. If all relaxation times are different, all eigenvalues of S are different.
+Fits compute the same responses in NumPy, with analytical derivatives (`residuals_with_jacobian`), so that nothing is
+compiled. The recursion (the update of the viscous memory from step to step) is differentiated in every step. The
+derivatives of the retardation modes are the first-order changes of eigenvalues and eigenvectors of S. If all relaxation
+times are different, all eigenvalues of S are different.
 """
 
 from collections.abc import Callable
@@ -29,7 +30,7 @@ from fitting.methods.uncertainty import parameter_vector
 
 
 def _phi(x: Array) -> tuple[Array, Array]:
-    """(1 - e^-x) / x and (x - 1 + e^-x) / x^2, also at 0."""
+    """Return phi_1 = (1 - e^-x) / x and phi_2 = (x - 1 + e^-x) / x^2, with their limits at x = 0."""
     xp = arrays_of(x)
     small = x < 1e-3
     near, safe = xp.where(small, x, 0.0), xp.where(small, 1.0, xp.where(x > 1e100, 1e100, x))  # powers stay finite
@@ -39,8 +40,8 @@ def _phi(x: Array) -> tuple[Array, Array]:
 
 
 def stress_response(model: Maxwell, time: jax.Array, strain: jax.Array) -> jax.Array:
-    """Shear stress (n,) [Pa] for a strain (n,) that is linear between the times (n,) [s]. strain[0] is reached at
-    once."""
+    """Return the shear stress (n,) [Pa] for a strain (n,) that is linear between the times (n,) [s]. strain[0] is
+    applied as a step at the first time."""
     rates = 1 / model.relaxation_times
 
     def step(h, change):
@@ -57,7 +58,8 @@ def stress_response(model: Maxwell, time: jax.Array, strain: jax.Array) -> jax.A
 
 
 def retardation(model: Maxwell) -> tuple[Array, Array]:
-    """Rates r (N,) [1/s] and weights w (N,) [1/s] in J(t) G0 = 1 + sum w_k (1 - exp(-r_k t)) / r_k."""
+    """Return rates r (N,) [1/s] and weights w (N,) [1/s] of the creep compliance J: J(t) G0 = 1 + sum w_k (1 - exp(-r_k
+    t)) / r_k."""
     xp = arrays_of(*model)
     b = xp.sqrt(model.ratios / model.relaxation_times)
     minus, q = xp.linalg.eigh(xp.outer(b, b) - xp.diag(1 / model.relaxation_times))
@@ -65,8 +67,8 @@ def retardation(model: Maxwell) -> tuple[Array, Array]:
 
 
 def strain_response(model: Maxwell, time: jax.Array, stress: jax.Array) -> jax.Array:
-    """Shear strain (n,) for a stress (n,) [Pa] that is linear between the times (n,) [s]. stress[0] is reached at
-    once."""
+    """Return the shear strain (n,) for a stress (n,) [Pa] that is linear between the times (n,) [s]. stress[0] is
+    applied as a step at the first time."""
     rates, weights = retardation(model)
 
     def step(y, change):
@@ -82,13 +84,13 @@ def strain_response(model: Maxwell, time: jax.Array, stress: jax.Array) -> jax.A
 
 
 def relaxation_modulus(model: Maxwell, time: np.ndarray) -> np.ndarray:
-    """G(t) (n,) [Pa] after a step of strain."""
+    """Relaxation modulus G(t) (n,) [Pa] after a step of strain."""
     decay = 1 - np.exp(-np.asarray(time)[:, None] / np.asarray(model.relaxation_times))
     return np.asarray(model.shear_modulus) * (1 - decay @ np.asarray(model.ratios))
 
 
 def creep_compliance(model: Maxwell, time: np.ndarray) -> np.ndarray:
-    """J(t) (n,) [1/Pa] after a step of stress."""
+    """Creep compliance J(t) (n,) [1/Pa] after a step of stress."""
     rates, weights = retardation(Maxwell(*map(np.asarray, model)))
     one, _ = _phi(np.asarray(time)[:, None] * rates)
     return (1 + np.asarray(time) * (one @ weights)) / np.asarray(model.shear_modulus)
@@ -100,14 +102,14 @@ def creep_compliance(model: Maxwell, time: np.ndarray) -> np.ndarray:
 def residuals_with_jacobian(
     kind: str, maxwell: Callable[[np.ndarray], Maxwell], u: np.ndarray, *data: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (…, m) of a test in time and their derivatives (…, m, P) by u.
+    """Return the residuals (…, m) of a relaxation or creep test and their derivatives (…, m, P) with respect to u.
 
     Args:
         kind: "relaxation" or "creep".
-        maxwell: u -> Prony modes.
-        u: (…, P).
-        data: times (n,) [s]; driven quantity (n,); rows (m,) of the answers; answers (m,); scales of the answers
-            (m,).
+        maxwell: function from u to Prony modes.
+        u: unknowns (…, P).
+        data: times (n,) [s]; imposed strain or stress (n,); indices (m,) of the times with a measured response;
+            measured responses (m,); their scales (m,).
     """
     time, driven, rows, answer, scales = data
     modes, slope = host.with_jacobian(partial(parameter_vector, maxwell=maxwell), u)
@@ -120,14 +122,14 @@ def residuals_with_jacobian(
 
 
 class Slopes(NamedTuple):
-    """Prony modes, and the derivatives (…, 2N + 1, P) of G0, ratios and times by u."""
+    """Prony modes, and the derivatives (…, 2N + 1, P) of G0, ratios and times with respect to u."""
 
     model: Maxwell
     by_u: np.ndarray
 
 
 def _driven_stress(at: Slopes, time: np.ndarray, strain: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Stress (m, …) [Pa] for a given strain, and its derivatives by u (m, …, P)."""
+    """Return the stress (m, …) [Pa] for a given strain, and its derivatives (m, …, P) with respect to u."""
     model = at.model
     G0, g, tau = model.shear_modulus[..., None], model.ratios, model.relaxation_times
     rise = np.diff(strain)
@@ -140,7 +142,7 @@ def _driven_stress(at: Slopes, time: np.ndarray, strain: np.ndarray, rows: np.nd
 
 
 def _driven_strain(at: Slopes, time: np.ndarray, stress: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Strain (m, …) for a given stress [Pa], and its derivatives by u (m, …, P)."""
+    """Return the strain (m, …) for a given stress [Pa], and its derivatives (m, …, P) with respect to u."""
     G0 = at.model.shear_modulus[..., None]
     rates, weights, of_rates, of_weights = _retardation(at)
     dt = np.diff(time)
@@ -155,7 +157,8 @@ def _driven_strain(at: Slopes, time: np.ndarray, stress: np.ndarray, rows: np.nd
 def _memory_of_modes(
     rates: np.ndarray, dt: np.ndarray, start: float, step: np.ndarray, ramp: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """h (n, …, N) with h_(j+1) = e^-x h_j + phi_1(x) step_j + phi_2(x) ramp_j at x = rate dt_j, and dh/drate."""
+    """Return the memory h (n, …, N) of each mode and its derivative dh/drate. The recursion is h_(j+1) = e^-x h_j +
+    phi_1(x) step_j + phi_2(x) ramp_j, with x = rate dt_j."""
     intervals = (-1, *(1,) * rates.ndim)
     dt, step, ramp = (a.reshape(intervals) for a in (dt, step, ramp))
     x = dt * rates
@@ -171,7 +174,7 @@ def _memory_of_modes(
 
 
 def _slopes_of_phi(x: np.ndarray, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of both values of `_phi` by x, also at 0."""
+    """Return the derivatives of phi_1 and phi_2 (`_phi`) with respect to x, with their limits at x = 0."""
     small = x < 1e-2
     far, near = np.where(small, 1.0, x), [np.polynomial.polynomial.polyval(np.where(small, x, 0.0), c) for c in _SLOPES]
     of_one, of_two = (np.exp(-far) - one) / far, (one - 2 * two) / far
@@ -186,18 +189,18 @@ _SLOPES = (
 
 
 def _retardation(at: Slopes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rates and weights (…, N) [1/s], and the derivatives of both by u (…, N, P)."""
+    """Return retardation rates and weights (…, N) [1/s], and the derivatives (…, N, P) of both with respect to u."""
     g, tau = at.model.ratios, at.model.relaxation_times
     of_g, of_tau = np.split(at.by_u[..., 1:, :], 2, axis=-2)
     b = np.sqrt(g / tau)
     n = np.arange(g.shape[-1])
     S = b[..., :, None] * b[..., None, :]
     S[..., n, n] -= 1 / tau
-    known = np.all(np.isfinite(S), axis=(-2, -1), keepdims=True)  # an overflow is only a bad trial
+    known = np.all(np.isfinite(S), axis=(-2, -1), keepdims=True)  # an overflow is only a bad trial point
     eigenvalues, Q = np.linalg.eigh(np.where(known, S, 0.0))
     Q = np.where(known, Q, np.nan)
     c = np.einsum("...ik,...i->...k", Q, b)
-    # Derivatives by every u_p: of b, of its components along the eigenvectors, and of the diagonal -1/tau.
+    # Derivatives with respect to every u_p of b, of its components along the eigenvectors, and of the diagonal -1/tau.
     of_b = b[..., None] * (of_g / (2 * g[..., None]) - of_tau / (2 * tau[..., None]))
     along, of_diagonal = np.swapaxes(Q, -1, -2) @ of_b, np.swapaxes(of_tau / tau[..., None] ** 2, -1, -2)
     # q_l . (dS/du_p) q_k, (…, p, l, k).

@@ -1,4 +1,4 @@
-"""How well the data determine the parameters: covariance, profile likelihood, and warnings."""
+"""Measures of how well the data determine the parameters: covariance, profile likelihood and warnings."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,14 +19,14 @@ from liverjax.core.struct import Content
 
 
 def parameter_vector(u: Array, maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural) -> Array:
-    """G0, ratios and relaxation times (2N + 1,) of the Prony modes that `maxwell` computes from u."""
+    """Return G0, ratios and relaxation times (2N + 1,) of the Prony modes that `maxwell` computes from u."""
     model = maxwell(u)
     xp = arrays_of(*model)
     return xp.concatenate([model.shear_modulus[..., None], model.ratios, model.relaxation_times], axis=-1)
 
 
 def parameter_names(modes: int) -> tuple[str, ...]:
-    """Names in the order of `parameter_vector`."""
+    """Return the names of the parameters in the order of `parameter_vector`."""
     ratios, times = ([f"{n}[{i}]" for i in range(modes)] for n in ("ratios", "relaxation_times"))
     return ("shear_modulus", *ratios, *times)
 
@@ -37,12 +37,12 @@ def estimate(
     maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural,
     components: tuple[int, float | None] | None = None,
 ) -> Estimate:
-    """Values, errors and correlation of G0, ratios and relaxation times at the minimum.
+    """Return values, standard errors and correlation of G0, ratios and relaxation times at the minimum.
 
     Args:
-        found: minimum over u.
-        deviations_given: see `noise_factor`.
-        maxwell: u -> Prony modes; by default the parametrisation `natural`.
+        found: result of the search over u.
+        deviations_given: whether the standard deviations of the data are given, see `estimate.noise_factor`.
+        maxwell: function from u to Prony modes; by default `generalised_maxwell.natural`.
         components: number of measured residuals (default: all), and effective number of parameters (default: length of
             u).
     """
@@ -51,35 +51,37 @@ def estimate(
     modes = jax.eval_shape(maxwell, found.u).ratios.shape[0]
     vector = partial(parameter_vector, maxwell=maxwell)
     own = estimated(parameter_names(modes), vector, found, count, deviations_given, effective)
-    if modes == 1 and maxwell is generalised_maxwell.natural_fluid:  # a fluid with one mode has the ratio 1
+    if modes == 1 and maxwell is generalised_maxwell.natural_fluid:  # the only mode of a fluid has exactly ratio 1
         own = own._replace(standard_errors=np.where(np.arange(len(own.values)) == 1, 0.0, own.standard_errors))
     return own
 
 
-#: If 1 minus the sum of the ratios is below this, the material is a fluid.
+#: If 1 minus the sum of the ratios is below this value, the material is a fluid.
 NO_REST = 1e-10
 
 
 def equilibrium_error(u: Estimate) -> float:
-    """Standard error of the equilibrium modulus G0 (1 - sum g) [Pa]; infinite for a fluid."""
+    """Return the standard error [Pa] of the equilibrium modulus G0 (1 - sum g). It is infinite for a fluid."""
     modes = (len(u.values) - 1) // 2
     rest = 1 - u.values[1 : modes + 1].sum()
-    # This uses the square root of the covariance, so that the variance is never negative.
+    # The square root of the covariance is used, so that the variance is never negative.
     slope = np.concatenate([[rest], np.full(modes, -u.values[0]), np.zeros(modes)])
     return float(np.linalg.norm(slope @ u.root)) if rest > NO_REST else np.inf
 
 
-#: A solid whose equilibrium modulus is below this part of G0 is compared with a fluid.
+#: If the equilibrium modulus of a solid is below this part of G0, the solid is compared with a fluid.
 _SOFT = 0.01
 
 
 def may_be_fluid(u: Estimate) -> bool:
-    """Whether the equilibrium modulus is so small, or so uncertain, that a fluid may explain the data as well."""
+    """Return whether the equilibrium modulus is so small, or so uncertain, that a fluid may explain the data as
+    well."""
     return not _equilibrium(u) > max(2 * equilibrium_error(u), _SOFT * u.values[0])
 
 
 def like_a_fluid(u: Estimate, remedy: str) -> list[str]:
-    """A sentence, with a remedy, if the equilibrium modulus of a solid is below twice its standard error."""
+    """Return a warning with the given remedy if the equilibrium modulus of a solid is below twice its standard
+    error."""
     stays = _equilibrium(u)
     if stays > 2 * equilibrium_error(u):
         return []
@@ -94,21 +96,22 @@ def _equilibrium(u: Estimate) -> float:
 
 
 def equilibrium_change(values: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Change [Pa] of G0 (1 - sum g), to first order, for changes `moved` (1 + 2N, ...) of G0, ratios and times."""
+    """Return the first-order change [Pa] of the equilibrium modulus G0 (1 - sum g). `moved` (1 + 2N, ...): changes of
+    G0, ratios and times."""
     ratios = slice(1, 1 + (len(values) - 1) // 2)
     return moved[0] * (1 - values[ratios].sum()) - values[0] * moved[ratios].sum(axis=0)
 
 
 def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, points: int = 21) -> Content:
-    """95 % intervals by profile likelihood, for a closed-form fit. Along each parameter, all other parameters are
-    fitted again.
+    """Compute 95 % intervals by profile likelihood, for a closed-form fit. One parameter is fixed at several values,
+    and all other parameters are fitted again for each value.
 
     The likelihood contains only the noise. If `uncertainty` has errors of the gap or the instrument too, these errors
-    widen the interval: each half width becomes the root of the sum of the squares. This is right to first order in
-    these errors.
+    widen the interval. The squares of both half widths are added. This is right to first order in these errors.
 
     Returns:
-        For each name, [low, high]. An end is `None` if it is not reached within about four standard errors.
+        [low, high] for each name. An end is None if the likelihood does not reach the limit within about four standard
+            errors.
     """
     data = (jnp.asarray(sweep.angular_frequency), sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     best = 2 * float(found.cost)
@@ -133,8 +136,8 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
             intervals[name] = [None, None]
             continue
         grid = center + error * np.linspace(-4, 4, points) * uncertainty.quantile / 2
-        # The penalty need not hold the parameter exactly at its value. The reached point is the constrained optimum for
-        # the reached value.
+        # The penalty keeps the parameter only near its value. The point found is still the constrained optimum for the
+        # value of the parameter found.
         reached, chi2 = (
             np.asarray(v) for v in along(j, jnp.maximum(grid, 1e-3 * center), 1e3 * uncertainty.noise / error)
         )
@@ -146,14 +149,15 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
 
 
 def _farther(end: float | None, center: float, half: float) -> float | None:
-    """The end of an interval, moved outwards by one more independent error with the half width `half`."""
+    """Return the end of an interval, moved outwards for one more independent error with the half width `half`."""
     if end is None or half == 0:
         return end
     return float(center + np.copysign(np.hypot(end - center, half), end - center))
 
 
 def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
-    """First position along x at which `rise` passes 0, by linear interpolation."""
+    """Return the first position along x at which `rise` passes 0, by linear interpolation. Returns None if there is
+    none."""
     above = np.flatnonzero(rise > 0)
     if not len(above) or above[0] == 0:
         return None
@@ -161,12 +165,12 @@ def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
     return float(x[k - 1] + (x[k] - x[k - 1]) * rise[k - 1] / (rise[k - 1] - rise[k]))
 
 
-#: Two neighbouring relaxation times whose ratio is below this act as one mode.
+#: Two neighbouring relaxation times act as one mode if their ratio is below this value.
 MERGED = 1.5
 
 
 class Band(Protocol):
-    """Data that resolve relaxation times: a sweep or a test in time."""
+    """Data that resolve relaxation times: a frequency sweep, or a relaxation or creep test."""
 
     @property
     def resolved(self) -> tuple[float, float]:
@@ -179,12 +183,13 @@ def _decades(data: Band) -> float:
 
 
 def supported_modes(data: Band) -> int:
-    """Number of modes that the band supports: about one for each decade, plus one."""
-    return max(1, int(_decades(data) + 1 + 1e-9))  # rounding must not lose a decade
+    """Return the number of modes that the band supports: about one for each decade, plus one."""
+    return max(1, int(_decades(data) + 1 + 1e-9))  # roundoff must not remove a mode
 
 
 def superfluous(data: Band, u: Estimate) -> list[str]:
-    """Sentences that advise against some of the modes. There are none if this number of modes may be chosen."""
+    """Return warnings that advise against some of the modes. The list is empty if this number of modes may be
+    chosen."""
     modes = (len(u.values) - 1) // 2
     kind, measured = ("sweep", "measured frequencies") if isinstance(data, Sweep) else ("test", "measured times")
     fewer = f"use fewer modes or a wider {kind}" if modes > 1 else f"use a wider {kind}"
@@ -197,7 +202,7 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
             product = f"G0 ratios[{k}] relaxation_times[{k}]" if tau[k] < low else f"G0 (1 - ratios[{k}])"
             out.append(
                 f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the "
-                f"{measured} resolve: only {product} is determined, not its factors; "
+                f"{measured} resolve. Only the product {product} is determined: "
                 f"{'use fewer modes or another band' if modes > 1 else 'use another band'}"
             )
         if not g_err[k] < 0.5 * g[k]:
@@ -223,21 +228,21 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
     if modes > supported_modes(data) or _decades(data) < 0.3:
         out.append(
             f"the {kind} spans {_decades(data):.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
-            f"(about one per decade and one more); {fewer}"
+            f"(the limit is about one mode per decade, plus one): {fewer}"
         )
     return out
 
 
-#: Remedy if a sweep does not show the equilibrium modulus.
+#: Remedy in a warning if a sweep does not show the equilibrium modulus.
 LOWER = "measure at lower frequencies"
 
-#: Points with a scatter below this were computed, not measured.
+#: If the relative scatter of the points is below this value, the points were computed and not measured.
 _SMALL = 1e-4
 
 
 def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
-    """Warnings about parameters that the data do not determine, and about the standard deviations in the file; each
-    with a remedy."""
+    """Return warnings about parameters that the data do not determine and about the standard deviations in the file,
+    each with a remedy."""
     modes = (len(u.values) - 1) // 2
     tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
     low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
@@ -253,20 +258,20 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
         out += like_a_fluid(u, LOWER)
     if sweep.storage_sd is not None and not (sweep.noise_given or sweep.sd_estimated or sweep.sd_before):
         out.append(
-            f"the deviations in the file ({100 * sweep.relative_deviation:.2g} %) are no noise: the points scatter by "
-            f"{100 * sweep.point_scatter:.2g} % only. They are used as weights, and as the spread between samples: "
-            "one sample may differ by as much from these moduli; give the files of the samples to fit each"
+            f"the deviations in the file ({100 * sweep.relative_deviation:.2g} %) are not noise: the points scatter by "
+            f"only {100 * sweep.point_scatter:.2g} %. The deviations are used as weights, and as the spread between "
+            "samples: one sample may differ that much from these moduli. To fit each sample, give one file per sample"
         )
     elif sweep.noise_given and _SMALL < sweep.point_scatter < sweep.relative_deviation / SHARED:
         out.append(
-            f"the points scatter by {100 * sweep.point_scatter:.2g} %, the deviations in the file are "
-            f"{100 * sweep.relative_deviation:.2g} %: if they are the spread between samples, errors of ratios and "
-            "times are too large, and that of this curve says little; give the files of the samples to fit each"
+            f"the points scatter by {100 * sweep.point_scatter:.2g} %, but the deviations in the file are "
+            f"{100 * sweep.relative_deviation:.2g} %. If these are the spread between samples, the errors of ratios "
+            "and times are too large, and the fit of this curve says little. Then give one file per sample, to fit each"
         )
     elif sweep.noise_given and u.noise > 1.5:
         out.append(
-            f"the residuals are {u.noise:.2g} times the given deviations: the model misses something or the "
-            "deviations are too small; the standard errors are enlarged by that factor"
+            f"the residuals are {u.noise:.2g} times the given deviations: the model misses something, or the "
+            "deviations are too small. The standard errors are enlarged by this factor"
         )
     return out
 

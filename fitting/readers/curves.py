@@ -1,4 +1,4 @@
-"""Stress-stretch curves of an incompressible sample: tension, compression, shear, equibiaxial and pure-shear data."""
+"""Read stress-stretch curves of incompressible samples: tension, compression, shear, equibiaxial and pure shear."""
 
 import itertools
 import re
@@ -22,16 +22,16 @@ class Curve(NamedTuple):
 
     label: str
     test: str  # uniaxial, equibiaxial, pure_shear, simple_shear or general
-    F: np.ndarray  # (n, 3, 3), det F = 1; no stress on face 3
+    F: np.ndarray  # (n, 3, 3) deformation gradient, det F = 1; face 3 is free of stress
     component: tuple[int, int]  # which component of the nominal stress was measured
     stress: np.ndarray  # (n,) [Pa]
-    returns: int = 0  # how often the rows turn back and pass a range again
-    sample: str = ""  # equal for the components of one test, which follow each other; empty: `label`
+    returns: int = 0  # how often the rows reverse and repeat a range of deformations
+    sample: str = ""  # the same text for all components of one test; if empty, `label` is used
 
     @property
     def driven(self) -> np.ndarray:
-        """The component of F on which the measured stress does work. If this component is constant: the shear or the
-        stretch that varies."""
+        """The component (n,) of F on which the measured stress does work. If it is constant, the shear or the stretch
+        that varies."""
         own, shear = self.F[:, *self.component], self.F[:, 0, 1]
         return own if np.ptp(own) > 0 else shear if np.ptp(shear) > 0 else self.F[:, 0, 0]
 
@@ -48,12 +48,13 @@ class Curve(NamedTuple):
 
 
 def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[str]]:
-    """Curves of CSV files, and notes for the user.
+    """Read the curves of CSV files. Return them with notes for the user.
 
-    A file has one of two forms; `#` begins a comment in both. In the first form, the columns are F11 … F33 and P11 …
-    P33. Here a stress that is zero in all rows counts as not measured. In the second form, the columns are `test`,
-    `stretch`, `shear` and `nominal_stress_kPa`, and `test` is one of uniaxial, equibiaxial, pure_shear, simple_shear.
-    The name of a stress column may end in _Pa, _kPa or _MPa. Otherwise the stress is in `unit`.
+    A file has one of two forms. In both, `#` begins a comment. In the first form, the columns are F11 … F33 and P11 …
+    P33 (deformation gradient and nominal stress). Here a stress that is zero in all rows counts as not measured. In the
+    second form, the columns are `test`, `stretch`, `shear` and `nominal_stress_kPa`, and `test` is one of uniaxial,
+    equibiaxial, pure_shear, simple_shear. The name of a stress column may end in _Pa, _kPa or _MPa. Otherwise the
+    stress is in `unit`.
 
     Raises:
         InputError: the file or a column does not exist, a value is not a number, the volume changes, or there are too
@@ -73,13 +74,13 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
         found, named = _components(file, rows, unit) if "F11" in rows[0] else _named_tests(file, rows, unit)
         curves += found
         if not named:
-            notes.append(f"{file.name}: its stress column names no unit, read as {unit} (--unit Pa, kPa or MPa)")
+            notes.append(f"{file.name}: its stress column names no unit; {unit} is assumed (--unit Pa, kPa or MPa)")
     for curve in (c for c in curves if c.returns):
         times = "once" if curve.returns == 1 else f"{curve.returns} times"
         notes.append(
-            f"{curve.label}: its rows turn back {times}: loading and unloading, cycles or several samples are fitted "
-            "as one curve, and the errors do not contain the differences between them: keep one of them, or give "
-            "each a separate file"
+            f"{curve.label}: its rows turn back {times} (unloading, cycles or several samples). All are fitted as one "
+            "curve, and the errors do not contain the differences between them: keep one of them, or give each a "
+            "separate file"
         )
     seen: dict[str, int] = {}
     for k, curve in enumerate(curves):
@@ -114,7 +115,7 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
 
 
 def _measured_rows(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
-    """The rows with a measured nominal stress, and the number of rows without one. If no row has one, all rows."""
+    """Return the rows with a measured nominal stress, and the number of other rows. If no row has one, return all."""
     name = next((key for key in rows[0] if key.startswith("nominal_stress")), None)
     kept = rows if name is None else [row for row in rows if row[name].lower() not in EMPTY]
     return (kept, len(rows) - len(kept)) if kept else (rows, 0)
@@ -126,7 +127,7 @@ def _row_under(names: list[str], cells: list[str], file: Path) -> dict[str, str]
             f"{file}: {len(cells)} cells under {len(names)} headings in {','.join(cells)[:60]!r}; write decimals with "
             "a point, and give every column a heading"
         )
-    return dict(zip(names, cells, strict=False))  # cells at the end may be missing; remarks may follow
+    return dict(zip(names, cells, strict=False))  # cells may be missing at the end, and remarks may follow the cells
 
 
 def _delimiter_of_curves(line: str) -> str:
@@ -135,13 +136,13 @@ def _delimiter_of_curves(line: str) -> str:
 
 
 def _documented(headings: list[str]) -> list[str]:
-    """The headings in their documented spelling, unless this would make two headings equal."""
+    """Return the headings in their documented spelling, unless this would make two headings equal."""
     plain = [_folded(name) for name in headings]
     return [own if own == name or plain.count(own) == 1 else name for name, own in zip(headings, plain, strict=True)]
 
 
 def _folded(name: str) -> str:
-    """The heading in its documented spelling: capital letters are lowered, and the unit [-] is removed."""
+    """Return a heading in its documented spelling: in small letters, and without the unit [-]."""
     plain = re.sub(r"\s*[\[(][-1][\])]$", "", name)
     if plain.lower() in ("test", "stretch", "shear"):
         return plain.lower()
@@ -154,7 +155,7 @@ def _names_curves(headings: list[str]) -> bool:
 
 
 def _with_point(cell: str, between: str, sign: str | None) -> str:
-    """A number in Python's notation. Any other text is returned unchanged."""
+    """Return a number in Python's notation. Any other text is returned unchanged."""
     value = to_number(cell, between, sign) if cell else None
     return cell if value is None else repr(value)
 
@@ -177,7 +178,8 @@ def _column(file: Path, rows: list[dict], name: str, default: float | None = Non
 
 
 def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str, float, bool] | None:
-    """Name of the stress column, its factor to Pa, and whether it names its unit."""
+    """Return the name of the stress column, its factor to Pa, and whether its heading names the unit. Returns None if
+    there is no such column."""
     for name in row:
         match = re.fullmatch(pattern + r"(?:[_ ]*[\[(]?(Pa|kPa|MPa)[\])]?)?", name)
         if match:
@@ -185,8 +187,8 @@ def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str,
     return None
 
 
-#: A stress component below this part of the largest component was not measured. Programs write roundoff in place of 0,
-#: some in single precision.
+#: A stress component below this fraction of the largest component was not measured. Programs write roundoff instead of
+#: 0, some of them in single precision.
 ROUNDOFF = 1e-5
 
 
@@ -212,9 +214,9 @@ def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], b
     if not measured:
         raise InputError(f"{file}: all stresses P11 … P33 are zero or missing: give the measured components")
     if any(2 in ij for ij in measured):
-        raise InputError(f"{file}: face 3 carries stress (P13 … P33): turn the axes so that it is free")
+        raise InputError(f"{file}: face 3 carries stress (P13 … P33): rotate the axes so that face 3 is free of stress")
     if np.abs(F[:, [0, 1, 2, 2], [2, 2, 0, 1]]).max() > 1e-9:
-        raise InputError(f"{file}: F13, F23, F31, F32 must be 0: turn the axes so that face 3 stays flat")
+        raise InputError(f"{file}: F13, F23, F31, F32 must be 0: rotate the axes so that face 3 stays flat")
     if (1, 1) in measured and (0, 0) in measured and np.allclose(measured[0, 0], measured[1, 1], rtol=1e-6):
         del measured[1, 1]  # one measurement, written twice
     kind = _kind(F)
@@ -239,20 +241,20 @@ def _kind(F: np.ndarray) -> str:
     return "general"
 
 
-#: If the smallest stretch of a test is this large, the test began far from rest. More likely the column contains
-#: strains in %.
+#: If the smallest stretch of a test is this large, the column probably contains strains in %, because a test begins
+#: near rest.
 STRAINED = 1.9
-#: If a shear is larger than this, it is more likely in %.
+#: A shear above this value is probably in %.
 SHEARED = 3.0
-#: The column more likely contains strains in % also in this case: a test exceeds `STRAINED`, and has a stretch below
-#: this value with a stress of the same sign.
+#: The column probably contains strains in % also if a test has a stretch above `STRAINED` and a stretch below this
+#: value, with stresses of the same sign.
 SHORTENED = 0.9
 
 
 def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], bool]:
     column = _stress_column(file, rows[0], "nominal_stress", unit)
     if column is None:
-        raise InputError(f"{file} has no column nominal_stress_Pa (or _kPa, _MPa): name the measured stress so")
+        raise InputError(f"{file} has no column nominal_stress_Pa (or _kPa, _MPa): rename the column of the stress")
     groups: dict[tuple, list[dict]] = {}
     at = _stretches_of_shear(rows)
     for row in rows:
@@ -282,8 +284,8 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         of_one_sign = np.prod(np.sign(ends)) >= 0
         if not shear and stretch.min() < SHORTENED and stretch.max() > STRAINED and of_one_sign:
             raise InputError(
-                f"{file}: stretches of {stretch.min():g} and {stretch.max():g} do not have opposite stresses: tension "
-                "does not shorten: a stretch is the length over the length at rest; write a strain of 2 % as 1.02"
+                f"{file}: stretches of {stretch.min():g} and {stretch.max():g} do not have opposite stresses, although "
+                "one is below 1. A stretch is the length over the length at rest: write a strain of 2 % as 1.02"
             )
         F = np.asarray(homogeneous.deformation_gradient(test, driven, stretch))
         label = f"{file.stem}, {test.replace('_', ' ')}" + (f" at {fixed}" if shear and fixed not in ("", "1") else "")
@@ -292,13 +294,13 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
     return curves, column[2]
 
 
-#: Stretches of sheared samples that differ by less than this are the same stretch, measured again in each row.
+#: Stretches of a sheared sample that differ by less than this count as one stretch, measured again in each row.
 SAME_STRETCH = 0.01
 
 
 def _stretch_of_shear(row: dict[str, str]) -> float:
-    """The stretch at which a sample is sheared; NaN if the cell is not a number. The reader of the column refuses such
-    a cell later."""
+    """Return the stretch at which a sample is sheared, or NaN if the cell is not a number. `_column` raises the error
+    for such a cell later."""
     try:
         return float(row.get("stretch") or 1.0)
     except ValueError:
@@ -306,7 +308,7 @@ def _stretch_of_shear(row: dict[str, str]) -> float:
 
 
 def _stretches_of_shear(rows: list[dict[str, str]]) -> dict[float, str]:
-    """For each stretch in the rows of sheared samples: the rounded stretch of its sample, as text."""
+    """Return for each stretch in the rows of sheared samples the rounded stretch of its sample, as text."""
     own = {_stretch_of_shear(row) for row in rows if row["test"] == "simple_shear"}
     values = np.array(sorted(v for v in own if np.isfinite(v)))
     parts = np.split(values, np.flatnonzero(np.diff(values) >= SAME_STRETCH) + 1)
@@ -317,7 +319,7 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
     J = np.linalg.det(F)
     worst = int(np.argmax(np.abs(J - 1)))
     if abs(J[worst] - 1) > 1e-3:
-        raise InputError(f"{file}: det F = {J[worst]:.4g} in row {worst + 1}: volume must be kept (det F = 1)")
+        raise InputError(f"{file}: det F = {J[worst]:.4g} in row {worst + 1}: the volume must not change (det F = 1)")
     if len(stress) < 3:
         raise InputError(f"{file}: {label} has {len(stress)} points: give at least 3")
     rms = np.sqrt(np.mean(stress**2))
@@ -325,7 +327,7 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
         raise InputError(f"{file}: {label} has a mean stress of {rms:g} Pa: give measured stresses")
     if np.ptp(F, axis=0).max() == 0:
         raise InputError(f"{file}: {label} has the same deformation in every row: give a curve")
-    # The digits of F are rounded: F33 is scaled so that det F = 1.
+    # The digits of F in the file are rounded, so F33 is scaled to make det F = 1.
     F = F.copy()
     F[:, 2, 2] /= J
     driven = Curve(label, test, F, component, stress).driven
@@ -333,17 +335,17 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
     return Curve(label, test, F[order], component, stress[order], _returns(driven, F.reshape(len(F), 9)))
 
 
-#: A curve turns if it goes back by more than this part of its range.
+#: A curve turns back if it goes back by more than this fraction of its range.
 _TURN = 0.05
 
 
 def _returns(driven: np.ndarray, F: np.ndarray) -> int:
-    """How often the rows turn back and pass again through deformations that they have passed before.
+    """Return how often the rows turn back and repeat earlier deformations.
 
     Args:
         driven: (n,) the component of the deformation that the test changes.
-        F: (n, 9) all components. Rows with other deformations at the same `driven`, as in biaxial tests with several
-            ratios of the stretches, do not pass through the same again.
+        F: (n, 9) all components. Rows with the same `driven` but other components do not count as a repetition, for
+            example in biaxial tests with several stretch ratios.
     """
     turns, low, high, least = [0], 0, 0, _TURN * np.ptp(driven)
     rises: bool | None = None
@@ -364,7 +366,8 @@ def _returns(driven: np.ndarray, F: np.ndarray) -> int:
 
 
 def _same_again(driven: np.ndarray, F: np.ndarray, before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether the rows `after` have the deformations of the rows `before` over a range, both with rising `driven`."""
+    """Return whether the rows `after` repeat the deformations of the rows `before` over a range. Both are sorted by
+    `driven`."""
     low, high = max(driven[before[0]], driven[after[0]]), min(driven[before[-1]], driven[after[-1]])
     if not high - low > 2 * _TURN * np.ptp(driven):
         return False

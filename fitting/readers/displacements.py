@@ -1,4 +1,4 @@
-"""Measured displacements of points of a body, read from CSV; and the displacements of a simulation at these points."""
+"""Read measured displacements of points of a body from CSV, and compute the simulated displacements of these points."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -14,10 +14,10 @@ from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.scenes.scene import Scene
 
-#: A point farther from the mesh than this does not belong to the body (in sizes of the nearest element).
+#: A point farther from the mesh than this does not belong to the body (unit: size of the nearest element).
 _FAR = 2.0
-#: A coarse surface of the mesh may leave points outside by more than _OUTSIDE element sizes, but at most this part of
-#: all points.
+#: Points near a coarse surface may lie outside of the mesh by more than _OUTSIDE element sizes, but not more than the
+#: fraction _MOST_OUTSIDE of all points.
 _OUTSIDE, _MOST_OUTSIDE = 0.25, 0.2
 #: A value above this many sizes of the body cannot be a displacement.
 _LONGEST = 2.0
@@ -29,7 +29,7 @@ class Displacements(NamedTuple):
 
     step: np.ndarray  # (n,) index of the step, from 0
     nodes: np.ndarray  # (n, 4) nodes of the element at the point; (n, 10) if quadratic
-    weights: np.ndarray  # shape functions of these nodes at the point
+    weights: np.ndarray  # values of the shape functions of these nodes at the point
     measured: np.ndarray  # (n, 3) [m]; 0 where not measured
     sd: np.ndarray  # (n, 3) [m] standard deviation of the noise; infinite where not measured
 
@@ -40,7 +40,7 @@ class Displacements(NamedTuple):
 
 
 def read_displacements(path: str | Path, scene: Scene, noise: float | None = None, unit: str = "m") -> Displacements:
-    """Displacements of a CSV file with a header.
+    """Read displacements from a CSV file with a header.
 
     The columns are: ``node`` (index of the node), or ``x, y, z`` (position at rest); ``ux, uy, uz`` (empty if not
     measured); ``time`` [s], if the scene has time steps (default: the last step); ``sd``, the standard deviation of the
@@ -50,7 +50,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
         path: CSV file.
         scene: the scene whose simulation is compared with the displacements.
         noise: standard deviation [m] if the file has no ``sd``.
-        unit: of all lengths in the file, one of `liverjax.mesh.tetrahedra.UNITS`.
+        unit: unit of all lengths in the file, one of `liverjax.mesh.tetrahedra.UNITS`.
 
     Raises:
         InputError: the file cannot be read, a column is unknown or missing, a value is not finite, a node or point is
@@ -74,7 +74,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
         row, axis = wild[0]
         raise InputError(
             f"{path}: row {row + 1}: u{'xyz'[axis]} = {measured[row, axis]:g} m in a body of {size:.3g} m: give "
-            "--unit, or leave empty what was not measured"
+            "--unit, or leave the cell empty if the displacement was not measured"
         )
     if "sd" in table:
         sd = scale * table["sd"]
@@ -100,8 +100,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     )
 
 
-#: If at least this many points lie within this part of the body's size, their positions have another unit than the
-#: body.
+#: If _SOME points or more all lie within _TOGETHER times the size of the body, their positions are in another unit.
 _SOME, _TOGETHER = 8, 0.01
 
 
@@ -110,13 +109,13 @@ def _refuse_other_places(path: Path, places: np.ndarray, size: float, unit: str)
     if len(np.unique(places, axis=0)) >= _SOME and across < _TOGETHER * size:
         raise InputError(
             f"{path}: all points lie within {across:.2g} m of each other, in a body of {size:.3g} m: --unit {unit} is "
-            "for x, y, z and ux, uy, uz alike; write all of them in one unit"
+            "for x, y, z and ux, uy, uz; write all of them in one unit"
         )
 
 
 def _no_copies(path: Path, table: dict[str, np.ndarray]) -> None:
-    """Refuse a table that is written twice: each row would count as a measurement. A few rows may be equal by
-    rounding."""
+    """Raise an error if the file has the same table twice, because each row counts as a measurement. A few rows may be
+    equal because of rounding."""
     rows = np.nan_to_num(np.column_stack(list(table.values())), nan=np.inf)
     _, first, of = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     again = np.flatnonzero(first[of.ravel()] != np.arange(len(rows)))
@@ -129,7 +128,7 @@ def _no_copies(path: Path, table: dict[str, np.ndarray]) -> None:
 
 
 def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
-    """Columns by name; an empty cell is NaN. The header may be a comment, as in files of `numpy.savetxt`."""
+    """Return the columns by name. An empty cell is NaN. The header may be a comment, as in files of `numpy.savetxt`."""
     lines = [line for line in text_of(path, "displacements").splitlines() if line.strip(" \t#;,")]
     if not lines:
         raise InputError(f"{path} is empty: give a CSV with columns x,y,z,ux,uy,uz")
@@ -154,8 +153,8 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
 
 
 def _rows_of_numbers(path: Path, names: list[str], rows: list[list[str]], between: str) -> np.ndarray:
-    """The numbers (n, columns). A cell that is neither empty nor a number is refused: otherwise it would count as not
-    measured."""
+    """Return the numbers (n, columns). Raise an error for a cell that is neither empty nor a number, because it would
+    count as not measured."""
     sign, values = decimal_sign(cell for row in rows[:1000] for cell in row), np.full((len(rows), len(names)), np.nan)
     for k, row in enumerate(rows):
         if len(row) > len(names):
@@ -182,7 +181,7 @@ def _at_nodes(path: Path, mesh: TetMesh, node: np.ndarray) -> tuple[np.ndarray, 
 
 def _measured_at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not np.all(np.isfinite(points)):
-        raise InputError(f"{path}: a place x,y,z is not finite: give the position at rest of every point")
+        raise InputError(f"{path}: a position x,y,z is not finite: give the position at rest of every point")
     nodes, weights, outside = locate(mesh, points)
     if np.any(outside > _FAR):
         bad = int(np.argmax(outside))
@@ -192,18 +191,18 @@ def _measured_at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[
     off = int(np.sum(outside > _OUTSIDE))
     if off > _MOST_OUTSIDE * len(points):
         raise InputError(
-            f"{path}: {off} of {len(points)} points lie outside of the mesh, up to {outside.max():.2g} elements: look "
-            "at the axes, the origin and --unit"
+            f"{path}: {off} of {len(points)} points lie outside of the mesh, by up to {outside.max():.2g} element "
+            "sizes: check the axes, the origin and --unit"
         )
     return nodes, weights
 
 
 def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The element that contains each point, or is nearest to it: its nodes, the values of their shape functions at the
-    point, and the distance.
+    """Find the element that contains each point, or the nearest element.
 
-    Returns nodes (n, 4) and barycentric coordinates (n, 4); for quadratic elements, nodes (n, 10) and their shape
-    functions (n, 10). The distance (n,) from point to element is in sizes of the element. It runs on the host.
+    Returns the nodes (n, 4) of this element, the barycentric coordinates (n, 4) of the point, and the distance (n,)
+    from point to element in element sizes. For quadratic elements, the first two are the nodes (n, 10) and the values
+    (n, 10) of their shape functions. The function runs on the host.
     """
     X, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     candidates = min(candidates, len(tets))
@@ -241,12 +240,12 @@ def _steps(path: Path, scene: Scene, time: np.ndarray | None, n: int) -> np.ndar
 
 
 def predicted(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
-    """Displacements (n, 3) [m] of the points, from the node positions (T, V, 3) of a run."""
+    """Return the simulated displacements (n, 3) [m] of the points, from the node positions (T, V, 3) [m] of a run."""
     corner = positions[data.step[:, None], data.nodes] - scene.mesh.points[data.nodes]
     return jnp.sum(data.weights[..., None] * corner, axis=1)
 
 
 def weighted_differences(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
-    """Predicted minus measured displacements, divided by the standard deviation of the noise, as a flat array (3 n,). A
-    component that was not measured is 0."""
+    """Return predicted minus measured displacements, divided by the standard deviation of the noise, as a flat array (3
+    n,). A component that was not measured is 0."""
     return ((predicted(data, scene, positions) - data.measured) / data.sd).ravel()

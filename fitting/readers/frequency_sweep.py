@@ -1,4 +1,4 @@
-"""A measured frequency sweep, and the parts of it that can be used."""
+"""A measured frequency sweep: data, scales of the residuals, and selection of the usable points."""
 
 import math
 from functools import lru_cache
@@ -10,10 +10,10 @@ from fitting.readers import raw_torque
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Minimum number of frequencies that must remain if points are left out: a fit of one mode needs them.
+#: Minimum number of frequencies that must remain if points are left out. A fit of one mode needs this number.
 FEWEST = 3
-#: Standard deviations show the spread between samples, not noise, if they exceed LARGE times the moduli and also SHARED
-#: times the scatter of the points. Noise of this size would make the points scatter as much.
+#: Given standard deviations are the spread between samples, not noise, if they exceed LARGE times the moduli and also
+#: SHARED times the scatter of the points. If they were noise, the points would scatter as much.
 SHARED, LARGE = 3.0, 0.1
 
 
@@ -26,21 +26,21 @@ class Sweep(NamedTuple):
     storage_sd: np.ndarray | None = None  # (n,) standard deviations [Pa]
     loss_sd: np.ndarray | None = None
     source: str = ""
-    notes: tuple[str, ...] = ()  # sentences about changes and choices of the reader
+    notes: tuple[str, ...] = ()  # notes on changes and choices of the reader
     raw: dict[str, np.ndarray] | None = None  # (n,) raw torque [N m], angle [rad], phase [rad], if in the file
     inertia: np.ndarray | None = (
-        None  # (n,) [Pa] that the instrument subtracted for its inertia, if raw columns show it
+        None  # (n,) [Pa] contribution of the instrument's inertia, already subtracted; None if unknown
     )
     friction: np.ndarray | None = None  # (n,) [Pa] change of G'' by one standard deviation of the bearing's friction
-    friction_error: float = 0.0  # this standard deviation [N m s]
-    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out: the instrument dominates
+    friction_error: float = 0.0  # standard deviation of the bearing's friction [N m s]
+    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out because the instrument dominates
     sd_estimated: bool = False  # the deviations are only weights, from the scatter of the points
-    sd_before: bool = False  # they are only weights, from the moduli before a correction
+    sd_before: bool = False  # the deviations are only weights, from the moduli before a correction
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Scales of the residuals [Pa]: the given standard deviations, or else smooth curves through the moduli
-        (relative errors).
+        """Scales [Pa] of the residuals of G' and G'': the given standard deviations, or else smooth curves through the
+        moduli (the residuals are then relative).
 
         Standard deviations that were estimated from few repeats are smoothed.
         """
@@ -65,7 +65,7 @@ class Sweep(NamedTuple):
 
     @property
     def point_scatter(self) -> float:
-        """Relative distance of the points from a smooth curve; infinite if there are too few points."""
+        """Relative scatter of the points about a smooth curve; infinite if there are too few points."""
         omega, *columns = merged(self.angular_frequency, self.storage, self.loss)
         return max(scatter(omega, column) for column in columns)
 
@@ -76,11 +76,10 @@ class Sweep(NamedTuple):
 
 
 def check_sweep(sweep: Sweep) -> None:
-    """Refuse a sweep with invalid values. This check is for sweeps made in Python: the readers of files refuse such
-    values themselves, with line and column.
+    """Check the values of a sweep that was made in Python. The file readers have separate checks, with line and column.
 
     Raises:
-        InputError: one sentence with the field, its value and the remedy.
+        InputError: a value is invalid; the message names the field, the value and the remedy.
     """
     name, first = sweep.source or "sweep", np.shape(sweep.angular_frequency)
     fields = {key: getattr(sweep, key) for key in ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")}
@@ -102,12 +101,12 @@ def check_sweep(sweep: Sweep) -> None:
 
 
 #: Numbers of neighbouring points that are compared with a polynomial. With more neighbours the degree is higher, and
-#: the shape of the curve adds less to the scatter.
+#: the curvature of the data adds less to the scatter.
 NEIGHBOURS = (4, 5, 6)
 
 
 def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
-    """Robust relative standard deviation of the points about a smooth curve: the smallest value over several
+    """Return the robust relative standard deviation of the points about a smooth curve: the smallest value for several
     polynomials.
 
     Four neighbours are compared with a parabola, five with a cubic, six with a quartic. If there are few points per
@@ -124,13 +123,14 @@ def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
 
 
 def distance_from_smooth(x: np.ndarray, y: np.ndarray) -> float:
-    """Robust standard deviation of y (n,) about a smooth curve over x (n,), ascending; n is 6 or more."""
+    """Return the robust standard deviation of y (n,) about a smooth curve over x (n,), ascending; n is 6 or more."""
     left = (distances_from_polynomials(x, y, m) for m in NEIGHBOURS if len(x) >= m + 2)
     return min(float(np.median(np.abs(each)) / 0.6745) for each in left)
 
 
 def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarray:
-    """Distances of y (n,) from the polynomials of degree m - 2 through m neighbours, scaled to unit variance."""
+    """Return the distances of y (n,) from polynomials of degree m - 2 through m neighbours. They are scaled so that
+    their variance is that of the noise."""
     left = []
     for k in range(len(x) - m + 1):
         own = x[k : k + m] - x[k]
@@ -148,19 +148,19 @@ _FAR, _DEVIATIONS = 0.4, 5.0
 
 
 def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A smooth curve through positive values y (n,) over positive x (n,), for example moduli over frequencies. It is a
-    spline of the logarithms, smoothed by cross-validation. At a value far above the curve, the result is this value.
+    """Return a smooth curve through positive values y (n,) over positive x (n,), for example moduli over frequencies.
 
-    The curve is the scale of relative errors. If the measured values were the scale, a point that is low by chance
-    would have more weight than a point that is high. The fit would be too low by twice the square of the relative
-    noise. A point that is far too high by mistake has its own value as scale, so that it does not dominate the fit.
+    The curve is a spline of the logarithms, smoothed by cross-validation. It is the scale of relative errors. If the
+    measured values were the scale, a point that is low by chance would have more weight than a point that is high. The
+    fit would then be too low by twice the square of the relative noise. A value far above the curve is returned as it
+    is, so that this wrong point does not dominate the fit.
     """
     return _curve_of_bytes(np.asarray(x, float).tobytes(), np.asarray(y, float).tobytes())
 
 
 @lru_cache(maxsize=64)  # a fit asks for the weights of the same sweep again and again
 def _curve_of_bytes(*columns: bytes) -> np.ndarray:
-    """`smooth_curve` of the bytes of its columns."""
+    """Compute `smooth_curve` from the bytes of its columns."""
     from scipy.interpolate import make_smoothing_spline
 
     x, y = (np.frombuffer(column) for column in columns)
@@ -172,13 +172,13 @@ def _curve_of_bytes(*columns: bytes) -> np.ndarray:
     curve = make_smoothing_spline(at[kept], values[kept], counts[kept])(np.log(x))
     off = np.log(y) - curve
     scale = np.where(off > max(_FAR, _DEVIATIONS * 1.4826 * float(np.median(np.abs(off)))), y, np.exp(curve))
-    scale.setflags(write=False)  # the next caller gets the same array
+    scale.setflags(write=False)  # the cache gives the same array to the next caller
     return scale
 
 
 def _cells_along(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means of points (n,) in cells along x, in ascending order, and the number of points in each cell. Neighbouring
-    points on two sides of a cell border are merged."""
+    """Return the means of points (n,) in cells along x, in ascending order, and the number of points in each cell.
+    Neighbouring points on the two sides of a cell border are merged."""
     near = max(_NEAR, float(np.ptp(x)) / _MOST)
     cell = np.round(x / near)
     for _ in range(2):
@@ -190,7 +190,7 @@ def _cells_along(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _far_from_neighbours(y: np.ndarray) -> np.ndarray:
-    """For each logarithm (n,): whether it is far from the median of the five values around it."""
+    """Return for each logarithm (n,) whether it is far from the median of the five values around it."""
     from scipy.ndimage import median_filter
 
     off = np.abs(y - median_filter(y, size=5, mode="nearest"))
@@ -198,15 +198,15 @@ def _far_from_neighbours(y: np.ndarray) -> np.ndarray:
 
 
 #: Standard deviations come from few repeats if ln(deviation / modulus) scatters about a smooth curve by more than
-#: _FEW_REPEATS. Five repeats give a scatter of 0.4, three repeats 0.64. Then follow the minimum number of points, and
-#: the degree of the polynomial that replaces such deviations.
+#: _FEW_REPEATS. Five repeats give a scatter of 0.4, three repeats 0.64. With _POINTS points or more, a polynomial of
+#: degree _DEGREE replaces such deviations.
 _FEW_REPEATS, _POINTS, _DEGREE = 0.25, 8, 2
-#: If ln(deviation / modulus) varies by less than this, the deviations were computed as one percentage of the moduli.
+#: If ln(deviation / modulus) varies by less than this, the deviations are a fixed percentage of the moduli.
 _ROUNDED = 0.01
 
 
 def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Standard deviations (n,) that change smoothly with the frequency, if the given ones scatter from point to point.
+    """Return smooth standard deviations (n,) over the frequency, if the given ones scatter from point to point.
 
     A standard deviation from three repeats may be wrong by a factor of two and more. Points whose standard deviation is
     small by chance would have most of the weight, and the errors of the fit would be too small.
@@ -216,7 +216,7 @@ def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) ->
 
 @lru_cache(maxsize=64)  # a fit asks for the weights of the same sweep again and again
 def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
-    """`smooth_deviations` of the bytes of its columns."""
+    """Compute `smooth_deviations` from the bytes of its columns."""
     omega, modulus, sd = (np.frombuffer(column) for column in columns)
     x, part, curve = np.log(omega), np.log(sd / modulus), smooth_curve(omega, modulus)
     # Standard deviations in percent of the measured moduli contain the noise of the moduli. So they are computed as
@@ -229,18 +229,18 @@ def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     if off < _FEW_REPEATS:
         return sd * curve / modulus if off < 0.5 * distance_from_smooth(x, np.log(sd)) else sd
     smooth = curve * np.exp(np.polyval(np.polyfit(x - x.mean(), part, _DEGREE), x - x.mean()))
-    return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # the squares of the deviations are right on average
+    return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # keeps the mean square of the ratio
 
 
 def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
-    """One point per frequency: points with the same frequency are averaged."""
+    """Return one point per frequency: points with the same frequency are averaged."""
     different, place = np.unique(omega, return_inverse=True)
     count = np.bincount(place)
     return different, *(np.bincount(place, column) / count for column in columns)
 
 
 def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
-    """The points from `low` to `high` [Hz]. A note tells how many points are left out.
+    """Return the points from `low` to `high` [Hz]. A note reports how many points are left out.
 
     Raises:
         InputError: fewer than `FEWEST` frequencies are left.
@@ -268,7 +268,7 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
 
 
 def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
-    """The points where `kept` (n,) is true."""
+    """Return the points where `kept` (n,) is true."""
     names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd", "inertia", "friction")
     columns: Content = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
     raw = None if sweep.raw is None else {q: v[kept] for q, v in sweep.raw.items()}
@@ -276,17 +276,18 @@ def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
 
 
 def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> Sweep:
-    """The sweep with the standard deviation `error` [N m s] of the friction of the instrument's bearing. `radius` and
-    `height` of the sample are in m."""
+    """Return the sweep with the effect of bearing friction. `error` [N m s] is the standard deviation of the friction
+    of the instrument's bearing; `radius` and `height` of the sample are in m."""
     geometry = np.pi * radius**4 / (2 * height)
     return sweep._replace(friction=error * sweep.angular_frequency / geometry, friction_error=error)
 
 
 def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
-    """The points whose modulus exceeds the uncertain part of the instrument's inertia. The other points become `grey`.
+    """Return the points whose modulus exceeds the uncertainty of the instrument's inertia. The other points become
+    `grey`.
 
-    This needs the raw phase; or raw torque and angle, together with the torque of the sample or its radius and height
-    [m].
+    The inertia is found from the raw phase. Without it, raw torque and angle are needed, and the torque of the sample
+    or its `radius` and `height` [m].
     """
     raw = sweep.raw
     if not raw or not set(raw_torque.COLUMNS) & set(raw):
@@ -298,7 +299,7 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     if found is None and "phase" in raw:
         found = raw_torque.share_by_phase(omega, G, {"phase": -raw["phase"]})
         if found is not None:
-            sign = "the raw phases fit the moduli with the other sign, as lags of the angle: their sign is turned"
+            sign = "the raw phases fit the moduli with the other sign (lags of the angle): their sign is changed"
             sweep = sweep._replace(notes=(*sweep.notes, sign))
     if found is None:
         if {"torque", "angle"} <= set(raw) and geometry is None:
@@ -319,7 +320,10 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
             f" ({empty} of {len(G)} points have an empty cell in the raw columns: for them, the inertia of the other "
             "points is used)"
         )
-    note = f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz it needs {times:.3g} times the torque of the sample"
+    note = (
+        f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz, the inertia needs {times:.3g} times the torque of the "
+        "sample"
+    )
     if not lost.any():
         return sweep._replace(notes=(*sweep.notes, note))
     if len(np.unique(sweep.angular_frequency[~lost])) < FEWEST:
@@ -328,9 +332,9 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
             "frequencies"
         )
     lowest = sweep.angular_frequency[lost].min() / (2 * np.pi)
-    share = f"{100 * raw_torque.UNCERTAINTY:g} % of the inertia, which calibrations leave open"
+    share = f"{100 * raw_torque.UNCERTAINTY:g} % of the torque of the inertia (the uncertainty)"
     left = (
-        f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are left out: the sample carries less than {share}"
+        f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are left out: the sample's torque is below {share}"
     )
     grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
     return some(sweep, ~lost)._replace(notes=(*sweep.notes, note, left), grey=grey)

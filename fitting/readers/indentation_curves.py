@@ -1,4 +1,4 @@
-"""Indentation curves from files: depth and force while the indenter moves in."""
+"""Read indentation curves from files: depth and force while the indenter moves in."""
 
 import re
 from pathlib import Path
@@ -24,20 +24,21 @@ _WORDS = {
     "depth": ("indentation", "eindringtiefe", "enfoncement", "depth", "tiefe", "profondeur", "displacement", "weg"),
     "force": ("force", "kraft", "load", "normal force"),
 }
-#: Words of headings that mean something else, for example a speed or an error.
+#: A heading with one of these words means something else, for example a speed or an error.
 _NOT = {"rate", "velocity", "speed", "sd", "std", "error", "modulus"}
 #: A value above this, in SI units, cannot be a measurement.
 _LARGEST = 1e30
 _FEWEST = 6
-#: A loading ends when the indenter goes back by the part _BACK of the depth range. A hold at its end is cut if it has
-#: more than the part _HELD of the points.
+#: A loading ends when the indenter moves back by more than _BACK times the depth range. A hold at the end of the
+#: loading is cut if it contains more than _HELD times all points.
 _BACK, _HELD = 0.1, 0.15
-#: An offset is subtracted only if the noise is too small to hide a rise by this part of the largest force.
+#: An offset of the force is subtracted only if the noise is too small to hide a rise by this fraction of the largest
+#: force.
 _FLAT = 0.01
 
 
 class IndentationCurve(NamedTuple):
-    """The measured approach of an indenter."""
+    """The measured loading of an indentation test."""
 
     depth: np.ndarray  # (n,) [m] of the indenter, from any origin; it grows as the indenter moves in
     force: np.ndarray  # (n,) [N]
@@ -54,7 +55,7 @@ def read_indentation(path: str | Path) -> IndentationCurve:
             their units, for example `depth_um,force_mN`. Units are m, mm, um, nm and N, mN, uN, nN, pN.
 
     Raises:
-        InputError: one sentence with the file, the column or line, the value and the remedy.
+        InputError: the file cannot be used; the message names the column or line, the value and the remedy.
     """
     lines = text_of(Path(path), "an indentation curve").splitlines()
     head = next((k for k, line in enumerate(lines) if len(_depth_and_force(lines, k)) == 2), None)
@@ -73,9 +74,9 @@ def read_indentation(path: str | Path) -> IndentationCurve:
     if last < _FEWEST or np.ptp(depth[:last]) == 0:
         falls = len(depth) >= _FEWEST and np.argmax(depth) < len(depth) / 10 and depth[-1] < depth[0]
         pulls = len(force) >= _FEWEST and np.mean(force) < 0 and np.argmin(force) > len(force) / 2
-        remedy = "the depth falls: it must grow further in, so change its sign" if falls else "give more of them"
-        remedy = "the force falls while the depth grows: change its sign" if pulls and not falls else remedy
-        remedy = "the force is the same in all rows: is this the right column?" if np.ptp(force) == 0 else remedy
+        remedy = "the depth falls during loading, so change its sign" if falls else "give more of them"
+        remedy = "the force falls while the depth grows, so change its sign" if pulls and not falls else remedy
+        remedy = "the force is the same in all rows; is this the right column?" if np.ptp(force) == 0 else remedy
         raise InputError(f"{path}: {last} loading points; a fit needs {_FEWEST} or more, at different depths: {remedy}")
     depth, force = depth[:last], force[:last]
     offset = _offset(force)
@@ -85,12 +86,12 @@ def read_indentation(path: str | Path) -> IndentationCurve:
 
 
 def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str]]:
-    """Number of points of the first loading, without a hold at its end; and notes."""
+    """Return the number of points of the first loading, without a hold at its end; and notes."""
     number, notes = len(depth), []
     back = np.maximum.accumulate(depth) - depth > _BACK * np.ptp(depth)
     end = int(np.argmax(back)) if back.any() else number
     last = int(np.argmax(depth[:end])) + 1
-    # After it has gone back, the indenter moves in again, by more than the part that ends a loading.
+    # Several loadings: after moving back, the indenter moves in again by more than _BACK times the depth range.
     after = depth[end:]
     if len(after) and np.max(after - np.minimum.accumulate(after)) > _BACK * np.ptp(depth):
         notes.append("the file has several loadings: the first is fitted")
@@ -104,9 +105,10 @@ def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str
 
 
 def _offset(force: np.ndarray) -> float:
-    """Mean force [N] of the first points, if the next points have the same mean: then the indenter does not touch yet.
+    """Return the mean force [N] of the first points if the indenter does not touch yet: the next points have the same
+    mean.
 
-    The result is 0 if the noise could hide a rise of the force, or if noise alone explains this mean.
+    Returns 0 otherwise, and also if the noise could hide a rise of the force, or if noise alone explains this mean.
     """
     few = max(3, len(force) // 20)
     first, after = float(np.mean(force[:few])), float(np.mean(force[few : 2 * few]))
@@ -116,10 +118,10 @@ def _offset(force: np.ndarray) -> float:
 
 
 def _points_of_hold(values: np.ndarray) -> int:
-    """Number of points at the end at which depth or force stays at its largest value; 0 if it still rises there.
+    """Return the number of points at the end at which depth or force stays at its largest value; 0 if it still rises.
 
-    By noise, a rising quantity comes near its largest value long before the end. So the rise within these points must
-    be below half of the rise before them, by more than noise explains.
+    Because of noise, a rising quantity comes near its largest value long before the end. So these points are a hold
+    only if the rise within them is below half of the rise before them, by more than noise explains.
     """
     reached = int(np.argmax(values >= np.max(values) - _margin(values))) + 1
     held = len(values) - reached
@@ -129,17 +131,18 @@ def _points_of_hold(values: np.ndarray) -> int:
     if half < 2:  # the largest value is at the beginning
         return held
     before, within = (np.diff(part.reshape(2, half).mean(axis=1))[0] for part in _both_sides(values, reached, half))
-    noise = noise_of_series(values) * np.sqrt(2 / half)  # of a difference of two means
+    noise = noise_of_series(values) * np.sqrt(2 / half)  # noise of a difference of two means
     return held if within < 0.5 * before - 2 * noise else 0
 
 
 def _both_sides(values: np.ndarray, reached: int, half: int) -> tuple[np.ndarray, np.ndarray]:
-    """The last 2 `half` values until `reached`, and the last ones of all."""
+    """Return the last 2 `half` values before the index `reached`, and the last 2 `half` values of all."""
     return values[reached - 2 * half : reached], values[len(values) - 2 * half :]
 
 
 def _margin(values: np.ndarray) -> float:
-    """A quantity counts as held within this distance of its largest value: twice its noise, plus 0.5 % of its range."""
+    """Return the distance from its largest value within which a quantity counts as constant: twice its noise, plus 0.5
+    % of its range."""
     return 2 * noise_of_series(values) + 0.005 * float(np.ptp(values))
 
 
@@ -152,7 +155,7 @@ class _PlacedColumn(NamedTuple):
 
 
 def _depth_and_force(lines: list[str], head: int) -> dict[str, _PlacedColumn]:
-    """The column of each quantity that line `head` names. The unit is in the heading or in the line below."""
+    """Return the column of each quantity that line `head` names. The unit is in the heading or in the line below."""
     cells = split_cells(lines[head], find_delimiter(lines[head]))
     below = split_cells(lines[head + 1], find_delimiter(lines[head])) if head + 1 < len(lines) else []
     found = {}
@@ -164,7 +167,8 @@ def _depth_and_force(lines: list[str], head: int) -> dict[str, _PlacedColumn]:
 
 
 def _places(cells: list[str], below: list[str], quantity: str) -> list[_PlacedColumn]:
-    """Columns of a quantity, best first. Their heading begins with one of the words of the quantity and has a unit."""
+    """Return the columns of a quantity, best first. Their headings begin with a word of the quantity and have a
+    unit."""
     found, units = [], INDENTATION_UNITS[quantity]
     for j, cell in enumerate(cells):
         words = [w for w in re.split(r"[\s_()\[\]#\"/,]+", cell) if w]
@@ -178,7 +182,7 @@ def _places(cells: list[str], below: list[str], quantity: str) -> list[_PlacedCo
 
 
 def _told_of_others(lines: list[str], head: int, found: dict[str, _PlacedColumn]) -> list[str]:
-    """A note for each quantity that several columns name."""
+    """Return a note for each quantity that has several columns."""
     cells = split_cells(lines[head], find_delimiter(lines[head]))
     below = split_cells(lines[head + 1], find_delimiter(lines[head])) if head + 1 < len(lines) else []
     notes = []
@@ -192,7 +196,7 @@ def _told_of_others(lines: list[str], head: int, found: dict[str, _PlacedColumn]
 def _in_si_units(
     path: str, lines: list[str], head: int, delimiter: str, found: dict[str, _PlacedColumn]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns in SI units; and a note on the rows that are left out because of an empty cell."""
+    """Return the columns in SI units, and a note on rows that are left out because of an empty cell."""
     numbered = [(k, line) for k, line in enumerate(lines[head + 1 :], head + 2) if line.strip(f"{delimiter} \t")]
     rows = [(k, split_cells(line, delimiter)) for k, line in numbered if not line.lstrip().startswith("#")]
     if rows and means_nothing(rows[0][1][p.column] for p in found.values() if p.column < len(rows[0][1])):

@@ -4,10 +4,10 @@ import numpy as np
 
 
 def noise_of_series(values: np.ndarray) -> float:
-    """Standard deviation of independent noise on a smooth series (n,), from third differences; 0 for fewer than four
-    values.
+    """Estimate the standard deviation of independent noise in a smooth series (n,) from its third differences. Returns
+    0 for fewer than four values.
 
-    A third difference has 20 times the variance of the noise. A few jumps hardly change the median.
+    A third difference has 20 times the variance of the noise. The median is used, because a few jumps hardly change it.
     """
     steps = np.abs(np.diff(values, 3))
     return float(np.median(steps)) / 0.6745 / np.sqrt(20) if len(steps) else 0.0

@@ -1,9 +1,9 @@
-"""Effect of the instrument's inertia on a sweep. It is computed from raw columns (torque, angle, phase) that some
-exports have.
+"""Compute the effect of the instrument's inertia on a sweep. The raw columns (torque, angle, phase) of some exports
+show this effect.
 
-Raw torque M and angle theta obey M e^(i phase) = (K G* - I omega^2) theta, with the geometry factor K and the inertia I
-that the software has subtracted. I omega^2 / K is the share of the inertia in the modulus. It is known up to the
-relative error `UNCERTAINTY`.
+Raw torque M and angle theta obey M e^(i phase) = (K G* - I omega^2) theta. K is the geometry factor. I is the inertia
+of the instrument, whose effect the software has already subtracted from the moduli. I omega^2 / K [Pa] is the
+contribution of the inertia to the modulus, with the relative error `UNCERTAINTY`.
 """
 
 import re
@@ -16,8 +16,8 @@ from fitting.readers.units import RAW_TORQUE_UNITS
 
 #: Relative standard deviation of an instrument's inertia: the scatter between repeated calibrations of one instrument.
 UNCERTAINTY = 0.03
-#: First words of a heading, and its quantity. If several headings name one quantity, the heading that comes first in
-#: this list is used.
+#: First words of a heading, and the quantity that they mean. If several columns have the same quantity, the column
+#: whose words come first in this list is used.
 HEADINGS = (
     ("oscillation torque (sample)", "sample_torque"),
     ("oscillation torque", "torque"),
@@ -40,12 +40,12 @@ HEADINGS = (
 class SampleShare(NamedTuple):
     """The inertia of the instrument, and the size of its contribution to the modulus."""
 
-    inertia: float  # I [N m s^2]; NaN if K is not known
+    inertia: float  # I [N m s^2]; NaN if K is unknown
     modulus: np.ndarray  # (n,) I omega^2 / K [Pa]
 
 
 def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float]]:
-    """For each quantity with a known heading and a known unit: the index of its column and its factor to SI.
+    """Return column index and factor to SI for each quantity that has a known heading and a known unit.
 
     Args:
         cells: headings.
@@ -55,16 +55,16 @@ def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, fl
 
 
 def unit_of(quantity: str, cells: list[str], units: list[str]) -> str:
-    """The unit of a quantity, from its heading or from the line of units; empty if neither gives it."""
+    """Return the unit of a quantity, from its heading or from the line of units. Empty if neither states the unit."""
     return _places_and_units(cells, units).get(quantity, (0, ""))[1]
 
 
-#: A heading with its unit, for each raw column of the instrument.
+#: Example of a heading with a unit, for each raw column of the instrument.
 _EXAMPLES = {"torque": "torque_uN.m", "angle": "angle_mrad", "phase": "raw_phase_deg"}
 
 
 def without_unit(cells: list[str], units: list[str]) -> list[str]:
-    """A note on each raw column of the instrument that cannot be used because its unit is not known."""
+    """Return a note on each raw column of the instrument that cannot be used because its unit is unknown."""
     known = _places_and_units(cells, units)
     return [
         f"column {cells[k].strip()!r} is not used to find the inertia of the instrument: its unit "
@@ -83,7 +83,7 @@ def _places_and_units(cells: list[str], units: list[str]) -> dict[str, tuple[int
 
 
 def _known_headings(cells: list[str], units: list[str]) -> Iterator[tuple[int, str, int, str]]:
-    """Column index, quantity, rank in `HEADINGS` and unit of each known heading."""
+    """Yield column index, quantity, rank in `HEADINGS` and unit of each known heading."""
     for k, cell in enumerate(cells):
         name = cell.strip().strip('"')
         plain = name.lower().replace("_", " ")
@@ -100,7 +100,7 @@ def _plain_unit(unit: str) -> str:
 
 
 def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry: float | None) -> SampleShare | None:
-    """The inertia that the instrument subtracted; None if the columns do not show it.
+    """Return the inertia that the instrument subtracted. Returns None if the columns do not show it.
 
     Args:
         omega: (n,) [rad/s].
@@ -120,7 +120,7 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
         return None
     if "phase" in own:
         inertias = (K * g.real - stiffness * np.cos(own["phase"])) / w**2
-    else:  # the root for frequencies above the resonance; the other root belongs to lower frequencies
+    else:  # of two roots, this one holds for frequencies above the resonance
         inertias = (K * g.real + np.sqrt(np.maximum(stiffness**2 - (K * g.imag) ** 2, 0))) / w**2
     inertia = _agreed(w, inertias)
     if not inertia * omega[-1] ** 2 > K * np.abs(G[-1]):
@@ -133,16 +133,16 @@ COLUMNS = ("torque", "angle", "phase", "sample_torque")
 
 
 def with_raw_columns(raw: dict[str, np.ndarray]) -> np.ndarray:
-    """For each point (n,): whether all raw columns of the instrument have a value. The other points have an empty
-    cell."""
+    """Return for each point (n,) whether all raw columns of the instrument have a value, and no cell is empty."""
     return np.all([np.isfinite(raw[q]) for q in COLUMNS if q in raw], axis=0)
 
 
 def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> SampleShare | None:
-    """The inertia from the raw phase alone, without torque and sample size: I omega^2 / K = G' - G'' / tan(phase).
+    """Return the inertia from the raw phase alone, without torque and sample size: I omega^2 / K = G' - G'' /
+    tan(phase).
 
-    None if there is no phase, if the phases at the highest frequencies give different inertias, or if the share of the
-    inertia is below the modulus even at the highest frequency.
+    Returns None if there is no phase, or if the phases at the highest frequencies give different inertias. Also returns
+    None if the contribution of the inertia is below the modulus even at the highest frequency.
     """
     if "phase" not in raw:
         return None
@@ -155,10 +155,10 @@ def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray])
 
 
 def _agreed(omega: np.ndarray, values: np.ndarray) -> float:
-    """The median inertia at the highest frequencies, if the values there agree within a tenth; else NaN.
+    """Return the median inertia at the highest frequencies, or NaN if the values there differ by a tenth or more.
 
-    At these frequencies the inertia has its largest share and is known best. At other frequencies it is a small
-    difference of large numbers.
+    At these frequencies the contribution of the inertia is largest, so the inertia is known best. At other frequencies
+    the inertia is a small difference of large numbers.
     """
     if not len(omega):
         return np.nan

@@ -1,8 +1,8 @@
-"""Frequency sweeps from files: plain CSV, TA TRIOS text and Anton Paar RheoCompass exports.
+"""Read frequency sweeps from files: plain CSV, TA TRIOS text and Anton Paar RheoCompass exports.
 
-One reader is used for all these files. It looks for a header line that names a frequency and two of storage modulus,
-loss modulus, |G*|, phase and tan(delta). A line of units may follow, then the numbers. The result is in rad/s and Pa,
-sorted by frequency.
+One reader is used for all these files. It looks for a header line that names a frequency and two of these quantities:
+storage modulus, loss modulus, |G*|, phase and tan(delta). A line of units may follow, then the numbers. The result is
+in rad/s and Pa, sorted by frequency.
 """
 
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-# Some of these imports exist only for users: `fitting.rheometer` exports all names of this module.
+# Some of these names are imported only for users: `fitting.rheometer` exports all names of this module.
 from fitting.readers.frequency_sweep import FEWEST, Sweep
 from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
@@ -35,17 +35,17 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     """Read a frequency sweep.
 
     A point is left out if a modulus or the frequency is not finite, not positive, or outside of `SMALLEST` to
-    `LARGEST`. A note names it.
+    `LARGEST`. A note names these points.
 
     Args:
         path: an instrument's export, or text with a header that names ``frequency_Hz`` or ``angular_frequency_rad_s``,
             ``storage_modulus_Pa`` and ``loss_modulus_Pa`` (or kPa, MPa). ``storage_modulus_sd_Pa`` and
             ``loss_modulus_sd_Pa`` are optional. ``#`` begins a comment.
         table: which table to read if the file has several: its number (from 1), its name or a part of its name. By
-            default, the table with the largest number of frequencies is read (if several have it, the first of them).
+            default, the table with the largest number of frequencies is read (the first one if there are several).
 
     Raises:
-        InputError: one sentence with the file, the column or line, the value and the remedy.
+        InputError: the file cannot be used; the message names the column or line, the value and the remedy.
     """
     tables = tables_of(str(path), text_of(Path(path)).splitlines())
     chosen, notes = choose_table(str(path), tables, table)
@@ -54,17 +54,17 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
 
 
 def read_all_sweeps(path: str | os.PathLike) -> list[tuple[str, Sweep]]:
-    """Read every table of a file that is a sweep; return name and sweep of each. Unlike in `read_sweep`, the points are
-    not weighted by their scatter."""
+    """Read all frequency sweeps of a file, and return name and sweep of each table. Unlike `read_sweep`, this function
+    does not weight the points by their scatter."""
     tables = tables_of(str(path), text_of(Path(path)).splitlines())
     return [(table.name, _sweep(str(path), table, [])) for table in tables]
 
 
 def _usable(path: str, table: Table, values: dict[int, np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """For each row: whether it is good in all columns of `values`; and a note on the other rows.
+    """Return whether each row is usable in all columns of `values`, and a note on the unusable rows.
 
     Raises:
-        InputError: fewer than half of the points or fewer than three frequencies are good.
+        InputError: fewer than half of the points or fewer than three frequencies are usable.
     """
     good, faults = np.ones(len(table.rows), bool), []
     for k, number in enumerate(table.numbers):
@@ -87,23 +87,23 @@ def _usable(path: str, table: Table, values: dict[int, np.ndarray]) -> tuple[np.
 
 
 def _below_zero(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -> list[str]:
-    """A note if several points are left out because their loss modulus is not above zero."""
+    """Return a note if several points are left out because their loss modulus is not above zero."""
     column, loss = next((first[q] for q in ("loss", "tangent", "phase") if q in first), (None, np.ones(len(good))))
     count = int(np.sum(~good & (loss <= 0)))
     if column is None or count < 2:
         return []
     return [
-        f"{count} points are left out because {column.name} is not above zero there: those that remain are too high on "
-        "average; if noise is the cause, average repeated sweeps before you fit"
+        f"{count} points are left out because {column.name} is not above zero there. The remaining points are too high "
+        "on average: if noise is the cause, average repeated sweeps before you fit"
     ]
 
 
-#: Ratio of G' to G'' [1], or its inverse, that no tissue and few materials reach.
+#: Ratio of G' to G'' [1], or of G'' to G', above that of all tissues and most other materials.
 FAR_APART = 100.0
 
 
 def _unlike_units(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -> list[str]:
-    """A note if G' and G'' have different units, and if they differ very much only for this reason."""
+    """Return a note if G' and G'' differ by more than `FAR_APART` only because their columns have different units."""
     if not {"storage", "loss"} <= set(first):
         return []
     (one, storage), (other, loss) = first["storage"], first["loss"]
@@ -112,7 +112,7 @@ def _unlike_units(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray)
     if max(ratio, 1 / ratio) < FAR_APART or max(ratio / scale, scale / ratio) > FAR_APART:
         return []
     return [
-        f"column {one.name!r} is in {one.unit or 'Pa'} and {other.name!r} in {other.unit or 'Pa'}, which makes G' "
+        f"column {one.name!r} is in {one.unit or 'Pa'} and {other.name!r} in {other.unit or 'Pa'}, so G' is "
         f"{ratio:.2g} times G'': if both are in one unit, correct the header"
     ]
 
@@ -154,35 +154,35 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)
 
 
-#: A note: the lines were in another order.
+#: Note on a file whose lines were not sorted by frequency.
 SORTED = "the frequencies were not in ascending order and have been sorted"
-#: A note on frequencies that occur in several lines. Their number comes before this text.
+#: Note on frequencies that occur in several lines. The number of repeated lines comes before this text.
 REPEATED = (
-    "frequencies are repeated; each line counts as a measurement of its own, unless the lines of a frequency share "
-    "their noise"
+    "frequencies are repeated; each line counts as a separate measurement, unless the noise of lines with the same "
+    "frequency is correlated"
 )
 
-#: Words of the note on a sweep at several temperatures.
-WARM = "and one material at one temperature is fitted"
+#: Part of the note on a sweep at several temperatures.
+WARM = "but one material at one temperature is fitted"
 #: A note is given if the temperature varies within one sweep by more than WARMER [K], or if the largest strain exceeds
 #: STRAINED times the smallest.
 WARMER, STRAINED = 2.0, 1.5
 
 
 def _what_differs(sweep: Sweep) -> list[str]:
-    """Notes if temperature or strain differ between the lines of a sweep."""
+    """Return notes if temperature or strain differ between the lines of a sweep."""
     out, raw = [], sweep.raw or {}
     heat, strain = (raw[q][np.isfinite(raw[q])] if q in raw else np.empty(0) for q in ("temperature", "strain"))
     if len(np.unique(sweep.angular_frequency)) == len(sweep.angular_frequency):
         if heat.size and np.ptp(heat) > WARMER:
             out.append(
-                f"the temperature changes by {np.ptp(heat):.2g} K in the sweep: its effect on the moduli is taken for "
-                "an effect of the frequency"
+                f"the temperature changes by {np.ptp(heat):.2g} K in the sweep: the fit treats its effect on the "
+                "moduli as an effect of the frequency"
             )
         if strain.size and strain.min() > 0 and strain.max() > STRAINED * strain.min():
             out.append(
                 f"the strain goes from {strain.min():.2g} to {strain.max():.2g} in the sweep: if the strain is not "
-                "small, its effect on the moduli is taken for an effect of the frequency"
+                "small, the fit treats its effect on the moduli as an effect of the frequency"
             )
         return out
     if heat.size and np.ptp(heat) > WARMER:
@@ -198,15 +198,16 @@ def _what_differs(sweep: Sweep) -> list[str]:
     return out
 
 
-#: A note is given if a column differs in the median by more than this [1] from the values that the other two columns
-#: give.
+#: A note is given if the median relative difference between a column and the values computed from G' and G'' exceeds
+#: this [1].
 CONTRADICTS = 0.03
 
 
 def _contradictions(path: str, beside: list[tuple[Column, np.ndarray]], values: Content, stretched: bool) -> list[str]:
-    """Notes on columns of |G*|, phase, tan(delta) or |eta*| that differ from the values computed from G' and G''.
+    """Return notes on columns of |G*|, phase, tan(delta) or |eta*| that differ from the values computed from G' and
+    G''.
 
-    If the file has E' and E'' (`stretched`), the column may contain |E*| or |G*|, and so may the viscosity.
+    If the file has E' and E'' (`stretched`), a column of modulus or viscosity may belong to tension or to shear.
     """
     G = values["storage"] + 1j * values["loss"]
     expected = {"complex": np.abs(G), "phase": np.angle(G), "tangent": values["loss"] / values["storage"]}

@@ -1,19 +1,19 @@
-"""A strain or stress that scatters although the real load is constant or rises as a straight line: the load without the
-scatter."""
+"""Remove the scatter of a measured strain or stress if the true load is constant or a linear ramp."""
 
 import numpy as np
 
 from fitting.readers.noise_of_series import noise_of_series
 
-#: Scatter of the load below this part of the largest load does not matter.
+#: Scatter of the load below this fraction of the largest load is ignored.
 QUIET = 1e-3
 
 
 def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np.ndarray, list[str]]:
-    """The driven quantity, and notes. If it scatters while it is constant, its mean replaces the constant part. A
-    straight line replaces a straight ramp.
+    """Return the imposed strain or stress without scatter, and notes. The mean replaces a constant part, and a straight
+    line replaces a linear ramp.
 
-    The model treats each reading as a real step, so it would treat the scatter of a sensor as motion.
+    The model treats the change between two readings as a real step. So it would treat the scatter of a sensor as
+    motion.
     """
     size, noise = float(np.max(np.abs(driven))), noise_of_series(driven)
     if not noise > QUIET * size:
@@ -22,13 +22,13 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
     near = np.abs(driven - level) <= 5 * noise
     first, told = int(np.argmax(near)), f"the {word} scatters by {100 * noise / size:.2g} % of its largest value"
     share = np.mean(near[first:])
-    if share < 0.5:  # cycles: from the differences of a few rows they look like noise
+    if share < 0.5:  # a cyclic load: its third differences look like noise
         return driven, []
-    # By scatter, a single row of the ramp may be near the level before the ramp ends.
+    # Because of the scatter, a single row of the ramp may be near the level before the ramp ends.
     first = next((int(k) for k in np.flatnonzero(near) if np.mean(near[k:]) >= 0.99), len(near))
     if np.sum(near[first:]) < 0.9 * np.sum(near):
         return driven, [
-            f"{told}, and each reading counts as a step: the moduli will be too small; smooth this column first"
+            f"{told}, and each reading counts as a step, so the moduli will be too small: smooth this column first"
         ]
     rest = int(np.argmax(np.abs(driven - np.median(driven[:3])) > 5 * noise))
     rest = rest if rest <= first else 0
@@ -38,30 +38,30 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
         if straight is not None:
             begin, end, held = straight
             return held, [
-                f"{told}: a straight ramp from {begin:.3g} to {end:.3g} s and then a constant are used; the standard "
-                "errors do not contain the uncertainty of these times"
+                f"{told}: a straight ramp from {begin:.3g} to {end:.3g} s and then a constant load are used; the "
+                "standard errors do not contain the uncertainty of these times"
             ]
-        told = f"{told}, and each reading of its ramp counts as a step, which makes G0 too small: smooth the ramp first"
+        told = f"{told}, and each reading of the ramp counts as a step, which makes G0 too small (smooth the ramp)"
     held = driven.copy()
     held[first:] = np.mean(driven[first:])
     held[:rest] = rest_level
-    return held, [f"{told}: from {time[first]:.3g} s on it is constant, and its mean is used"]
+    return held, [f"{told}: from {time[first]:.3g} s on, the load is constant, and its mean is used"]
 
 
-#: Minimum number of rows of a ramp that a straight line replaces; and maximum misfit of this line, divided by the
-#: noise.
+#: A straight line replaces a ramp only if the ramp has _ROWS_OF_RAMP rows or more, and if the misfit of the line is
+#: below _STRAIGHT times the noise.
 _ROWS_OF_RAMP, _STRAIGHT = 4, 1.5
-#: Maximum number of rows of the rest, and of the hold, to which such a line is fitted.
+#: Maximum number of rows before the ramp (rest), and after the ramp (hold), that are used in the fit of this line.
 _OF_HOLD = 500
 
 
 def _straight_ramp(
     time: np.ndarray, driven: np.ndarray, places: tuple[int, int, float], noise: float
 ) -> tuple[float, float, np.ndarray] | None:
-    """Begin and end [s] of a ramp, and the load (n,) of rest, ramp and hold without scatter. None if the ramp is not
-    straight.
+    """Return start and end [s] of a linear ramp, and the load (n,) of rest, ramp and hold without scatter. Returns None
+    if the ramp is not linear.
 
-    `places`: first row of the load, first row of the hold, level at rest.
+    `places`: index of the first row under load, index of the first row of the hold, load at rest.
     """
     import scipy.optimize
 
@@ -86,8 +86,7 @@ def _straight_ramp(
     ends = np.linspace(time[rest], time[min(first + max(3, (first - rest) // 4), len(time) - 1)], 400)
     near = ends[int(np.argmin([np.sum((line_from(time[0], end, 0.0) - driven) ** 2) for end in ends]))]
     free = scipy.optimize.minimize(misfit, [time[max(rest - 1, 0)], time[first]], method="Nelder-Mead").x
-    # First try: the ramp begins with 0 at the first row. Second try: it begins at the level of the rest, at a fitted
-    # time.
+    # First try: the ramp begins with load 0 at the first row. Second try: with the load at rest, at a fitted time.
     for begin, end, level in ((time[0], near, 0.0), (free[0], free[1], low)):
         line = line_from(begin, end, level)
         off = (line - driven) / noise

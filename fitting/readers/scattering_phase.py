@@ -1,29 +1,29 @@
-"""Loss moduli that scatter because of errors in the phase: this scatter is in proportion to |G*|, not to G''."""
+"""Weights for loss moduli that scatter because of phase errors. This scatter is proportional to |G*|, not to G''."""
 
 import numpy as np
 
 from fitting.readers.frequency_sweep import Sweep, distance_from_smooth, distances_from_polynomials
 
-#: The phase may be the cause if G'' scatters by more than _SCATTERS (relative), and by the factor _MORE more than G'.
-#: With few points (n), the factor can be larger by chance, so _MORE is multiplied by 1 + _BY_CHANCE / n. If both have
-#: equal noise, 1 % of all sweeps exceed a factor of 6 at 12 points, and 3 at 40 points.
+#: The phase may be the cause if the relative scatter of G'' exceeds _SCATTERS, and exceeds _MORE times that of G'. With
+#: few points (n), this ratio can be larger by chance, so _MORE is multiplied by 1 + _BY_CHANCE / n. If G' and G'' have
+#: equal noise, 1 % of all sweeps exceed a ratio of 6 at 12 points, and of 3 at 40 points.
 _SCATTERS, _MORE, _BY_CHANCE = 0.03, 3.0, 9.0
 #: Minimum number of points, and of points per decade. With fewer points, the curvature of the material would look like
 #: scatter.
 _FEWEST, _PER_DECADE = 8, 5.0
-#: Noise in proportion to G'' is assumed only if the logarithm of its likelihood is higher by more than this: there are
-#: few causes for such noise in G'' alone.
+#: Noise proportional to G'' is assumed only if its log-likelihood is higher by more than this, because such noise in
+#: G'' alone is rare.
 _BETTER = 8.0
-#: Number of neighbouring points over which the two kinds of noise are compared.
+#: Number of neighbouring points per polynomial in the comparison of the two kinds of noise.
 _NEIGHBOURS = 5
 
 
 def weighed_by_scatter(sweep: Sweep) -> Sweep:
-    """The sweep with standard deviations from the scatter of its points, if errors of the phase cause the scatter of
-    G''.
+    """Return the sweep with standard deviations from the scatter of its points, if phase errors cause the scatter of
+    G''. Otherwise return the sweep unchanged.
 
-    An error of the phase [rad], times G', is the error of G''. If the residuals were divided by G'', points that are
-    low by chance would have the largest weight. Where G'' << G', a fit would then follow the noise.
+    The error of G'' is the phase error [rad] times G'. If the residuals were divided by G'', points that are low by
+    chance would have the largest weight. Where G'' << G', a fit would then follow the noise.
     """
     omega, size = sweep.angular_frequency, np.hypot(sweep.storage, sweep.loss)
     if sweep.storage_sd is not None or len(np.unique(omega)) < max(len(omega), _FEWEST):
@@ -38,15 +38,15 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
     if _likelier_in_proportion(x, sine) > _BETTER:
         return sweep
     note = (
-        f"G'' scatters by {100 * scatters:.2g} % and G' by {100 * storage:.2g} %, for example from an error of the "
-        f"phase of {np.degrees(phase):.2g} degrees (or from outliers): the residuals of G'' are divided by |G*|, not "
-        "by G''; give standard deviations for other weights"
+        f"G'' scatters by {100 * scatters:.2g} % and G' by {100 * storage:.2g} %, for example because the error of "
+        f"the phase is {np.degrees(phase):.2g} degrees, or because of outliers. So the residuals of G'' are divided by "
+        "|G*|, not by G''; give standard deviations if you want other weights"
     )
     storage_sd = np.maximum(storage, phase * sine) * sweep.storage
     return sweep._replace(storage_sd=storage_sd, loss_sd=phase * size, sd_estimated=True, notes=(*sweep.notes, note))
 
 
 def _likelier_in_proportion(x: np.ndarray, sine: np.ndarray) -> float:
-    """Logarithm of a ratio of likelihoods: noise in proportion to `sine` (n,), against noise of equal size."""
+    """Return the log-likelihood ratio of two kinds of noise: proportional to `sine` (n,), and of constant size."""
     equal, growing = (np.mean(distances_from_polynomials(x, y, _NEIGHBOURS) ** 2) for y in (sine, np.log(sine)))
     return float(0.5 * len(x) * np.log(equal / max(growing, 1e-300)) - np.sum(np.log(sine)))

@@ -1,5 +1,5 @@
-"""Relaxation and creep tests from files: the time with a modulus, a compliance, strain and stress, or another pair of
-columns."""
+"""Read relaxation and creep tests from files. A file has the time and a modulus, a compliance, strain and stress, or
+another pair of columns."""
 
 import os
 from typing import NamedTuple
@@ -11,36 +11,36 @@ from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.time_columns import FORMS, beyond_small, read_columns
 from liverjax.core.errors import InputError
 
-#: A load below this part of the largest load counts as rest: its effect on the answers is just as small.
+#: A load below this fraction of the largest load counts as rest: its effect on the response is just as small.
 AT_REST = 0.01
 
-#: Lower bound of the scales: the noise divided by RELATIVE. In a cyclic test, the bound is at least the part CYCLIC of
-#: the largest answer.
+#: Lower bound of the scales of the residuals: noise / RELATIVE; in a cyclic test, at least CYCLIC times the largest
+#: response.
 RELATIVE, CYCLIC = 0.03, 0.1
 
-#: What is known of changes of the load that no row shows: nothing, so it is straight between rows; nothing, and a row
-#: at 0 s was added before a first row under load; or how long they took.
+#: How the load changed where no row shows it. BETWEEN_ROWS: unknown; a linear change between rows is assumed.
+#: BEFORE_ROWS: unknown; the first row is already loaded, so a row at 0 s was added. GIVEN: the user gave the duration.
 BETWEEN_ROWS, BEFORE_ROWS, GIVEN = "between rows", "before the rows", "given"
 
 
 class TimeTest(NamedTuple):
-    """A relaxation or creep test in SI units, as quantities of shear."""
+    """A relaxation or creep test in SI units. All quantities are those of shear."""
 
     kind: str  # relaxation or creep
     time: np.ndarray  # (n,) [s], ascending
     driven: np.ndarray  # (n,) imposed strain; in creep the imposed stress [Pa]
     answer: np.ndarray  # (n,) measured response: stress [Pa]; in creep the strain
-    used: np.ndarray  # (n,) whether the answer of a row is fitted
+    used: np.ndarray  # (n,) whether the response in a row is fitted
     source: str = ""
     notes: tuple[str, ...] = ()
-    constant_noise: bool = False  # whether the noise of all answers has the same size
-    rise: str = BETWEEN_ROWS  # what is known of changes of the load that no row shows
-    described: bool = False  # whether a description in TOML names the file
+    constant_noise: bool = False  # whether the noise of all responses has the same size
+    rise: str = BETWEEN_ROWS  # how the load changed where no row shows it
+    described: bool = False  # whether a TOML description names the file
 
     @property
     def scales(self) -> np.ndarray:
-        """Scales of the residuals: the size of each answer, with a lower bound for answers that are lost in noise.
-        If the noise is constant, all scales are the median of these.
+        """Scales of the residuals: the size of each response, with a lower bound for responses below the noise.
+        If the noise is constant, all scales are the median of these sizes.
         """
         sizes = self._sizes_of_answers()
         return np.full(len(sizes), np.median(sizes)) if self.constant_noise else sizes
@@ -52,8 +52,8 @@ class TimeTest(NamedTuple):
 
     @property
     def cyclic(self) -> bool:
-        """Whether the driven quantity falls by more than half of its largest value and rises again. Then the answers
-        pass 0."""
+        """Whether the imposed load falls by more than half of its largest value and rises again. The response of such a
+        test passes 0."""
         driven = np.abs(self.driven)
         half = 0.5 * driven.max()
         fallen = np.maximum.accumulate(driven) - driven > half
@@ -73,22 +73,23 @@ class TimeTest(NamedTuple):
 
     @property
     def jumps(self) -> np.ndarray:
-        """Numbers (j,) of the rows at the ends of jumps of the load, if nobody has said how long they took."""
+        """Indices (j,) of the rows at the ends of jumps of the load; empty if the user gave the duration of the
+        jumps."""
         if self.rise == GIVEN:
             return np.zeros(0, int)
-        shown = np.flatnonzero(np.isfinite(self.answer))  # rows without an answer may have been added between others
+        shown = np.flatnonzero(np.isfinite(self.answer))  # rows without a response may have been added
         return shown[_rows_of_jumps(self.driven[shown])]
 
     @property
     def answers_at_once(self) -> bool:
-        """Whether an answer at the moment of a step is used. It tells G0, but resolves no time."""
+        """Whether a response at the instant of a step is fitted. It determines G0, but no relaxation time."""
         first, second = self.time[self.used][:2] - self.begun
         return bool(first < AT_ONCE * second)
 
     @property
     def resolved(self) -> tuple[float, float]:
-        """Shortest and longest relaxation time [s] that the test resolves: the times of the first and the last used
-        answer after the load began."""
+        """Shortest and longest relaxation time [s] that the test resolves: the times of the first and the last fitted
+        response, counted from the start of the load."""
         time = self.time[self.used] - self.begun
         return float(time[int(self.answers_at_once)]), float(time[-1])
 
@@ -103,18 +104,18 @@ class Sample(NamedTuple):
 def read_time_test(
     path: str | os.PathLike, kind: str, sample: Sample = Sample(), ramp: float | None = None, start: float = 0.0
 ) -> TimeTest:
-    """Read a test.
+    """Read a relaxation or creep test.
 
     Args:
-        path: a file with a header that names the time and one of `FORMS`.
+        path: a file with a header that names the time and one combination of quantities in `FORMS`.
         kind: "relaxation" or "creep".
         sample: radius and height of a cylinder, for torque and force.
-        ramp: for a column of modulus or compliance: duration [s] of the ramp of strain or stress; 0 (or None) for a
-            step. For two columns: None; or the seconds of a rise that no row shows (see `from_rest`), 0 for a step.
-        start: answers before this time [s] are not fitted.
+        ramp: duration [s] of the ramp of strain or stress, 0 for a step. For a column of modulus or compliance, None
+            means a step. For two columns, a duration is given only if no row shows the rise (see `from_rest`).
+        start: responses before this time [s] are not fitted.
 
     Raises:
-        InputError: one sentence with the file, the column or line, the value and the remedy.
+        InputError: the file cannot be used; the message names the column or line, the value and the remedy.
     """
     if not (np.isfinite(start) and start >= 0):
         raise InputError(f"--min-time {start:g} cannot be seconds after the load: give 0 or more")
@@ -123,7 +124,7 @@ def read_time_test(
     form = next((f for f in FORMS if set(f) <= set(columns)), None)
     if form is None or (form[0] in ("modulus", "compliance") and form[0] != _own_table(kind)):
         raise InputError(
-            f"{path}: a {kind} test needs, with time, {_own_table(kind)}, or strain and stress, angle and torque, or "
+            f"{path}: a {kind} test needs the time and {_own_table(kind)}, strain and stress, angle and torque, or "
             f"displacement and force; the file has {', '.join(columns)}"
         )
     if form[0] in ("modulus", "compliance"):
@@ -134,9 +135,9 @@ def read_time_test(
         if ramp is None:
             word = "strain" if kind == "relaxation" else "stress"
             notes.append(
-                f"no column shows how the {word} rose: a step at 0 s is assumed. If it took some time, give --ramp "
-                "SECONDS, with times that count from its beginning: otherwise G0 is too large, or too small if the "
-                "times count from its end"
+                f"no column shows how the {word} rose: a step at 0 s is assumed. If the rise took some time, give "
+                "--ramp SECONDS, and count the times from the start of the rise. Otherwise G0 is too large (or too "
+                "small if the times count from the end of the rise)"
             )
     else:
         strain, stress, told = _as_shear(str(path), form, columns, sample)
@@ -158,45 +159,46 @@ def of_columns(
     source: tuple[str, list[str]],
     start: float = 0.0,
 ) -> TimeTest:
-    """A test from columns of strain and stress whose rows begin at 0 s (see `from_rest`).
+    """Return a test from columns of strain and stress. Their rows begin at 0 s (see `from_rest`).
 
     Args:
         kind: "relaxation" or "creep".
         time: (n,) [s], rising from 0.
         driven, answer: (n,) strain and stress [Pa]; in creep, stress [Pa] and strain.
         source: name of the file, and notes.
-        start: answers before this time [s] are not fitted.
+        start: responses before this time [s] are not fitted.
 
     Raises:
-        InputError: the driven quantity is zero, there are too few answers, or most answers have the opposite sign.
+        InputError: the imposed load is zero, there are too few responses, or most responses have the opposite sign.
     """
     driven, told = without_scatter(time, driven, "strain" if kind == "relaxation" else "stress")
     told += _ringing(time, driven, answer, start) if kind == "creep" else []
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
 
 
-#: A note on rows that begin at 0 s under load.
+#: Note on a file whose first row, at 0 s, is already under load.
 BEGINS_LOADED = (
-    "the first row, at 0 s, is under load already: a step from rest at 0 s is assumed. If the load rose before it, or "
-    "the sample was loaded before, give those rows too: what relaxed until then is missing from G0 otherwise. If it "
-    "was held under an earlier load until its stress was steady, take that strain and that stress off all rows. If it "
-    "was a step, ramp = 0 in a description, or (relaxation and creep alone) --ramp 0, says so"
+    "the first row, at 0 s, is under load already: a step from rest at 0 s is assumed. If the sample was loaded "
+    "before, give these earlier rows too; otherwise G0 lacks the stress that relaxed before 0 s. If the sample was "
+    "under a constant load until its stress was steady, subtract this strain and this stress from all rows. If the "
+    "load was a step, confirm it with ramp = 0 in a description, or with --ramp 0 (relaxation and creep only)"
 )
 
 
 def from_rest(
     time: np.ndarray, driven: np.ndarray, answer: np.ndarray, ramp: float | None, names: tuple[str, str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """The rows (n,), with an added row at 0 s if they begin later, and added rows if `ramp` is given; and notes.
+    """Return times, loads and responses (n,) that begin at rest, and notes. Rows at 0 s and in jumps are added if
+    needed.
 
     Args:
         time, driven, answer: (n,), see `of_columns`.
-        ramp: None: the load is straight between rows. If the rows begin under load, 0: it acted from 0 s on. Where the
-            load changes between two rows alone: seconds of this change until the later row; 0 for a step.
+        ramp: duration [s] of a jump of the load between two rows, until the later row; 0 for a step. If the first row
+            is under load, 0 means that this load acted from 0 s on. None: the load is linear between rows.
         names: name of the file, and name of `ramp`, for messages.
 
     Raises:
-        InputError: the rows show how the load rose, or it rose in less time.
+        InputError: `ramp` contradicts the rows: they show how the load rose, or the rise took less time.
     """
     size, rows = np.abs(driven), _rows_of_jumps(driven)
     loaded = size[0] > AT_REST * np.max(size)
@@ -215,17 +217,17 @@ def from_rest(
     first, notes = driven[0] if at_once else 0.0, []
     if not at_once and loaded:
         notes.append(
-            f"the rows begin at {time[0]:.3g} s under load: a linear ramp from 0 s on is assumed. If it was a step at "
-            "0 s, put a row with this load at 0 s, or (relaxation and creep alone) say --ramp 0 (in a description: "
-            "ramp = 0)"
+            f"the rows begin at {time[0]:.3g} s under load: a linear ramp from 0 s on is assumed. If the load was a "
+            "step at 0 s, add a row with this load at 0 s, or give --ramp 0 (relaxation and creep only; in a "
+            "description: ramp = 0)"
         )
     return np.append(0.0, time), np.append(first, driven), np.append(0.0, answer), notes
 
 
 def with_known_rise(test: TimeTest, time: np.ndarray, driven: np.ndarray, ramp: float | None) -> TimeTest:
-    """The test with what is known of its `rise`, from the times and driven values (n,) of its file.
+    """Return the test with its field `rise`, which is found from the times and loads (n,) of the file.
 
-    Answers in rows that `from_rest` has added are not fitted.
+    Responses in rows that `from_rest` has added are not fitted.
     """
     test = test._replace(used=test.used & np.isin(test.time, time))
     if ramp is not None:
@@ -235,15 +237,15 @@ def with_known_rise(test: TimeTest, time: np.ndarray, driven: np.ndarray, ramp: 
     return test._replace(rise=BEFORE_ROWS) if before else test
 
 
-#: A load jumps if it changes between two rows by more than this part of its largest value, and if the changes before
-#: and after are below the second part of this change.
+#: The load jumps between two rows if it changes by more than _JUMP times its largest value, and if the changes before
+#: and after are below _COMPLETE times this change.
 _JUMP, _COMPLETE = 0.05, 0.5
-#: A step takes this part of the time between two rows. Such a short time resolves no relaxation time.
+#: Duration of a step, as a fraction of the time between two rows. It is so short that it resolves no relaxation time.
 AT_ONCE = 1e-4
 
 
 def _rows_of_jumps(driven: np.ndarray) -> np.ndarray:
-    """Numbers (j,) of the rows at the ends of jumps: no row shows how the load changed there."""
+    """Return the indices (j,) of the rows at the ends of jumps. No row shows how the load changed in a jump."""
     change = np.abs(np.diff(driven, prepend=driven[0], append=driven[-1]))
     before, own, after = change[:-2], change[1:-1], change[2:]
     least = _JUMP * np.max(np.abs(driven))
@@ -251,8 +253,8 @@ def _rows_of_jumps(driven: np.ndarray) -> np.ndarray:
 
 
 def _rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple:
-    """The columns with a row before each jump that has the values of the earlier row, `ramp` [s] before the later
-    row."""
+    """Return the columns with an added row in each jump, `ramp` [s] before its later row. The added row has the values
+    of the earlier row."""
     interval = time[rows] - time[rows - 1]
     after = np.append(np.diff(time), np.inf)[rows]
     before = time[rows] - np.clip(ramp, 0.1 * AT_ONCE * np.minimum(interval, after), interval)
@@ -264,9 +266,9 @@ def _rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns
 
 
 def with_steps(test: TimeTest) -> TimeTest:
-    """The test whose load has steps at the later rows of its jumps (`TimeTest.jumps`).
+    """Return the test with each jump of the load (`TimeTest.jumps`) replaced by a step at the later row.
 
-    If the rows begin under load, the step is at 0 s.
+    If the rows begin under load, the first step is at 0 s.
     """
     driven, jumps = test.driven.copy(), test.jumps
     if test.rise == BEFORE_ROWS:
@@ -282,8 +284,8 @@ def with_steps(test: TimeTest) -> TimeTest:
 
 
 def kind_of(path: str | os.PathLike) -> str:
-    """ "relaxation" or "creep". A column of modulus or compliance decides. Otherwise the column that changes less in
-    the second half is the driven quantity."""
+    """Return "relaxation" or "creep". A column of modulus means relaxation, and a column of compliance means creep.
+    Otherwise, the column that changes less in the second half is the imposed quantity."""
     columns, _ = read_columns(path)
     form = next((f for f in FORMS if set(f) <= set(columns)), ("modulus",))
     if len(form) == 1:
@@ -294,10 +296,10 @@ def kind_of(path: str | os.PathLike) -> str:
 
 
 def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: np.ndarray) -> list[str]:
-    """A note if, in the second half, the quantity that this kind of test imposes changes while the other quantity is
-    held.
+    """Return a note if the imposed quantity of this kind of test changes in the second half, while the other quantity
+    is constant.
 
-    No note if it changes at a constant rate: this also happens if a sample is strained until its stress is steady.
+    No note is given for a constant rate of change, because samples are also strained until their stress is steady.
     """
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
     late = len(driven) // 2
@@ -309,15 +311,15 @@ def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: 
         return []
     names = ("stress", "strain", "creep") if kind == "relaxation" else ("strain", "stress", "relaxation")
     return [
-        f"the {names[0]} is held and the {names[1]} changes, as in a {names[2]} test, so python -m fitting {names[2]} "
-        f"is the right command: this command takes the {names[1]} as exact, although it has noise"
+        f"the {names[0]} is constant and the {names[1]} changes, as in a {names[2]} test: use python -m fitting "
+        f"{names[2]}. This command takes the {names[1]} as exact, although it has noise"
     ]
 
 
-#: A quantity is held if its relative standard deviation in the second half is below this [1].
+#: A quantity counts as constant if its relative standard deviation in the second half is below this [1].
 HELD = 0.01
-#: A quantity changes at a constant rate if its distance from a straight line is below this part of its change (standard
-#: deviations).
+#: A quantity changes at a constant rate if its standard deviation from a straight line is below this fraction of its
+#: standard deviation.
 STEADY = 0.05
 
 
@@ -326,11 +328,11 @@ def _own_table(kind: str) -> str:
 
 
 def _as_a_step(path, time, modulus, ramp):
-    """Times, a driven strain (or stress) that reaches 1 at once or by a ramp, and answers."""
+    """Return times, an imposed strain (or stress) that rises to 1 in a step or a ramp, and responses."""
     if not (np.isfinite(ramp) and ramp >= 0):
-        raise InputError(f"{path}: --ramp {ramp:g} cannot be the seconds of a ramp; give 0 or more")
+        raise InputError(f"{path}: --ramp {ramp:g} cannot be the duration of a ramp in seconds; give 0 or more")
     if ramp > time[-1]:
-        raise InputError(f"{path}: --ramp {ramp:g} ends after the last row at {time[-1]:g} s; give its seconds")
+        raise InputError(f"{path}: --ramp {ramp:g} ends after the last row at {time[-1]:g} s; give it in seconds")
     kept = time > 0
     times = np.unique(np.concatenate([[0.0], time[kept], [ramp] if ramp else []]))
     answer = np.full(len(times), np.nan)
@@ -338,18 +340,18 @@ def _as_a_step(path, time, modulus, ramp):
     return times, np.minimum(times / ramp, 1.0) if ramp else np.ones(len(times)), answer
 
 
-#: A modulus or compliance may change in the wrong direction by this part of its largest value, or by this many standard
-#: deviations of its noise.
+#: A modulus or compliance may change in the wrong direction by _WRONG_WAY times its largest value, or by _IN_NOISE
+#: standard deviations of its noise.
 _WRONG_WAY, _IN_NOISE = 0.25, 6.0
 
 
 def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, given: tuple) -> list[str]:
-    """Refuse a modulus that rises, or a compliance that falls, under a constant load. `given`: ramp [s] and start [s].
+    """Check that a modulus does not rise, and a compliance does not fall, under a constant load. Return notes.
 
-    A running median removes single wrong rows. Returns notes.
+    A running median removes single wrong rows. `given`: ramp [s] and start [s].
 
     Raises:
-        InputError: one sentence with the time and possible causes.
+        InputError: the check fails; the message has the time and possible causes.
     """
     from scipy.ndimage import median_filter
 
@@ -367,29 +369,29 @@ def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, 
         if fallen.max() > allowed:
             last = t[int(np.argmax(v[: int(np.argmax(fallen > allowed)) + 1]))]
             raise InputError(
-                f"{path}: the compliance falls from {last:.3g} s on. If the stress was taken away, give strain and "
-                "stress in two columns, or end the rows there; if it rings after the load, leave these rows out "
+                f"{path}: the compliance falls from {last:.3g} s on. If the stress was removed, give strain and stress "
+                "in two columns, or end the rows there. If the strain oscillates after loading, leave these rows out "
                 "(--min-time)"
             )
         return []
     peak = int(np.argmax(v))
     if not ramp and v[peak] - v[: peak + 1].min() > allowed:
         raise InputError(
-            f"{path}: the modulus rises until {t[peak]:.3g} s, and after a step of strain it can only fall: if the "
-            f"strain rose until then, give --ramp {t[peak]:.3g}, else leave the rows before it out (--min-time "
+            f"{path}: the modulus rises until {t[peak]:.3g} s, but after a step of strain it can only fall. If the "
+            f"strain rose until then, give --ramp {t[peak]:.3g}; otherwise leave out the earlier rows (--min-time "
             f"{t[peak]:.3g})"
         )
     if ramp and t[0] < 0.3 * ramp and v[0] > 0.7 * size:
         return [
-            f"the modulus has {100 * v[0] / size:.0f} % of its largest value at {t[0]:.3g} s, and a ramp of {ramp:g} s "
-            f"has {100 * t[0] / ramp:.2g} % of its strain then: is --ramp right?"
+            f"the modulus has {100 * v[0] / size:.0f} % of its largest value at {t[0]:.3g} s, but a ramp of {ramp:g} s "
+            f"has only {100 * t[0] / ramp:.2g} % of its strain then: is --ramp right?"
         ]
     return []
 
 
 def _ringing(time: np.ndarray, stress: np.ndarray, strain: np.ndarray, start: float) -> list[str]:
-    """A note if the strain falls and rises again under a constant stress: then the inertia of the instrument causes
-    oscillations."""
+    """Return a note if the strain falls and rises again under constant stress. The inertia of the instrument causes
+    such oscillations."""
     from scipy.ndimage import median_filter
 
     largest = float(stress[np.argmax(np.abs(stress))])
@@ -410,16 +412,16 @@ def _ringing(time: np.ndarray, stress: np.ndarray, strain: np.ndarray, start: fl
         return []
     return [
         f"the strain falls by {100 * falls[worst] / v.max():.2g} % until {t[worst]:.3g} s under a constant stress, and "
-        "rises again: the inertia of the instrument rings, and no creep does; leave these rows out (--min-time)"
+        "rises again. This is an oscillation of the instrument's inertia, not creep: leave these rows out (--min-time)"
     ]
 
 
-#: The strain oscillates if it falls, and rises again, by more than this part of the largest strain.
+#: The strain oscillates if it falls, and rises again, by more than this fraction of the largest strain.
 _RINGS = 0.02
 
 
 def _as_shear(path, form, columns, sample):
-    """Shear strain, shear stress [Pa], and notes."""
+    """Return shear strain, shear stress [Pa], and notes."""
     if form == ("strain", "stress"):
         return columns["strain"], columns["stress"], []
     if sample.radius is None or sample.height is None:
@@ -427,19 +429,18 @@ def _as_shear(path, form, columns, sample):
     r, h = sample.radius, sample.height
     if form == ("angle", "torque"):
         return columns["angle"] * r / h, columns["torque"] * 2 / (np.pi * r**3), []
-    note = "force and displacement are taken as those of an incompressible cylinder between slippery plates: G = E / 3"
+    note = "force and displacement are those of an incompressible cylinder between frictionless plates: G = E / 3"
     strain = columns["displacement"] / h
     return strain, columns["force"] / (3 * np.pi * r**2), [note, *beyond_small(float(np.nanmax(np.abs(strain))))]
 
 
-#: Minimum number of rows at rest that show an offset; and the part of the largest answer below which an offset does
-#: not matter.
+#: Minimum number of rows at rest that can show an offset. An offset below OFFSET times the largest response is ignored.
 RESTING, OFFSET = 3, 0.003
 
 
 def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
-    """The answers, and a note. If the mean before the load clearly exceeds its error, this mean is subtracted from all
-    answers."""
+    """Return the responses and a note. If the mean before the load clearly exceeds its error, this mean is subtracted
+    from all responses."""
     rest = np.isfinite(test.answer) & (test.time < test.begun) & ~((test.time == 0) & (test.answer == 0))
     count, size = int(rest.sum()), float(np.nanmax(np.abs(test.answer)))
     if count < RESTING:
@@ -450,23 +451,23 @@ def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
     return test.answer - mean, [
         f"the {what} of the {count} rows before the load is {mean:.3g}{unit} on average, "
-        f"{100 * abs(mean) / size:.2g} % of the largest: it is taken off all rows, as an offset of the sensor"
+        f"{100 * abs(mean) / size:.2g} % of the largest: this offset of the sensor is subtracted from all rows"
     ]
 
 
 def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
-    """A note if the answer at the begin of the load is not 0. One or two rows cannot distinguish an offset from
-    noise."""
+    """Return a note if the response at the start of the load is not 0. One or two rows cannot distinguish an offset
+    from noise."""
     k = int(np.argmax(test.time >= test.begun))
     here, load = float(test.answer[k]), abs(float(test.driven[k])) / float(np.max(np.abs(test.driven)))
     noise = noise_of_series(test.answer[np.isfinite(test.answer) & (test.time > test.begun)])
-    # In a steady cycle, the first answer is not 0, because the response lags behind.
+    # In a steady cycle, the first response is not 0, because it lags behind the load.
     if test.cyclic or load > AT_REST or not abs(here) > max(_IN_NOISE * noise, (OFFSET + 2 * load) * size):
         return []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
     return [
         f"the {what} is {here:.3g}{unit} at {test.time[k]:.3g} s, before the load, {100 * abs(here) / size:.2g} % of "
-        "the largest: if this is an offset of the sensor, it changes all moduli: subtract it from all rows, or give "
+        "the largest. If this is an offset of the sensor, it changes all moduli: subtract it from all rows, or give "
         f"{RESTING} or more rows before the load"
     ]
 
@@ -474,18 +475,18 @@ def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
 def _checked(test: TimeTest, start: float) -> TimeTest:
     if not np.max(np.abs(test.driven)) > 0:
         word = "strain" if test.kind == "relaxation" else "stress"
-        raise InputError(f"{test.source}: the {word} is zero throughout; a {test.kind} test needs one")
+        raise InputError(f"{test.source}: the {word} is zero throughout; give a {test.kind} test with a load")
     sign = np.sign(test.driven[np.argmax(np.abs(test.driven))])
     driven, (answer, told) = sign * test.driven, _without_offset(test)
     answer = sign * answer
     used = test.used & np.isfinite(answer) & (test.time >= start) & (test.time > test.begun)
     if used.sum() < 4:
         raise InputError(
-            f"{test.source}: {used.sum()} usable answers are left; give four or more (--min-time too late?)"
+            f"{test.source}: {used.sum()} usable responses are left; give four or more (is --min-time too late?)"
         )
     if not np.sum(driven[used] * answer[used]) > 0:
         raise InputError(
-            f"{test.source}: most answers of the {test.kind} test have the wrong sign for its load; correct the signs"
+            f"{test.source}: most responses of the {test.kind} test have the wrong sign for its load; correct the signs"
         )
     notes = (*test.notes, *told)
     if np.sum(test.time <= test.begun) > 2:

@@ -1,18 +1,19 @@
 """TA TRIOS exports in JSON, converted to the text tables that the other readers read.
 
-Layout: TRIOSJSONExportSchema of TA Instruments. `Results` (or its part `Processed`, or else `Raw`) has three entries:
-`ColumnHeaders` gives name and unit for each key, `Rows` have a value for each key, and `ResultsSteps` give the steps of
-the test by their id.
+The layout is the TRIOSJSONExportSchema of TA Instruments. The table is in `Results`, or in its part `Processed` or
+`Raw`. There, `ColumnHeaders` gives the name and unit of each column key, and `Rows` gives a value for each key.
+`ResultsSteps` gives the name of each test step by its id.
 """
 
 import json
 
-#: Key in a row whose value is the id of the row's step.
+#: Key of a row for the id of the test step to which the row belongs.
 STEP = "Results Step Id"
 
 
 def tables(text: str) -> str | None:
-    """Tab-separated tables, one per step, with a row of names and a row of units; None if the text is not such JSON."""
+    """Return tab-separated tables, one per step, with a row of names and a row of units. Returns None if the text is
+    not JSON of this layout."""
     try:
         content = json.loads(text)
         results = content["Results"]
@@ -34,7 +35,7 @@ def tables(text: str) -> str | None:
 
 
 def _is_column(values: list) -> bool:
-    """Whether all values are numbers or empty, with at least one number. A value is empty if its point was aborted."""
+    """Return whether all values are numbers or empty, with at least one number. Aborted points have empty values."""
     return all(v is None or _is_number(v) for v in values) and any(map(_is_number, values))
 
 

@@ -1,14 +1,14 @@
-"""Units that files may name, and their factors to SI (angular frequencies in rad/s)."""
+"""Units that may occur in files, and the factors that convert them to SI (frequencies to rad/s)."""
 
 import numpy as np
 
-#: mPa is left out on purpose: it may mean millipascal, or MPa in careless spelling, which differ by a factor of 1e9.
+#: mPa is left out on purpose. It means millipascal but, in careless spelling, also megapascal: a factor of 1e9.
 MODULUS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9} | {"pa": 1.0, "kpa": 1e3, "gpa": 1e9, "MPA": 1e6}
 MODULUS_UNITS |= {"PA": 1.0, "KPA": 1e3}
 MODULUS_UNITS |= dict.fromkeys(("N/m2", "N/m²", "N/m^2"), 1.0) | {"N/mm2": 1e6, "N/mm²": 1e6, "N/mm^2": 1e6}
 MODULUS_UNITS |= {"psi": 6894.757293168, "ksi": 6894757.293168}
 MODULUS_UNITS |= dict.fromkeys(("dyn/cm2", "dyn/cm²", "dyn/cm^2", "dyne/cm2", "dyne/cm²", "dyne/cm^2"), 0.1)
-#: Units in `PER_SECOND` leave a factor of 2 pi open, so they are accepted only in columns whose heading says angular.
+#: Units in `PER_SECOND` may mean Hz or rad/s, so they are accepted only if the heading names an angular frequency.
 PER_SECOND = ("1/s", "s-1", "s^-1", "s⁻¹")
 FREQUENCY_UNITS = {"hz": 2 * np.pi, "khz": 2e3 * np.pi} | dict.fromkeys(("rad/s", "rad/sec", "rad_s", *PER_SECOND), 1.0)
 FREQUENCY_UNITS |= dict.fromkeys(("rad s-1", "rad_s-1", "rad s^-1", "rad·s-1", "rad.s-1", "rad*s-1"), 1.0)
@@ -30,7 +30,7 @@ RAW_TORQUE_UNITS = {
     "strain": {"%": 0.01, "percent": 0.01, "1": 1.0, "": 1.0},
 }
 _PER_PA = {f"1/{unit}": 1 / factor for unit, factor in MODULUS_UNITS.items()} | {"Pa-1": 1.0, "Pa^-1": 1.0}
-#: Units of tests in time; the first unit is the default.
+#: Units of relaxation and creep tests; the first unit of each quantity is the default.
 TIME_TEST_UNITS = {
     "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "ms": 1e-3}
     | {"sec": 1.0, "seconds": 1.0, "minutes": 60.0, "hr": 3600.0, "hours": 3600.0},
@@ -53,7 +53,7 @@ INDENTATION_UNITS = {
     "depth": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9},
     "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "µN": 1e-6, "μN": 1e-6, "nN": 1e-9, "pN": 1e-12},
 }
-#: Units of shear waves; the first unit is the default. 1 Np is a factor of e.
+#: Units of shear waves; the first unit of each quantity is the default. 1 Np (neper) is a factor of e in amplitude.
 WAVE_UNITS = {
     "frequency": {"Hz": 2 * np.pi, "kHz": 2e3 * np.pi, "rad/s": 1.0, "rad_s": 1.0},
     "velocity": {"m/s": 1.0, "m_s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
@@ -63,5 +63,5 @@ WAVE_UNITS = {
 
 
 def celsius(kelvin: float | np.ndarray) -> np.ndarray:
-    """Temperatures in °C, rounded so that the subtraction leaves no roundoff."""
+    """Convert temperatures from K to °C. The result is rounded, which removes the roundoff of the subtraction."""
     return np.round(np.asarray(kelvin) - 273.15, 9)

@@ -1,21 +1,21 @@
-"""Spreadsheets (.xls, .xlsx, .xlsb, .ods) as lines of text. Every sheet is a table with tabs between the cells."""
+"""Convert spreadsheets (.xls, .xlsx, .xlsb, .ods) to lines of text. Each sheet is a table with tabs between cells."""
 
 import io
 from pathlib import Path
 
 from liverjax.core.errors import InputError
 
-#: First bytes of the old binary format (OLE) and of the zip archive of the new one.
+#: First bytes of a workbook in the old binary format (OLE), and of a zip archive (new formats).
 OLD, ZIP = bytes.fromhex("d0cf11e0a1b11ae1"), b"PK\x03\x04"
 
 
 def is_one(data: bytes) -> bool:
-    """Whether the bytes are a workbook."""
+    """Return whether the bytes are the content of a workbook."""
     return data.startswith(OLD) or (data.startswith(ZIP) and (b"xl/" in data or b"opendocument.spreadsheet" in data))
 
 
 def text(path: Path, data: bytes, wanted: str) -> str:
-    """The sheets of a workbook, one after the other, in the form of an instrument's text export: each sheet is a step.
+    """Return all sheets of a workbook in the form of an instrument's text export, in which each sheet is a test step.
 
     Args:
         path: path of the file, for error messages.
@@ -23,7 +23,7 @@ def text(path: Path, data: bytes, wanted: str) -> str:
         wanted: what to export as CSV if the workbook cannot be read, e.g. "the sheet of the sweep".
 
     Raises:
-        InputError: the reader of workbooks is not installed, or the workbook is damaged.
+        InputError: python-calamine, which reads workbooks, is not installed, or the workbook is damaged.
     """
     try:
         import python_calamine
@@ -35,7 +35,7 @@ def text(path: Path, data: bytes, wanted: str) -> str:
     try:
         book = python_calamine.CalamineWorkbook.from_filelike(io.BytesIO(data))
         sheets = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
-    except Exception as error:  # the library has an exception for each format, and raises other ones for damaged bytes
+    except Exception as error:  # the library has one exception per format, and raises others for damaged files
         raise InputError(
             f"{path} is a spreadsheet workbook that cannot be read ({_line(error)}): save it again, or export {wanted} "
             "as CSV"
@@ -45,5 +45,5 @@ def text(path: Path, data: bytes, wanted: str) -> str:
 
 
 def _line(cell: object) -> str:
-    """A cell as text, without tabs and line ends. Numbers keep all their digits."""
+    """Return a cell as text, without tabs and line ends. Numbers keep all their digits."""
     return " ".join(str(cell).split())

@@ -1,4 +1,4 @@
-"""Files of a fit of a strain sweep: fit.json and fit.png, and a table on the terminal."""
+"""Write the results of a fit to a strain sweep: fit.json and fit.png, and a table on the terminal."""
 
 import json
 from collections.abc import Sequence
@@ -48,14 +48,15 @@ def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequen
 
 
 def table(sweep: StrainSweep, fits: list[StrainFit]) -> str:
-    """Table of the laws, with the best law first; and the third harmonic of the best law at the largest strain."""
+    """Return the table of the laws, best law first, and the third harmonic of the best law at the largest strain."""
     most, third = 100 * sweep.strain[-1], round(100 * fits[0].third[-1], 9)
     said = f"{fits[0].law.label}: at a strain of {most:.3g} % the third harmonic is {third:.2g} % of the first"
     return "\n".join([curves_report.table([f.law for f in fits]), said])
 
 
 def figure(sweep: StrainSweep, fits: list[StrainFit]) -> "Figure":
-    """Moduli over strain with the best laws on the left; the third harmonics that these laws predict on the right."""
+    """Plot the moduli over strain with the best laws (left), and the third harmonics that these laws predict
+    (right)."""
     fig = pyplot().figure(figsize=(10, 4.2), layout="constrained")
     left, right = fig.subplots(1, 2)
     percent = 100 * sweep.strain

@@ -1,4 +1,4 @@
-"""Files of a fit of stress-stretch curves: curves.json and curves.png, and a table on the terminal."""
+"""Write the results of a fit to stress-stretch curves: curves.json and curves.png, and a table on the terminal."""
 
 import json
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ def best_first(fits: list[LawFit]) -> list[LawFit]:
 
 
 def summary(fit: LawFit) -> Content:
-    """The entry of one law in curves.json."""
+    """Return the entry of one law in curves.json."""
     return {
         "law": fit.label,
         "parameters": dict(zip(fit.names, fit.values.tolist(), strict=True)),
@@ -57,8 +57,8 @@ def summary(fit: LawFit) -> Content:
 
 
 def write(out: Path, curves: list[Curve], fits: list[LawFit], structured: Sequence[str] = ()) -> None:
-    """Write curves.json and curves.png into the existing folder `out`. `structured`: sentences on structured
-    misfits."""
+    """Write curves.json and curves.png into the existing folder `out`. `structured`: warnings about structured misfits
+    (residuals with a pattern that noise does not explain)."""
     ordered = best_first(fits)
     content = {
         "best": ordered[0].label,
@@ -77,7 +77,7 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit], structured: Sequen
 
 
 def figure(curves: list[Curve], ordered: list[LawFit]) -> "Figure":
-    """Every curve with the best laws; below, the error and the number of parameters of each law."""
+    """Plot each curve with the best laws; below, the error and the number of parameters of each law."""
     shown = ordered[: len(COLOURS)]
     columns = min(4, len(curves))
     rows = -(-len(curves) // columns)
@@ -107,10 +107,10 @@ def figure(curves: list[Curve], ordered: list[LawFit]) -> "Figure":
 
 
 def fine(curve: Curve) -> Curve:
-    """The deformations of a curve at `FINE` points along it, with a stress of zero.
+    """Return the deformations of a curve at `FINE` points along the curve, with a stress of zero.
 
-    Between two measured points, the shears and the logarithms of the diagonal of F change linearly. So a tension test
-    stays a tension test: its sides keep the stretch lambda^(-1/2). F33 is scaled so that the volume stays the same.
+    Between two measured points, the shears and the logarithms of the diagonal of F change linearly. So in a tension
+    test the lateral stretch stays lambda^(-1/2). F33 is scaled so that the volume stays the same.
     """
     at, places = np.linspace(0, len(curve.stress) - 1, FINE), np.arange(len(curve.stress))
     F = np.zeros((FINE, 3, 3))
@@ -136,7 +136,7 @@ def _curve(axis: Any, curve: Curve, dense: Curve, stresses: list[np.ndarray]) ->
 
 
 def table(fits: list[LawFit]) -> str:
-    """One line per law, with the best law first: error, times, criterion, G0, parameters ± standard error."""
+    """Return one line per law, best law first: error, times, criterion, G0, parameters ± standard error."""
     lines = [f"{'law':18s} {'error':>7s} {'run':>8s} {'compile':>8s} {'AICc':>8s}  G0 [Pa]    parameters"]
     for f in best_first(fits):
         parameters = ", ".join(

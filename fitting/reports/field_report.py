@@ -1,4 +1,4 @@
-"""Files of a fit to displacements: field.json, and for a map field.vtu, field.h5 and field.png."""
+"""Write the results of a fit to displacements: field.json, and for a map field.vtu, field.h5 and field.png."""
 
 import json
 from pathlib import Path
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Above TOO_FAR of chi^2 per component, a warning says that the model misses something. Below TOO_NEAR, the stated
-#: noise counts as too large. With FEW components, chi^2 is below TOO_NEAR by chance once in a million times.
+#: If chi^2 per component is above TOO_FAR, a warning says that the model does not explain the data. Below TOO_NEAR, the
+#: stated noise counts as too large. With FEW components, this happens by chance once in a million times.
 TOO_FAR, TOO_NEAR, FEW = 1.5, 0.4, 50
-#: If chi^2 is too large, the mesh error is reported too if it exceeds this many times the noise of the data.
+#: If chi^2 is too large, a mesh error above this many times the noise of the data is reported too.
 MESH = 1.0
 
 
 def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
-    """A warning if the fit misses the displacements by more than their noise, or by much less than their noise; else
+    """Return a warning if the residuals are much larger or much smaller than the noise of the displacements, or else
     None.
 
     If the noise contains an estimate of the mesh error (`with_mesh`), a small misfit does not mean that the noise is
@@ -41,17 +41,17 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
     ratio = found.chi2 / found.components
     if ratio < TOO_NEAR and found.components >= FEW and not with_mesh:
         return (
-            f"chi2 is {ratio:.3g} per component, so the displacements scatter {np.sqrt(ratio):.2g} times as much as "
-            "the stated noise, and the errors are too large by this factor: give the noise (--noise) in metres, "
-            "whatever the unit of the file is"
+            f"chi2 is {ratio:.3g} per component, so the displacements scatter {np.sqrt(ratio):.2g} times as much "
+            "as the stated noise, and the errors are too large. Give the noise (--noise) in metres, whatever the unit "
+            "of the file is"
         )
     if not ratio > TOO_FAR:
         return None
     if not np.any(np.isfinite(found.standard_errors)):
         return (
-            f"no values of {', '.join(found.names)} explain the displacements (chi2 is {ratio:.3g} per component): the "
-            "fit ran away, and the values that are printed mean nothing; look at the unit (--unit), the sign and the "
-            "origin of the coordinates, node numbers (from 0), loads and supports"
+            f"no values of {', '.join(found.names)} explain the displacements (chi2 is {ratio:.3g} per component). The "
+            "fit ran away, and the printed values have no meaning: check the unit (--unit), the sign and the origin "
+            "of the coordinates, node numbers (from 0), loads and supports"
         )
     said = (
         f"chi2 stays at {ratio:.3g} per component, so the fit misses the displacements by {np.sqrt(ratio):.2g} times "
@@ -60,27 +60,27 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
     if found.mesh_over_noise is not None and found.mesh_over_noise > MESH:
         said += (
             f"; the mesh's error in the data is {found.mesh_over_noise:.2g} times the noise: refine the mesh, or use "
-            "order = 2 if it is 1 (the bias of a region's border that goes through elements is not in the mesh bias)"
+            "order = 2 if it is 1 (the mesh bias does not contain the error of a region border inside elements)"
         )
     return (
-        f"{said}; look at the unit (--unit), the origin of the coordinates, node numbers (from 0), rows of zeros, "
+        f"{said}; check the unit (--unit), the origin of the coordinates, node numbers (from 0), rows of zeros, "
         "loads and supports, or give a larger --noise"
     )
 
 
 def noise_sentence(found: Field) -> str | None:
-    """A warning if the residuals of a map exceed the stated noise by more than chance explains; else None."""
+    """Return a warning if the residuals of a map exceed the stated noise by more than chance explains, or else None."""
     chance = 3 * np.sqrt(2 * found.components)
     if found.reached or found.chi2 <= found.components + chance:
         return None
     return (
         f"chi2 stays at {found.chi2 / found.components:.3g} per component: the stated noise is too small, or the scene "
-        "misses something (mesh, supports, loads)"
+        "is not correct (mesh, supports, loads)"
     )
 
 
 def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
-    """The content of field.json for a few parameters. `with_mesh`: see `misfit_sentence`."""
+    """Return the content of field.json for a few parameters. `with_mesh`: see `misfit_sentence`."""
     return {
         "values": dict(zip(found.names, found.values.tolist(), strict=True)),
         "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
@@ -98,18 +98,18 @@ def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
 
 
 def _mapped(mesh: TetMesh, found: Field) -> np.ndarray:
-    """Numbers of the nodes at which the map says something: those of elements without a value from a [[region]]."""
+    """Return the indices of the nodes with a value of the map: those of elements without a value from a [[region]]."""
     return np.unique(mesh.element_nodes_on_host[:, ~found.given])
 
 
 def _sd_of_map(mesh: TetMesh, found: Field) -> np.ndarray:
-    """Standard deviations of m at the vertices among these nodes."""
+    """Return the standard deviations of the logarithm of the map at the mapped vertices (see `_mapped`)."""
     mapped = _mapped(mesh, found)
     return found.sd[mapped[mapped < len(found.sd)]]
 
 
 def of_field(mesh: TetMesh, found: Field) -> Content:
-    """The content of field.json for a map."""
+    """Return the content of field.json for a map."""
     sd = _sd_of_map(mesh, found)
     return {
         "name": found.name,
@@ -156,8 +156,8 @@ def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> No
 
 
 def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n: int = 200) -> tuple[np.ndarray, tuple]:
-    """The values at the vertices (V,), interpolated on a plane through `middle` normal to `axis` (NaN outside of the
-    body); and the extent of the plane [cm]."""
+    """Interpolate values at the vertices (V,) on a plane through `middle` normal to `axis`. Return the values on the
+    plane (NaN outside of the body), and the extent of the plane [cm]."""
     X = np.asarray(mesh.points)
     low, high = X.min(axis=0), X.max(axis=0)
     a, b = (k for k in range(3) if k != axis)
@@ -171,8 +171,8 @@ def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n:
 
 
 def map_figure(mesh: TetMesh, found: Field) -> "Figure":
-    """Sections through the node whose value is farthest from the median: the factor on the parameter of the scene, and
-    its uncertainty."""
+    """Plot sections through the node whose value is farthest from the median: the factor that multiplies the parameter
+    of the scene, and the uncertainty of this factor."""
     shown = np.isin(np.arange(len(found.sd)), _mapped(mesh, found))
     factor, sd = (np.where(shown, values, np.nan) for values in (np.exp(found.log_factor), found.sd))
     middle = np.asarray(mesh.points)[np.nanargmax(np.abs(np.log(factor) - np.nanmedian(np.log(factor))))]
@@ -194,7 +194,7 @@ def map_figure(mesh: TetMesh, found: Field) -> "Figure":
 
 
 def table_of_numbers(found: Estimate) -> str:
-    """Names, values, standard errors and mesh bias of the parameters, for the terminal."""
+    """Return a table of names, values, standard errors and mesh bias of the parameters, for the terminal."""
     width = max(map(len, found.names))
     rows = [f"{'parameter':{width}}  {'value':>11}  {'standard error':>14}  {'mesh bias':>11}"]
     bias = ["not known"] * len(found.names) if found.mesh_bias is None else [f"{b:.3g}" for b in found.mesh_bias]
@@ -205,7 +205,7 @@ def table_of_numbers(found: Estimate) -> str:
 
 
 def table_of_field(mesh: TetMesh, found: Field) -> str:
-    """Table of the tried fits, and the result, for the terminal."""
+    """Return a table of the fits for each prior, and the result, for the terminal."""
     rows = ["prior sd  chi2/component  iterations  evaluations  seconds"]
     for h in found.history:
         rows.append(

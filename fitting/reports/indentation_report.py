@@ -1,4 +1,4 @@
-"""Files of a fit of an indentation curve: fit.json and fit.png, and a table on the terminal."""
+"""Write the results of a fit to an indentation curve: fit.json and fit.png, and a table on the terminal."""
 
 import json
 from pathlib import Path
@@ -27,8 +27,8 @@ _WIDE, _DEEP = 0.4, 0.2
 def write(
     out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit, level: ContactFit | None = None
 ) -> Content:
-    """Write both files and return the JSON. `level`: fit without a tilt of the base line, if the base line of `fit` has
-    one."""
+    """Write both files and return the JSON. `level`: second fit without a tilt of the base line, if `fit` has a
+    tilt."""
     out.mkdir(parents=True, exist_ok=True)
     G, errors = fit.modulus / (2 * (1 + rig.poisson)), fit.standard_errors
     alone = half_space(rig, curve.depth - fit.contact_point)
@@ -77,10 +77,10 @@ def _of_level(level: ContactFit) -> Content:
 def indentation_warnings(
     curve: IndentationCurve, rig: Indenter, fit: ContactFit, level: ContactFit | None = None
 ) -> list[str]:
-    """Warnings about the modulus, for the user."""
+    """Return warnings about the modulus for the user."""
     told, deepest = [], float(curve.depth.max() - fit.contact_point)
     if fit.before < 3:
-        told.append(f"{fit.before} points are before contact: measure the approach too, it fixes the contact point")
+        told.append(f"{fit.before} points are before contact: measure the approach too, to find the contact point")
     if level is not None:
         told.append(
             "the force rises or falls steadily before contact: the sensor drifts, and this changes modulus and "
@@ -92,9 +92,9 @@ def indentation_warnings(
         far = (
             f"the contact is {width:.0%} of the radius wide"
             if width > _WIDE
-            else f"the indenter goes {deepest:.3g} m deep, {deepest / rig.thickness:.0%} of the thickness"
+            else f"the indentation depth is {deepest:.3g} m, {deepest / rig.thickness:.0%} of the thickness"
         )
-        told.append(f"{far}: the theory is for small strains; also fit only a part of the curve, and compare")
+        told.append(f"{far}, but the theory is for small strains: also fit only a part of the curve, and compare")
     if fit.modulus <= 0:
         told.append("the modulus is not positive: the force does not rise with the depth; check the signs")
     # The points before contact contain only noise. With these points, a misfit in contact would look like noise.
@@ -102,14 +102,15 @@ def indentation_warnings(
     runs, chance = runs_probability(touching)
     if chance < 1e-3:
         told.append(
-            f"structured misfit: residuals in contact change sign {runs - 1} times over {len(touching)} points (by "
-            f"chance: {chance:.1g}): another shape, layer or material, a material that relaxes meanwhile, or noise "
-            "that neighbours share"
+            f"structured misfit: residuals in contact change sign only {runs - 1} times in {len(touching)} points "
+            f"(probability by chance {chance:.1g}). Possible causes: another indenter shape, a layer, another material "
+            "law, relaxation during the test, or correlated noise"
         )
     if fit.independent is not None:
         told.append(
-            f"neighbouring points share their noise, or the model misses something: {len(fit.residuals)} points "
-            f"measure as much as {fit.independent:.0f} of independent noise; standard errors are those of such noise"
+            "neighbouring residuals are correlated: the noise is correlated, or the model is incomplete. The "
+            f"{len(fit.residuals)} points carry the information of {fit.independent:.0f} independent points; the "
+            "standard errors include this"
         )
     # The noise is estimated from neighbouring points, because the residuals contain the adhesion.
     if curve.force.min() < -5 * noise_of_series(curve.force):
@@ -118,10 +119,10 @@ def indentation_warnings(
 
 
 def table(rig: Indenter, fit: ContactFit, content: Content) -> str:
-    """Modulus and contact point ± standard error."""
+    """Return a table with modulus and contact point ± standard error."""
     e, offset = content["standard_errors"], []
     if fit.offset_error:
-        offset = [f"F0  {fit.offset:11.5g} ± {fit.offset_error:<9.2g} N, force before contact that is left"]
+        offset = [f"F0  {fit.offset:11.5g} ± {fit.offset_error:<9.2g} N, remaining force before contact"]
     return "\n".join(
         [
             f"{rig.shape} on a bonded layer of {1e3 * rig.thickness:g} mm, Poisson's ratio {rig.poisson:g}",
@@ -135,7 +136,7 @@ def table(rig: Indenter, fit: ContactFit, content: Content) -> str:
 
 
 def figure(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> "Figure":
-    """The curve and its residuals."""
+    """Plot the curve and its residuals."""
     fig, (above, below) = pyplot().subplots(
         2, 1, figsize=(6, 5), sharex=True, height_ratios=(3, 1), layout="constrained"
     )

@@ -1,4 +1,4 @@
-"""Prony modes as material cards of liverjax, FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
+"""Write Prony modes as material cards for liverjax, FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
 
 All cards are neo-Hookean with G0, the instantaneous shear modulus. The whole stress relaxes, as in the simulations here
 (part = "all"). A shear test does not determine the bulk modulus. It is computed from Poisson's ratio `POISSON`.
@@ -19,11 +19,11 @@ LARGEST_SUM = 1 - 1e-6
 
 
 def write(folder: Path, model: Maxwell) -> list[str]:
-    """Write the files. Return sentences on everything that a program cannot represent."""
+    """Write the files. Return notes on everything that a program cannot represent."""
     folder.mkdir(parents=True, exist_ok=True)
     told = []
     if len(model.ratios) > FEBIO_TERMS:
-        told.append(f"FEBio has at most {FEBIO_TERMS} modes, the model has {len(model.ratios)}: no card for it")
+        told.append(f"FEBio has at most {FEBIO_TERMS} modes, but the model has {len(model.ratios)}: no FEBio card")
         (folder / "febio.feb").unlink(missing_ok=True)
     else:
         (folder / "febio.feb").write_text(febio(model))
@@ -43,7 +43,7 @@ def write(folder: Path, model: Maxwell) -> list[str]:
 
 
 def _span(model: Maxwell) -> str:
-    """A sentence on the relaxation that a card does not contain."""
+    """Return a sentence on the relaxation that a card does not contain."""
     times = np.asarray(model.relaxation_times)
     return f"Modes of {times.min():.3g} to {times.max():.3g} s: faster and slower relaxation is not in this card."
 
@@ -57,12 +57,12 @@ def _written_number(value: float) -> str:
 
 
 def _below_one(ratios: np.ndarray) -> np.ndarray:
-    """The ratios. The ratios of a fluid are reduced so that a millionth of G0 does not relax."""
+    """Return the ratios. The ratios of a fluid are reduced so that a millionth of G0 does not relax."""
     return np.asarray(ratios) * min(1.0, LARGEST_SUM / max(float(np.sum(ratios)), 1e-300))
 
 
 def scene_tables(model: Maxwell) -> str:
-    """Tables for a scene file of liverjax: the law with G0, and the viscosity."""
+    """Return tables for a scene file of liverjax: the law with G0, and the viscosity."""
     G0, ratios, times = model
     return "\n".join(
         [
@@ -83,7 +83,7 @@ def scene_tables(model: Maxwell) -> str:
 
 
 def febio(model: Maxwell) -> str:
-    """A viscoelastic material. g0 is the equilibrium part, so the elastic law is the instantaneous law."""
+    """Return a viscoelastic material. g0 is the equilibrium fraction, so the elastic law is the instantaneous law."""
     G0, ratios, times = model
     young = _written_number(2 * (1 + POISSON) * float(G0))
     terms = [f"      <t{k}>{_written_number(t)}</t{k}>" for k, t in enumerate(times, 1)]
@@ -110,8 +110,8 @@ def febio(model: Maxwell) -> str:
 
 
 def abaqus(model: Maxwell) -> str:
-    """A hyperelastic material with instantaneous moduli, C10 = G0 / 2 and D1 = 2 / K. Each mode has a line g, k,
-    tau."""
+    """Return a hyperelastic material with instantaneous moduli, C10 = G0 / 2 and D1 = 2 / K (K: bulk modulus). Each
+    mode has a line with shear ratio g, bulk ratio k and relaxation time tau."""
     G0, ratios, times = model
     kept = zip(_below_one(ratios), times, strict=True)
     rows = [f"{_written_number(g)}, {_written_number(g)}, {_written_number(t)}" for g, t in kept]
@@ -130,8 +130,8 @@ def abaqus(model: Maxwell) -> str:
 
 
 def ansys(model: Maxwell) -> str:
-    """Mechanical APDL: a neo-Hookean law with mu = G0 and d = 2 / K. Shear and bulk have the same Prony pairs, with six
-    values per line."""
+    """Return commands of Mechanical APDL: a neo-Hookean law with mu = G0 and d = 2 / K (K: bulk modulus). Shear and
+    bulk have the same Prony pairs, with six values per line."""
     G0, ratios, times = model
     pairs = [_written_number(v) for pair in zip(ratios, times, strict=True) for v in pair]
     data = [f"TBDATA,{k + 1},{','.join(pairs[k : k + 6])}" for k in range(0, len(pairs), 6)]
@@ -143,7 +143,8 @@ def ansys(model: Maxwell) -> str:
 
 
 def sofa(model: Maxwell) -> str:
-    """A hyperelastic force field at the equilibrium modulus. SOFA has no Prony series, so a comment contains it.
+    """Return a hyperelastic force field with the equilibrium modulus. SOFA has no Prony series, so the series is in a
+    comment.
 
     The energy of SOFA's law is mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2. So the second parameter is Lame's lambda,
     not the bulk modulus.
@@ -154,7 +155,7 @@ def sofa(model: Maxwell) -> str:
     what = "equilibrium" if shear == rest else "instantaneous (the model is a fluid)"
     modes = "; ".join(f"{_written_number(g)} {_written_number(t)}" for g, t in zip(ratios, times, strict=True))
     return (
-        f"<!-- SI units: Pa, s. The {what} shear modulus of these modes: SOFA has no Prony series of its own.\n"
+        f"<!-- SI units: Pa, s. The {what} shear modulus of these modes: SOFA has no Prony series.\n"
         f"     {_span(model)}\n"
         f"     G0 {_written_number(float(G0))}; ratio and relaxation time of each mode: {modes} -->\n"
         '<TetrahedronHyperelasticityFEMForceField materialName="NeoHookean" '

@@ -1,4 +1,4 @@
-"""A fit on one page for printing: pictures, parameters, notes and warnings."""
+"""Write a fit on one page for printing: pictures, parameters, notes and warnings."""
 
 import textwrap
 from pathlib import Path
@@ -21,7 +21,7 @@ CHARACTERS, SIZE = 104, 8.0
 
 
 def write(file: Path, sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> None:
-    """Write the page as PDF, or in another format, by the ending of the file name.
+    """Write the page as PDF, or in another format that the ending of the file name shows.
 
     Args:
         sweep, fits: see `sweep_report.write`.
@@ -32,7 +32,7 @@ def write(file: Path, sweep: Sweep, fits: list[Fit], content: Content, first: st
 
 
 def page(sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> "Figure":
-    """The page as a figure."""
+    """Return the page as a figure."""
     figure = pyplot().figure(figsize=(WIDTH, HEIGHT))
     place = {"left": 0.12, "right": 0.96, "top": 0.91, "bottom": TEXT + 0.04, "wspace": 0.3}
     grid = figure.add_gridspec(2, 2, width_ratios=(3, 2), height_ratios=(3, 1), **place)
@@ -49,7 +49,7 @@ def page(sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> "F
 
 
 def text_of_page(sweep: Sweep, fits: list[Fit], content: Content, first: str = "") -> list[str]:
-    """The lines below the pictures."""
+    """Return the lines below the pictures."""
     f = content["shear_waves"]["frequency_Hz"]
     rows = [
         f"{len(f)} frequencies from {f[0]:.3g} to {f[-1]:.3g} Hz; errors are standard errors",
@@ -58,7 +58,7 @@ def text_of_page(sweep: Sweep, fits: list[Fit], content: Content, first: str = "
     ]
     for row in sweep_report.table(sweep, fits).splitlines():
         rows += [row] if len(row) <= CHARACTERS else textwrap.wrap(row, CHARACTERS, subsequent_indent="  ")
-    for head, sentences in (("Notes", content["notes"]), ("To be careful of", content["warnings"])):
+    for head, sentences in (("Notes", content["notes"]), ("Warnings about this fit", content["warnings"])):
         if sentences:
             rows += ["", f"{head}:"]
         for sentence in sentences:

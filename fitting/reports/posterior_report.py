@@ -1,4 +1,4 @@
-"""Reports of the draws of a posterior: a part of fit.json, the file posterior.csv, and lines on the terminal."""
+"""Report the draws of a posterior: a part of fit.json, the file posterior.csv, and lines on the terminal."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ QUANTILES = (0.025, 0.5, 0.975)
 
 
 def summary(p: Posterior) -> Content:
-    """The part `posterior` of fit.json."""
+    """Return the part `posterior` of fit.json."""
     flat = p.draws.reshape(-1, p.draws.shape[-1])
     rows = zip(p.names, flat.mean(axis=0), flat.std(axis=0, ddof=1), *np.quantile(flat, QUANTILES, axis=0), strict=True)
     evidence = p.chains.log_evidence
@@ -44,7 +44,7 @@ def write_draws(path: Path, p: Posterior) -> None:
 
 
 def table(p: Posterior) -> str:
-    """Medians and 95 % intervals."""
+    """Return lines with medians and 95 % intervals."""
     flat = p.draws.reshape(-1, p.draws.shape[-1])
     low, middle, high = np.quantile(flat, QUANTILES, axis=0)
     chains, count, _ = p.draws.shape
@@ -55,5 +55,5 @@ def table(p: Posterior) -> str:
     ]
     if p.simulated:
         count, apart = p.simulated["draws"], p.simulated["largest_difference"]
-        rows.append(f"{count:.0f} draws simulated: log density off by {apart:.2g} at most")
+        rows.append(f"{count:.0f} draws simulated: log density differs by {apart:.2g} at most")
     return "\n".join(rows)

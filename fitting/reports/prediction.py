@@ -1,4 +1,4 @@
-"""Prediction of a test that was not fitted: how far the prediction is off, and whether its stated errors cover this."""
+"""Predict a test that was not fitted, and check the size of the error and the coverage of the stated intervals."""
 
 from typing import NamedTuple
 
@@ -41,8 +41,8 @@ class Prediction(NamedTuple):
 
     @property
     def covered(self) -> float:
-        """Share of the measured values in the band that lie within the 95 % interval of the prediction. This interval
-        contains the scatter of the measured values."""
+        """Fraction of the measured values in the band that lie within the 95 % interval of the prediction. This
+        interval contains the scatter of the measured values."""
         off = (self.predicted - self.measured)[self.inside]
         own = self.scales[self.inside] * noise_of_series(off / self.scales[self.inside])
         return float(
@@ -51,7 +51,7 @@ class Prediction(NamedTuple):
 
 
 def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Prediction:
-    """Predict a test.
+    """Predict a test, and compare the prediction with the measured values.
 
     Args:
         fit: fit of a sweep. Its Prony modes are the model.
@@ -81,16 +81,16 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
 
 
 def sentence(found: Prediction) -> str:
-    """One line for the user."""
+    """Return one line about a prediction for the user."""
     share, inside = len(found.measured), int(found.inside.sum())
     name = f"{found.name} {found.source}"
     if not inside:
-        return f"{name}: predicted, but all its {share} values lie outside the band of the sweep"
+        return f"{name}: predicted, but all {share} values lie outside the band of the sweep"
     off = 100 * found.relative_errors[found.inside].mean()
     told = (
-        f"{name}: predicted within {off:.2g} % on average; {100 * found.covered:.0f} % of {inside} numbers within the "
+        f"{name}: predicted within {off:.2g} % on average; {100 * found.covered:.0f} % of {inside} numbers lie in the "
         f"95 % interval of the prediction"
     )
     if abs(found.factor - 1) > 0.005 * off:  # one factor explains half of the error
-        told += f"; {found.factor:.3g} times the prediction would fit it best"
+        told += f"; {found.factor:.3g} times the prediction would fit the test best"
     return told + (f"; {share - inside} numbers outside the band are not counted" if inside < share else "")

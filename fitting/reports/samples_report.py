@@ -1,4 +1,4 @@
-"""Files of a fit of several samples: fit.json, fit.png and fit.h5, and a table on the terminal."""
+"""Write the results of a fit to several samples: fit.json, fit.png and fit.h5, and a table on the terminal."""
 
 import json
 from pathlib import Path
@@ -32,7 +32,7 @@ def write(out: Path, found: Samples) -> Content:
 
 
 def _json_content(found: Samples) -> Content:
-    """The content of fit.json: first a typical sample, then the population and all samples."""
+    """Return the content of fit.json: first a typical sample, then the population and all samples."""
     typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
     own = (
         {}
@@ -64,7 +64,7 @@ def _json_content(found: Samples) -> Content:
 
 
 def _times_of_strengths(found: Samples) -> Content:
-    """Relaxation time [s] of each strength of a spectrum, by the name of the strength."""
+    """Return the relaxation time [s] of each strength of a spectrum, by the name of the strength."""
     out: Content = {}
     for fit in found.fits:
         names = (n for n in fit.kind.names if n.startswith("strengths["))
@@ -73,7 +73,7 @@ def _times_of_strengths(found: Samples) -> Content:
 
 
 def _labels(found: Samples) -> dict[str, str]:
-    """Names of the parameters for the user: a strength is named by its relaxation time."""
+    """Return the names of the parameters for the user. A strength is named by its relaxation time."""
     times = _times_of_strengths(found)["relaxation_times"] if found.kind.effective is not None else {}
     return {n: f"strength at {times[n]:.3g} s" if n in times else n for n in found.populations}
 
@@ -98,7 +98,7 @@ def _population(p: Any) -> Content | None:
 
 
 def _sample_entry(found: Samples, k: int) -> Content:
-    """The fit of one sample by itself, and its parameters moved towards the population (pooled)."""
+    """Return the separate fit of one sample, and its parameters shrunk towards the population mean (pooled)."""
     fit, sweep = found.fits[k], found.sweeps[k]
     pooled = {
         name: {"value": p.pooled[k], "standard_deviation_of_logarithm": p.pooled_errors[k]}
@@ -109,26 +109,26 @@ def _sample_entry(found: Samples, k: int) -> Content:
 
 
 def warnings(found: Samples) -> list[str]:
-    """Warnings on the population; and for each warning on single samples, the number of samples that have it."""
+    """Return warnings about the population, and the number of samples that have each warning about single samples."""
     out = []
     for name, p in found.populations.items():
         own = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
         if name.startswith("strengths["):
             continue  # no warning: many strengths are zero or not determined
         if p is None and "exponent" in name and np.all(np.abs(own - np.round(own[0])) < 1e-3):
-            out.append(f"{name}: it is {np.round(own[0]):g} in all samples, the springpot is a pure spring or dashpot")
+            out.append(f"{name}: it is {np.round(own[0]):g} in all samples, so the springpot is a spring or dashpot")
         elif p is None:
             out.append(f"{name}: fewer than two samples determine this parameter, so it has no population")
         else:
             if p.spread == 0:
                 out.append(
-                    f"{name}: the errors of the samples explain their differences; no spread between samples is found"
+                    f"{name}: the errors of the fits explain all differences; no spread between samples is found"
                 )
             without = [Path(s.source).name for s, x in zip(found.sweeps, p.pooled, strict=True) if np.isnan(x)]
             if without:
                 out.append(
                     f"{name}: {', '.join(without)} does not determine it (a fluid, or another band?), so the "
-                    "population is that of the others"
+                    "population contains only the other samples"
                 )
     out += _limits_of_typical(found)
     out += outliers(found)
@@ -144,29 +144,29 @@ def warnings(found: Samples) -> list[str]:
         out.append(f"the fit of {', '.join(failed)} did not converge; its best point is given: try fewer modes")
     for words, told in (
         ("mark of the instrument", "the last points show the instrument"),
-        ("Kramers-Kronig", "the data do not agree with themselves"),
+        ("Kramers-Kronig", "G' and G'' are not consistent with each other"),
         ("structured misfit", "the misfit has structure"),
-        ("half decade", "the ends of the band decide some parameters"),
+        ("half decade", "some parameters depend on the ends of the band"),
         (SHORT, "the test ends before the material has relaxed, and no interval of G_inf contains the rest"),
         ("(a fluid)", "the equilibrium modulus cannot be distinguished from zero"),
         ("have merged", "two relaxation times have merged"),
-        ("extrapolated", "a relaxation time lies outside of what the frequencies resolve"),
+        ("extrapolated", "a relaxation time lies outside of the range that the frequencies resolve"),
         ("use fewer modes", "a mode is not needed or not determined"),
     ):
         count = sum(any(words in w for w in f.warnings) for f in found.fits)
         if count:
-            out.append(f"in {count} of {len(found.fits)} samples {told}; fit.json has the sentences of each")
+            out.append(f"in {count} of {len(found.fits)} samples {told}; fit.json has the warnings of each sample")
     return out
 
 
-#: A sentence is given if the equilibrium modulus of the typical sample's Prony modes differs from the mean of the
-#: population by more than this (relative).
+#: A warning is given if the equilibrium modulus of the typical sample's Prony modes differs from the population mean by
+#: more than this (relative).
 APART = 0.01
 
 
 def _limits_of_typical(found: Samples) -> list[str]:
-    """A sentence if the equilibrium modulus of the Prony modes at the top of fit.json differs from the mean of the
-    population."""
+    """Return a warning if the equilibrium modulus of the Prony modes at the top of fit.json differs from the population
+    mean."""
     p = found.populations.get("equilibrium_modulus")
     if found.kind.values is None or p is None:
         return []
@@ -174,13 +174,13 @@ def _limits_of_typical(found: Samples) -> list[str]:
     if abs(rest / p.mean - 1) < APART:
         return []
     return [
-        f"the equilibrium modulus of the typical sample's Prony modes is {rest:.4g} Pa, the population's mean "
+        f"the equilibrium modulus of the typical sample's Prony modes is {rest:.4g} Pa, but the population mean is "
         f"{p.mean:.4g} Pa: the modes follow the model {found.kind.name} over the measured band only"
     ]
 
 
 def table(found: Samples) -> str:
-    """The population, the samples, and the criterion of each model."""
+    """Return the tables of the population, of the samples, and of the criterion of each model."""
     units = dict(zip(found.kind.names, found.kind.units, strict=True))
     rows = [
         f"{len(found.fits)} samples, {found.kind.name}",
@@ -200,7 +200,7 @@ def table(found: Samples) -> str:
         middle, new = ends
         rows.append(f"{label:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
     every = [found.values(k) for k in range(len(found.fits))]
-    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # that most samples have
+    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # in most samples
     rows.append(f"{'sample':32s} {'mean error':>10s}   {labels[name]}")
     for (fit, sweep), own in zip(_pairs(found), every, strict=True):
         value, error = own[name]
@@ -217,7 +217,7 @@ def table(found: Samples) -> str:
 
 
 def figure(found: Samples) -> "Figure":
-    """Moduli of all samples on the left; every parameter of every sample, with its population, on the right."""
+    """Plot the moduli of all samples (left), and every parameter of every sample with its population (right)."""
     fig = pyplot().figure(figsize=(10, max(5.0, 0.7 * len(found.populations) + 1.5)), layout="constrained")
     left, right = fig.subplots(1, 2, width_ratios=(5.6, 4.4))
     for fit, sweep in _pairs(found):

@@ -1,4 +1,4 @@
-"""Files of a fit: fit.json, fit.png and fit.h5, and a table on the terminal."""
+"""Write the results of a fit to a sweep: fit.json, fit.png and fit.h5, and a table on the terminal."""
 
 import json
 import math
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Closed form and simulation count as equal up to this part of a standard error.
+#: Closed form and simulation count as equal if they differ by less than this fraction of a standard error.
 AGREED = 0.1
 STEMS = ("ratios", "relaxation_times")
-MARK = "* moves by more than independent noise explains without the first or the last half decade"
+MARK = "* changes by more than independent noise explains if the first or the last half decade is left out"
 
 
 def numbers(values: Any) -> Any:
-    """The values as JSON numbers. Values that are not finite become null."""
+    """Return the values as JSON numbers. Values that are not finite become null."""
     if isinstance(values, dict):
         return {k: numbers(v) for k, v in values.items()}
     if isinstance(values, (list, tuple)):
@@ -47,7 +47,7 @@ def numbers(values: Any) -> Any:
 
 
 def summary(fit: Fit, sweep: Sweep) -> Content:
-    """The content of fit.json for one method."""
+    """Return the content of fit.json for one method."""
     u, n = fit.uncertainty, fit.modes
     errors = fit.relative_errors(sweep)
     e = u.standard_errors
@@ -87,13 +87,13 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
 
 
 def ends_of_interval(details: Content) -> list[float] | None:
-    """Ends of the interval of the equilibrium modulus; None for models other than Prony modes."""
+    """Return the ends of the interval of the equilibrium modulus, or None for models other than Prony modes."""
     found = details.get(INTERVAL)
     return [found["low"], found["high"]] if found else None
 
 
 def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
-    """Moduli of a closed-form fit with their standard errors. These errors contain the uncertainty about the model."""
+    """Return the moduli of a closed-form fit with standard errors, which contain the uncertainty about the model."""
     found = moduli_errors.fitted_moduli(fit, sweep.angular_frequency, sweep.noise_given)
     storage, loss = np.split(found.values, 2)
     errors = np.split(found.standard_errors, 2)
@@ -108,7 +108,7 @@ def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
 
 
 def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | None:
-    """Bias by the names of `standard_errors`; None if it is not known."""
+    """Return the bias of each parameter, with the names of `standard_errors`. Returns None if it is unknown."""
     if moved is None:
         return None
     return {
@@ -120,14 +120,14 @@ def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | No
 
 
 def band_sensitivity(fit: Fit) -> Content:
-    """Changes of the parameters without an end of the band, by the names of `standard_errors`; None if too few points
-    were left."""
+    """Return the changes of the parameters if an end of the band is left out, with the names of `standard_errors`. An
+    entry is None if too few points were left."""
     changes = fit.details.get("band_sensitivity", {})
     return {part: None if found is None else by_stem(found) for part, found in changes.items()}
 
 
 def by_stem(flat: dict[str, float]) -> Content:
-    """Values by the names of `standard_errors`: one list for ratios[0], ratios[1], …"""
+    """Return values with the names of `standard_errors`: one list for ratios[0], ratios[1], …"""
     out: Content = {}
     for name, value in flat.items():
         stem = name.split("[")[0]
@@ -139,7 +139,7 @@ def by_stem(flat: dict[str, float]) -> Content:
 
 
 def own_numbers(p: Estimate | None, kind: Kind) -> Content:
-    """Parameters of a model that is not made of modes, for fit.json."""
+    """Return the parameters of a model that is not made of modes, for fit.json."""
     if p is None:
         return {}
     rows = zip(p.names, p.values, p.standard_errors, kind.units, strict=True)
@@ -147,7 +147,7 @@ def own_numbers(p: Estimate | None, kind: Kind) -> Content:
 
 
 def spectrum_rows(details: Content) -> list[str]:
-    """Lines about a spectrum for the user. Other models have no lines."""
+    """Return lines about a spectrum for the user. Other models have no lines."""
     found = details.get("spectrum")
     if not found:
         return []
@@ -161,7 +161,7 @@ def spectrum_rows(details: Content) -> list[str]:
 
 
 def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = ()) -> list[str]:
-    """Lines with the parameters of a model, and the error of its Prony modes. Parameters in `marked` get a star."""
+    """Return lines with the parameters of a model, and the error of its Prony modes. Names in `marked` get a star."""
     rows = []
     for name, value, error, unit in zip(p.names, p.values, p.standard_errors, kind.units, strict=True):
         if not name.startswith("strengths["):
@@ -201,8 +201,8 @@ def write(
         content["warnings"] += posterior.warnings()
         if alike_points.INDEPENDENT in main.details:
             content["warnings"].append(
-                "the posterior takes the noise of all moduli as independent, and neighbours share it: its intervals "
-                "are too narrow; use the standard errors"
+                "the posterior takes the noise of all moduli as independent, but neighbouring points are correlated: "
+                "its intervals are too narrow; use the standard errors"
             )
         posterior_report.write_draws(out / "posterior.csv", posterior)
     content = numbers(content)
@@ -232,9 +232,9 @@ def _store(path: Path, sweep: Sweep, fits: list[Fit], content: Content) -> None:
 
 
 def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
-    """Moduli and residuals on the left; time constants and the table of parameters on the right.
+    """Plot moduli and residuals (left); time constants and the table of parameters (right).
 
-    Lengths are in inches. The picture grows with the table, so that no panel shrinks and no line is cut off.
+    Lengths are in inches. The picture grows with the table, so no panel shrinks and no line is cut off.
     """
     fit = fits[-1]
     lines = _parameter_rows(fit)
@@ -260,7 +260,7 @@ def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
 
 
 def _nearest_of_all(fits: list[Fit]) -> str:
-    """A second line of the title: how close any linear material, of whatever spectrum, can come to the data."""
+    """Return a second line for the title: the smallest misfit that a linear material of any spectrum can have."""
     misfit = fits[0].details.get("consistency", {}).get("kramers_kronig_misfit")
     if misfit is None:
         return ""
@@ -308,7 +308,8 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
 
 
 def _bands(closed: Fit, sweep: Sweep) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Ends of the 95 % intervals of G' and G'' at the measured frequencies; empty for a compressed sample."""
+    """Return the ends of the 95 % intervals of G' and G'' at the measured frequencies; empty for a compressed
+    sample."""
     if "precompression" in closed.details:
         return {}
     found = moduli_errors.fitted_moduli(closed, sweep.angular_frequency, sweep.noise_given)
@@ -318,8 +319,8 @@ def _bands(closed: Fit, sweep: Sweep) -> dict[str, tuple[np.ndarray, np.ndarray]
 
 
 def _moduli_as_measured(closed: Fit, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """G' and G'' as the instrument measures them. If the sample is compressed, they differ from the moduli of the
-    sample at rest."""
+    """Return G' and G'' as the instrument measures them. If the sample is compressed, they differ from the moduli of
+    the sample at rest."""
     found = closed.details.get("precompression")
     factors = (1.0, 1.0)
     if found is not None:
@@ -334,12 +335,12 @@ def _moduli_as_measured(closed: Fit, omega: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _legend_above(axes: Any, columns: int) -> None:
-    """Put the legend outside of the axes, so that it covers no data."""
+    """Put the legend outside of the axes, where it covers no data."""
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.3, fontsize=8, ncols=columns, frameon=False)
 
 
 def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int = 2) -> None:
-    """Draw ratio over relaxation time with 95 % intervals, and the band that the frequencies resolve.
+    """Draw the Prony ratios over the relaxation times with 95 % intervals, and the band that the frequencies resolve.
 
     Args:
         columns: number of columns of the legend.
@@ -366,7 +367,7 @@ def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int =
 
 
 def _parameter_rows(fit: Fit) -> list[str]:
-    """The moduli and one line per mode, or the parameters of another model."""
+    """Return lines with the moduli and one line per mode, or with the parameters of another model."""
     u, n = fit.uncertainty, fit.modes
     if fit.parameters is not None:
         return own_rows(fit.parameters, fit.kind, fit.details, edges.moved(fit))
@@ -421,7 +422,7 @@ def _lines(fit: Fit) -> list[str]:
 
 
 def table(sweep: Sweep, fits: list[Fit]) -> str:
-    """Parameters ± standard error, side by side for every method; errors and times below."""
+    """Return a table of parameters ± standard error, side by side for every method; errors and times below."""
     columns = []
     for fit in fits:
         errors = fit.relative_errors(sweep)
@@ -453,7 +454,7 @@ SOURCES = {
 
 
 def _totals(fit: Fit) -> list[str]:
-    """Lines with the total errors of the moduli and their shares."""
+    """Return lines with the total errors of the moduli and the contribution of each source."""
     whole, parts, known = total_error.total_errors(fit), total_error.error_shares(fit), edges.values(fit)
     symbols = {"shear_modulus": "G0", "equilibrium_modulus": "G_inf"}
     out = []
@@ -465,7 +466,7 @@ def _totals(fit: Fit) -> list[str]:
 
 
 def _compression(fits: list[Fit]) -> list[str]:
-    """Lines with the assumed compression of the sample, and with the axial force as a check of it."""
+    """Return lines with the assumed compression of the sample, and with the axial force as a check."""
     found = [fit.details["precompression"] for fit in fits if "precompression" in fit.details]
     if not found:
         return []
@@ -483,12 +484,12 @@ def _compression(fits: list[Fit]) -> list[str]:
 
 
 def _agreement(fits: list[Fit]) -> list[str]:
-    """One line on the difference between simulation and closed form."""
+    """Return one line on the difference between simulation and closed form."""
     if len(fits) < 2:
         return []
     shift, seconds = largest_shift(*fits), fits[-1].run_time + fits[-1].compile_time
     if shift > AGREED:
-        return [f"the simulation moves a number by {shift:.2g} standard errors, in {seconds:.2g} s"]
+        return [f"the simulation changes a parameter by {shift:.2g} standard errors, in {seconds:.2g} s"]
     return [
         f"closed form and simulation agree within {100 * max(shift, 1e-3):.1g} % of the standard errors: the "
         f"simulation ({seconds:.2g} s) adds nothing here, and --method closed-form gives the same"

@@ -1,4 +1,4 @@
-"""Files of a fit of a relaxation or creep test: fit.json and fit.png, and a table on the terminal."""
+"""Write the results of a fit to a relaxation or creep test: fit.json and fit.png, and a table on the terminal."""
 
 import json
 from pathlib import Path
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None = None) -> Content:
-    """Write both files, and the draws of the posterior if there is one. Return the JSON; it has the same names as for a
-    sweep."""
+    """Write both files, and the draws of the posterior if there is one. Return the JSON, which has the same names as
+    for a sweep."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = fit.uncertainty, fit.modes
     e, errors = u.standard_errors, fit.relative_errors
@@ -75,8 +75,8 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
 
 
 def _total_errors_in_time(fit: TimeFit) -> Content:
-    """Total errors and their shares (noise, size of the sample, short and long times). Empty for a test that a TOML
-    file describes."""
+    """Return total errors and the contribution of each source (noise, size of the sample, short and long times). Empty
+    for a test that a TOML file describes."""
     if "geometry_error" not in fit.details:
         return {}
     shares = total_error.error_shares(fit)
@@ -87,7 +87,7 @@ def _total_errors_in_time(fit: TimeFit) -> Content:
 
 
 def table(test: TimeTest, fit: TimeFit) -> str:
-    """Parameters ± standard error, and the criterion of each number of modes."""
+    """Return a table of parameters ± standard error, and the criterion of each number of modes."""
     rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
     if time_tests.ELASTIC in fit.details:
         elastic = fit.details[time_tests.ELASTIC]
@@ -121,7 +121,7 @@ def _rows_of_modes(fit: TimeFit) -> list[str]:
 
 
 def figure(test: TimeTest, fit: TimeFit) -> "Figure":
-    """The test and its fit on the left, G(t) and J(t) of the model on the right."""
+    """Plot the test and its fit (left), and G(t) and J(t) of the model (right)."""
     fig = pyplot().figure(figsize=(10, 4.6), layout="constrained")
     left, right = fig.subplots(1, 2)
     unit = "stress [Pa]" if test.kind == "relaxation" else "strain [1]"

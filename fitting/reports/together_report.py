@@ -1,4 +1,4 @@
-"""Files of a fit of several tests: fit.json and fit.png, and a table on the terminal."""
+"""Write the results of a fit to several tests: fit.json and fit.png, and a table on the terminal."""
 
 import json
 from pathlib import Path
@@ -36,12 +36,13 @@ QUANTITIES = {
 
 
 def write(out: Path, found: Together, relative: float) -> Content:
-    """Write both files. Return the JSON; it has the same names as for a sweep, and `tests` in addition.
+    """Write both files. Return the JSON, which has the same names as for a sweep, and also `tests`.
 
     Args:
         out: folder.
         found: the fit.
-        relative: relative error of all moduli of a test that comes from the size of its sample.
+        relative: relative error of the moduli of a test due to the size of its sample, common to all moduli of the
+            test.
     """
     out.mkdir(parents=True, exist_ok=True)
     u, n = found.uncertainty, found.modes
@@ -87,7 +88,7 @@ def _total_errors(found: Together, relative: float) -> Content:
 
 
 def _waves(found: Together) -> Content:
-    """Shear waves over the band of all tests, at four frequencies per decade."""
+    """Return shear waves over the band of all tests, at four frequencies per decade."""
     high, low = 1 / min(t.resolved[0] for t in found.tests), 1 / max(t.resolved[1] for t in found.tests)
     omega = np.geomspace(low, high, max(2, 1 + int(4 * np.log10(high / low))))
     density = next((t.density for t in found.tests if isinstance(t, Dispersion)), None)
@@ -117,7 +118,7 @@ def _share_of_test(share: Share, found: Together) -> Content:
 
 
 def _measured(found: Together, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Abscissae [Hz or s] and measured values of test k, in the order of `Together.fitted`."""
+    """Return the abscissae [Hz or s] and measured values of test k, in the order of `Together.fitted`."""
     test = found.tests[k]
     if isinstance(test, Sweep):
         return test.angular_frequency / (2 * np.pi), np.concatenate([test.storage, test.loss])
@@ -133,8 +134,8 @@ def _largest(found: Together) -> list[float]:
 
 
 def table(found: Together, relative: float) -> str:
-    """Parameters ± standard error, the errors of a fit without each test, and the total error of the first
-    parameter."""
+    """Return a table of parameters ± standard error, the errors of fits without each test, and the total error of the
+    first parameter."""
     u, n, own = found.uncertainty, found.modes, found.parameters
     heads = [f"without {k}" for k in range(1, len(found.shares) + 1)]
     rows = [f"{k}: {s.name}, {s.points} numbers, {Path(s.source).name}" for k, s in enumerate(found.shares, 1)]
@@ -166,8 +167,8 @@ def table(found: Together, relative: float) -> str:
 
 
 def _with_sizes(found: Together, relative: float) -> list[str]:
-    """A line with the total error of the first parameter. It adds the other parameter that depends most on the sizes of
-    the samples, if its error from these sizes exceeds its error from noise."""
+    """Return a line with the total error of the first parameter. A second parameter is added: the one that depends most
+    on the sizes of the samples, if its error due to these sizes exceeds its error due to noise."""
     shares = sizes_of_samples.shares_with_sizes(found, relative)
     whole, names = total_error.root_of_squares(shares), list(shares["noise"])
     if not names or not np.isfinite(whole[names[0]]):
@@ -187,7 +188,7 @@ def _error(value: float) -> str:
 
 
 def figure(found: Together) -> "Figure":
-    """One panel per test, with measured and fitted values."""
+    """Plot one panel per test, with measured and fitted values."""
     count = len(found.tests)
     fig = pyplot().figure(figsize=(max(6.0, 3.6 * count), 4.4), layout="constrained")
     axes = np.atleast_1d(fig.subplots(1, count))

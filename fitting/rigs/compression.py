@@ -1,13 +1,14 @@
-"""A sample that the plates compress before they turn it (`--precompression`).
+"""Torsion of a sample that the plates compress first (`--precompression`).
 
-At rest, the sample has the radius of the plates; it is not trimmed after the compression. The plates hold it until its
-stress has relaxed. Moduli here are the moduli that the instrument reports: it computes them with the radius of the
-plates and with the gap of the test.
+At rest, the sample has the radius of the plates; it is not trimmed after the compression. It stays compressed until its
+stress has relaxed. Moduli in this file are the moduli that the instrument reports. The instrument computes them with
+the radius of the plates and the gap during the test.
 
 If the sample can slide sideways on the plates, it stays a cylinder. It has the stretches a along the radius and l along
-the axis, and the axial stress s. With an isotropic law, a shear between both directions has the modulus l^2 s / (l^2 -
-a^2). The stress of the compression contributes s to this modulus (Ericksen's relation; Rivlin 1949 for the
-incompressible cylinder). The torque grows with the fourth power of the radius, and so the instrument reports
+the axis, and the axial stress s. For an isotropic law, a shear between both directions has the modulus l^2 s / (l^2 -
+a^2) (Ericksen's relation; Rivlin 1949 for the incompressible cylinder). The part s of this modulus comes from the axial
+prestress. The remaining part, a^2 s / (l^2 - a^2), comes from the material. The torque is proportional to the fourth
+power of the radius. So the instrument reports
 
     G*(omega) = a^4 s [a^2 / (l^2 - a^2) (1 - sum_k g_k / (1 + i omega tau_k)) + (1 - sum_k g_k)]
 
@@ -33,25 +34,26 @@ _STEP = 0.05
 
 
 class Shares(NamedTuple):
-    """Apparent moduli of a compressed cylinder that can slide sideways, divided by its moduli at rest [1]."""
+    """Reported moduli of a compressed cylinder that can slide sideways, divided by the moduli of the uncompressed
+    sample [1]."""
 
-    relaxing: float  # of the relaxing moduli
-    equilibrium: float  # of the equilibrium modulus
+    relaxing: float  # factor of the moduli of the modes
+    equilibrium: float  # factor of the equilibrium modulus
 
 
 def check_strain(strain: float) -> None:
-    """Raise `InputError` for a strain that is impossible for a sample."""
+    """Raise `InputError` if the compression is not between 0 and `LARGEST`."""
     if not 0 <= strain <= LARGEST:
-        meant = f"{strain / 100:g}" if 1 <= strain <= 100 * LARGEST else "0.05"  # in percent
+        meant = f"{strain / 100:g}" if 1 <= strain <= 100 * LARGEST else "0.05"  # the value may be in percent
         raise InputError(
-            f"--precompression {strain:g} is out of range: it is the part of the height by which the plates compress "
-            f"the sample, from 0 to {LARGEST:g}; give e.g. --precompression {meant}"
+            f"--precompression {strain:g} is out of range: the compression is a part of the height, from 0 to "
+            f"{LARGEST:g}; give e.g. --precompression {meant}"
         )
 
 
 def shares(law: Law, strain: float) -> Shares:
-    """`Shares` for a sample of this law, compressed by `strain` between smooth plates (formula at the top of this
-    file).
+    """Return the factors of a sample that is compressed by `strain` between frictionless plates (formula at the top of
+    this file).
 
     Raises:
         InputError: the law is not isotropic, or it does not resist the compression.
@@ -71,9 +73,10 @@ def shares(law: Law, strain: float) -> Shares:
 
 
 def incompressible(law: Law, strain: float) -> Shares | None:
-    """The result of `shares` if the sample keeps its volume. s is then the stress of the law without U(J).
+    """Return the factors as in `shares`, but for an incompressible sample. The axial stress s is then computed without
+    the volumetric energy U(J) of the law.
 
-    None if the law has no isochoric part, or if the strain is 0.
+    Returns None if the law has no isochoric part, or if the strain is 0.
     """
     _refuse_directions(law)
     axial, own = 1 - strain, law.isochoric_part()
@@ -81,32 +84,32 @@ def incompressible(law: Law, strain: float) -> Shares | None:
         return None
     a = 1 / np.sqrt(axial)
     side, _, s = _cauchy(own, a, axial)
-    s -= side  # this pressure makes the side free of force
+    s -= side  # this pressure makes the side free of stress
     G = float(np.asarray(law.shear_modulus()))
     relaxing = float(a**6 * s / (axial**2 - a**2) / G)
     return Shares(relaxing, relaxing + float(a**4 * s / G))
 
 
 def side_stretch(law: Law, strain: float) -> float:
-    """Stretch along the radius of a cylinder that is compressed by `strain` between smooth plates."""
+    """Return the radial stretch of a cylinder that is compressed by `strain` between frictionless plates."""
     _refuse_directions(law)
     axial = 1 - strain
     return float(brentq(lambda a: _cauchy(law, a, axial)[0], 0.9, 1.1 / np.sqrt(axial), xtol=1e-14))
 
 
 def torsional_density(law: Law, strain: float, density: float) -> float:
-    """The density [kg/m^3] that gives the inertia of a compressed sample in `fitting.fits.sample_inertia`, with the
-    moduli that the instrument reports and the gap.
+    """Return the density [kg/m^3] with which `fitting.fits.sample_inertia` gives the right inertia of a compressed
+    sample. That module uses the gap and the moduli that the instrument reports.
 
     The compressed cylinder has the radius a R, the density rho / (a^2 l) and a modulus G. The instrument reports a^4 G.
-    So the wave number omega sqrt(rho / (a^2 l G)) is omega sqrt(rho a^2 / (l a^4 G)).
+    The wave number omega sqrt(rho / (a^2 l G)) equals omega sqrt(rho a^2 / (l a^4 G)). So the density is rho a^2 / l.
     """
     return density if strain == 0 else density * side_stretch(law, strain) ** 2 / (1 - strain)
 
 
 def smooth_force(law: Law, strain: float, radius: float) -> float:
-    """Force [N] with which the sample pushes smooth plates apart before relaxation. `radius`: radius of the sample at
-    rest [m]."""
+    """Return the force [N] with which the sample pushes frictionless plates apart before relaxation. `radius`: radius
+    of the sample at rest [m]."""
     if strain == 0:
         return 0.0
     a = side_stretch(law, strain)
@@ -114,7 +117,7 @@ def smooth_force(law: Law, strain: float, radius: float) -> float:
 
 
 def _cauchy(law: Law, side: float, axial: float) -> np.ndarray:
-    """Principal Cauchy stresses (3,) [Pa]."""
+    """Principal Cauchy stresses (3,) [Pa] for the stretches `side`, `side` and `axial`."""
     F = np.array([side, side, axial])
     return np.diagonal(np.asarray(law.first_piola(jnp.diag(F)))) * F / np.prod(F)
 
@@ -129,30 +132,30 @@ def _refuse_directions(law: Law) -> None:
 
 
 def load_steps(strain: float) -> int:
-    """Number of load steps of a compression."""
+    """Return the number of load steps of a compression."""
     return max(1, int(np.ceil(strain / _STEP)))
 
 
 def too_far(strain: float) -> InputError:
-    """The error for a strain at which the simulation with glued plates fails."""
+    """Return the `InputError` for a compression at which the simulation with glued plates does not converge."""
     return InputError(
-        f"--precompression {strain:g}: the simulated sample could not be compressed so far; give less, or --method "
-        "closed-form, whose plates are smooth"
+        f"--precompression {strain:g}: the simulation did not converge at this compression; give a smaller value, or "
+        "use --method closed-form, which assumes frictionless plates"
     )
 
 
 def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
-    """The rig with its sample compressed by `strain` and held, before the plate turns.
+    """Return the rig with its sample compressed by `strain`, before the plate turns.
 
     Args:
-        rig: rig of the sample at rest. The height of the returned rig is the gap.
+        rig: rig of the uncompressed sample. The height of the returned rig is the gap after the compression.
         law: law of the sample.
-        strain: part of the height at rest.
+        strain: compression, as a part of the height at rest.
         smooth: the sample slides sideways on the plates during the compression, so that it stays a cylinder. Otherwise
             it is glued and bulges.
 
     Raises:
-        InputError: the sample cannot be compressed so far.
+        InputError: the simulation does not converge at this compression.
     """
     if strain == 0:
         return rig

@@ -1,15 +1,16 @@
-"""A test in time in a rig, described by a small TOML file: force and displacement of a sample that is not simply
-sheared.
+"""Relaxation and creep tests in other loadings than simple shear.
 
-f(d) is the force on an elastic sample of unit shear modulus at a displacement d. For glued samples, f(d) is computed by
-finite elements and corrected for their estimated error. For indenters, it is the exact solution of a bonded layer. The
-force on the viscoelastic sample follows from linear viscoelasticity with f(d) in place of the strain,
+A small TOML file describes the test, the sample and its rig (the test machine). f(d) is the force on an elastic sample
+of unit shear modulus at a displacement d. For glued samples, f(d) is computed by finite elements and corrected for the
+estimated error of the mesh. For indenters, f(d) is the exact solution for a layer that is bonded to a rigid base. The
+force on the viscoelastic sample follows from linear viscoelasticity with f(d) in place of the strain and the relaxation
+modulus G:
 
-    F(t) = integral of G(t - s) d f(d(s)),
+    F(t) = integral of G(t - s) d f(d(s)).
 
 This is exact if strains are small and if the bulk modulus relaxes like the shear modulus or is much larger. For an
-indenter, it holds only while the contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438). At large strain, it is
-Fung's quasi-linear form.
+indenter, the formula holds only while the contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438). At large strain,
+the formula is an approximation: Fung's quasi-linear viscoelasticity.
 """
 
 import tomllib
@@ -29,7 +30,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.status import NAMES
 from liverjax.laws import NeoHookean
 
-#: Lengths [m] that each test needs. The cone needs an angle [degrees] too.
+#: Sizes that each test needs: lengths [m], and the half angle [degrees] of the cone.
 TESTS: dict[str, tuple[str, ...]] = {
     "tension": ("radius", "height"),
     "compression": ("radius", "height"),
@@ -39,48 +40,49 @@ TESTS: dict[str, tuple[str, ...]] = {
     "punch": ("radius", "thickness"),
 }
 _OTHER = ("test", "data", "drive", "poisson", "min_time", "ramp")
-#: For each driven quantity, the kind of the test.
+#: Kind of the test for each imposed quantity.
 _KINDS = {"displacement": "relaxation", "force": "creep"}
-#: Default Poisson's ratios: glued samples have K/mu = 1000, and layers keep their volume.
+#: Default Poisson's ratios: K/mu = 1000 for glued samples, and incompressible layers.
 _GLUED, _LAYER = 0.4995, 0.5
-#: Displacements, divided by the largest displacement, at which glued samples are computed. Above the strain _LARGE, the
-#: finer grid is used.
+#: Displacements, divided by the largest displacement, at which glued samples are simulated. Above the strain _LARGE,
+#: the finer grid is used.
 _GRID, _FINER_GRID, _LARGE = (0.05, 0.5, 1.0), (0.05, 0.25, 0.5, 0.75, 1.0), 0.1
-#: Sizes of the cells at the rims of the plates, divided by the shortest length there. They are tried in this order:
-#: small cells turn inside out at large compression.
+#: Sizes of the cells at the rims of the plates, divided by the shortest length there. They are tried in this order,
+#: because small cells invert at large compression.
 _RIMS = (0.04, 0.1, 0.2)
-#: An indenter goes back if its depth falls by more than the part _BACK of the largest depth and by more than _SCATTERS
+#: An indenter counts as going back if its depth falls by more than both _BACK times the largest depth and _SCATTERS
 #: times the scatter of the depth.
 _BACK, _SCATTERS = 0.02, 4.0
 #: Minimum number of rows of a growing contact, including the row at rest.
 _FEWEST = 6
 #: Maximum number of rows of an indenter's test, including the rows that are added between the measured rows.
 _MOST_ROWS = 2000
-#: A glued sample is computed up to this ratio of height to radius. Above it, meshes are large and a run takes minutes.
+#: Glued samples are simulated up to this ratio of height to radius. Above this ratio, meshes are large and a run takes
+#: minutes.
 _SLENDER = 10.0
-#: If the force deviates from a straight line by more than this, a note is given.
+#: A note is given if the relative deviation of the force from a straight line exceeds this value.
 _CURVED = 0.02
 
 
 class Described(NamedTuple):
-    """The content of a description."""
+    """The content of a TOML file that describes a test."""
 
     test: str
     data: Path
     sizes: dict[str, float]
     poisson: float
-    drive: str  # displacement or force
+    drive: str  # imposed quantity: displacement or force
     min_time: float
-    at_once: bool  # ramp = 0 in the file: the load of the first row acted from 0 s on
+    at_once: bool  # whether the file has ramp = 0: the load of the first row acted from 0 s on
 
 
 def read_described(path: str | Path) -> TimeTest:
-    """Read the described test as a test in shear, with the strain f(d)/S and the stress F/S. S is chosen so that a
-    small strain is d divided by a length of the sample.
+    """Read the described test and convert it to a test in shear, with the strain f(d)/S and the stress F/S. The area S
+    is chosen so that a small strain (for sphere and cone: the largest strain) is d divided by a length of the sample.
 
     Args:
-        path: TOML file with test, data (a table of time, displacement and force), and the sizes in metres that the test
-            needs. drive, poisson, min_time and ramp = 0 are optional.
+        path: TOML file with the keys test, data (file with a table of time, displacement and force), and the sizes in
+            metres that the test needs. The keys drive, poisson, min_time and ramp (only 0) are optional.
 
     Raises:
         InputError: one sentence with the file, the key, the value and the remedy.
@@ -91,16 +93,16 @@ def read_described(path: str | Path) -> TimeTest:
     for name in ("displacement", "force"):
         if name not in columns:
             raise InputError(
-                f"{described.data}: a test of {path.name} needs columns of time, displacement and force; the file has "
-                f"{', '.join(columns)}"
+                f"{described.data}: the test in {path.name} needs columns of time, displacement and force; this file "
+                f"has {', '.join(columns)}"
             )
     d, force = columns["displacement"], columns["force"]
     if described.test == "compression":
-        notes.append("displacement and force count as positive in compression")
+        notes.append("displacement and force are taken as positive in compression")
     sign = np.sign(d[np.argmax(np.abs(d))]) or 1.0
     largest = float(np.max(sign * d))
     if not largest > 0:
-        raise InputError(f"{described.data}: the displacement is zero throughout; give a test that moves")
+        raise InputError(f"{described.data}: the displacement is zero throughout: give a test with a displacement")
     curve, size, told = _elastic(described, largest, str(path))
     section = curve(largest * 1e-3) / (1e-3 * largest / size)
     if described.test in ("sphere", "cone"):
@@ -114,7 +116,7 @@ def read_described(path: str | Path) -> TimeTest:
         if kept < _FEWEST:
             raise InputError(
                 f"{described.data}: the indenter goes back from {time[kept]:.4g} s on, after {kept} rows: "
-                "give a test that presses first"
+                "give a test that begins with an indentation"
             )
         time, d, force, told = time[:kept], d[:kept], force[:kept], [*told, *told_of_way]
     if described.test in ("sphere", "cone") and described.drive == "displacement":
@@ -129,10 +131,10 @@ def read_described(path: str | Path) -> TimeTest:
 
 
 def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list[str]]:
-    """The number of rows until the indenter goes back, and a note if it goes back. While the contact shrinks, another
-    formula holds for the force (Ting 1966, J. Appl. Mech. 33:845).
+    """Return the number of rows before the indenter goes back, and a note if it does. While the contact shrinks, the
+    force follows another formula (Ting 1966, J. Appl. Mech. 33:845).
     """
-    depth = scipy.ndimage.median_filter(np.maximum(depth, 0.0), 5, mode="nearest")  # a single reading is no way back
+    depth = scipy.ndimage.median_filter(np.maximum(depth, 0.0), 5, mode="nearest")  # ignores single low values
     scatter = 1.4826 * float(np.median(np.abs(np.diff(depth, 2)))) / np.sqrt(6) if len(depth) > 2 else 0.0
     fall = np.maximum.accumulate(depth) - depth
     back = fall > max(_BACK * float(depth.max()), _SCATTERS * scatter)
@@ -140,14 +142,14 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
         return len(time), []
     kept = int(np.argmax(back))
     return kept, [
-        f"{len(time) - kept} rows from {time[kept]:.4g} s on are left out: there the indenter goes back, and these "
-        "formulas do not hold while the contact shrinks"
+        f"{len(time) - kept} rows from {time[kept]:.4g} s on are left out: the indenter goes back there, and the "
+        "formulas are not valid while the contact shrinks"
     ]
 
 
 def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The rows, and more rows between them without a force. They are needed because d is linear in time between two
-    rows, but f(d) is not."""
+    """Return the rows, with additional rows between them that have no force (NaN). They are needed because between two
+    measured rows d is linear in time, but f(d) is not."""
     parts = int(np.clip(_MOST_ROWS // len(time), 1, 8))
     place = np.arange((len(time) - 1) * parts + 1) / parts
     rows = np.arange(len(time))
@@ -157,7 +159,7 @@ def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tu
 
 
 def curve_of(curve: Callable[[float], float], d: np.ndarray) -> np.ndarray:
-    """f at displacements (n,) [m]. Below 0, f is continued as a straight line."""
+    """Return f (n,) [m^2] at displacements d (n,) [m]. For d < 0, f is continued as a straight line."""
     grid = np.linspace(0.0, max(float(d.max()), 0.0), 400)
     values = np.array([0.0, *(curve(each) for each in grid[1:])])
     below = curve(grid[1]) / grid[1] * np.minimum(d, 0.0)
@@ -168,9 +170,9 @@ def _description(path: Path) -> Described:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); give a description of a test") from None
+        raise InputError(f"{path} cannot be read ({error.strerror}): give a TOML file that describes a test") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no TOML ({error}); correct that line") from None
+        raise InputError(f"{path} is not valid TOML ({error}): correct this line") from None
     test = table.get("test")
     if test not in TESTS:
         raise InputError(f"{path}: test = {test!r} is not known: {hint(str(test), TESTS)}")
@@ -184,7 +186,9 @@ def _description(path: Path) -> Described:
     sizes = {key: _number_of(path, key, table[key]) for key in needed}
     bad = next((key for key, value in sizes.items() if not 0 < value < (90 if key == "half_angle" else 1)), None)
     if bad:
-        raise InputError(f"{path}: {bad} = {sizes[bad]:g} cannot be that of a sample: give metres (degrees for a cone)")
+        raise InputError(
+            f"{path}: {bad} = {sizes[bad]:g} cannot be the size of a sample: give metres (half_angle: degrees)"
+        )
     own = _LAYER if "thickness" in needed else _GLUED
     poisson = _number_of(path, "poisson", table.get("poisson", own))
     if not 0 <= poisson <= own:
@@ -200,19 +204,20 @@ def _description(path: Path) -> Described:
     ramp = table.get("ramp")
     if ramp is not None and _number_of(path, "ramp", ramp) != 0:
         raise InputError(
-            f"{path}: ramp = {ramp} cannot be used: leave it out, or give 0 for steps where no row shows the load rise"
+            f"{path}: ramp = {ramp} cannot be used: leave it out, or give 0 for a step whose rise no row shows"
         )
     return Described(test, path.parent / table["data"], sizes, poisson, drive, first, ramp is not None)
 
 
 def _number_of(path: Path, key: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise InputError(f"{path}: {key} = {value!r} is not a number: give one")
+        raise InputError(f"{path}: {key} = {value!r} is not a number: give a number")
     return float(value)
 
 
 def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
-    """f(d) [m^2] for unit shear modulus, the length by which d is divided to give a strain, and notes."""
+    """Return the function f(d) [m^2] for unit shear modulus, the length [m] by which d is divided to give a strain, and
+    notes."""
     sizes = described.sizes
     if "thickness" not in sizes:
         return _glued_curve(described, largest, path)
@@ -224,7 +229,7 @@ def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[
         half_angle=sizes.get("half_angle", 45.0),
     )
     layer, per_shear = thin_layer.Layer(indenter), 2 * (1 + described.poisson)
-    layer.force(np.array([largest]))  # raises an error for depths beyond its table
+    layer.force(np.array([largest]))  # raises InputError for depths beyond the table
     said = "the contact begins where displacement is 0, without adhesion"
     if described.test != "punch":
         said += ", and grows until the largest displacement"
@@ -232,7 +237,8 @@ def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[
 
 
 def _glued_curve(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
-    """f(d) by finite elements, corrected for the error of the mesh; with the same results as `_elastic`."""
+    """Compute f(d) by finite elements, corrected for the error of the mesh. Returns the same three values as
+    `_elastic`."""
     sizes, way = described.sizes, 1.0 if described.test == "tension" else -1.0
     radius, height = sizes["radius"], sizes["height"]
     if largest >= 0.5 * height:
@@ -242,9 +248,9 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
         )
     if height > _SLENDER * radius:
         raise InputError(
-            f"{path}: height = {height:g} m is {height / radius:.3g} radii, and glued samples are computed up to "
-            f"{_SLENDER:g}: the ends of so slender a sample hardly matter, so give its shear stress, the tensile "
-            f"stress over {2 * (1 + described.poisson):.4g} (2 times 1 + poisson), and strain as a table of its own"
+            f"{path}: height = {height:g} m is {height / radius:.3g} radii, but glued samples are computed only up to "
+            f"{_SLENDER:g} radii. The glued ends of such a slender sample hardly matter: give a table of strain and "
+            f"shear stress instead (tensile stress / {2 * (1 + described.poisson):.4g}, that is 2 times 1 + poisson)"
         )
     at = largest * np.array(_GRID if largest <= _LARGE * height else _FINER_GRID)
     nu = described.poisson
@@ -263,8 +269,9 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
                 break
         else:
             raise InputError(
-                f"{path}: the run of an elastic sample of {radius:g} m radius and {height:g} m height ends before "
-                f"{largest:g} m ({NAMES[int(np.max(codes))]}): check the sizes, or give rows of smaller displacements"
+                f"{path}: the simulation of an elastic sample (radius {radius:g} m, height {height:g} m) fails before "
+                f"the displacement {largest:g} m ({NAMES[int(np.max(codes))]}): check the sizes, or give only rows of "
+                "smaller displacements"
             )
         left_out = np.asarray(glued.mesh_error(rig, law, None)) / 1e3
     found = np.asarray(force) / 1e3
@@ -272,12 +279,12 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
     secant = np.abs(found + left_out) / at
     notes = [f"{w.message}" for w in said if issubclass(w.category, UserWarning)]
     notes.append(
-        f"the sample's stiffness per shear modulus is {secant[0]:.4g} m, of which {100 * left_out[0] / found[0]:.2g} % "
-        "are a correction of the mesh's error"
+        f"the stiffness of the sample, divided by the shear modulus, is {secant[0]:.4g} m; "
+        f"{100 * left_out[0] / found[0]:.2g} % of this value correct the error of the mesh"
     )
     if abs(secant[-1] / secant[0] - 1) > _CURVED:
         notes.append(
-            f"at the largest displacement the elastic force is {100 * (secant[-1] / secant[0] - 1):+.0f} % off a "
-            "straight line; in the fit it relaxes like shear (quasi-linear)"
+            f"at the largest displacement, the elastic force differs by {100 * (secant[-1] / secant[0] - 1):+.0f} % "
+            "from a straight line; the fit assumes that it relaxes like the shear stress (quasi-linear)"
         )
     return (lambda d: d * float(np.interp(d, at, secant))), height, notes

@@ -1,10 +1,10 @@
-"""Tension, indentation and creep of a cylinder as differentiable experiments.
+"""Tension, indentation and creep of a cylinder as differentiable simulations.
 
-Each experiment is a scene, to which law and viscosity are added, and a reading from its run. The sample is glued to its
-plates. The simulation contains this, so no shape factor is needed.
+Each test is a rig: a scene without a law, and a reading (the force or displacement that is taken from the run). Law and
+viscosity are added for each run. The simulated sample is glued to its plates, so no shape factor is needed.
 
 By default, the mesh is a narrow sector of the cylinder between two planes of symmetry. It is fine at the rims of the
-plates and at the edge of the punch, where stresses are infinite. experiments/TABLES.md has its error.
+plates and at the edge of the punch, where stresses are infinite. experiments/TABLES.md lists the error of this mesh.
 """
 
 import warnings
@@ -26,33 +26,33 @@ from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Prony
 from liverjax.simulation import automatic
 
-#: Minimum width of the punch, and of the ring around it, divided by the radius of the sample.
+#: Minimum radius of the punch, and minimum width of the ring around the punch, divided by the radius of the sample.
 NARROWEST = 0.01
-#: A default mesh is known to be within 1 % for height / radius between SHAPES, and up to a K/mu of STIFFEST. STIFFEST
-#: depends on how volume changes are treated. "mixed" needs a law that separates bulk from shear, and a viscosity with
-#: `part = "isochoric"` or no viscosity.
+#: The error of a default mesh is known to be below 1 % if height / radius lies within SHAPES and K/mu is at most
+#: STIFFEST. STIFFEST depends on how the elements treat volume changes. "mixed" needs a law that separates bulk from
+#: shear, and a viscosity with `part = "isochoric"` or no viscosity.
 SHAPES, STIFFEST = (0.2, 5.0), {"mixed": 1e4, "element": 20.0}
 
 
 class Cells(NamedTuple):
-    """The mesh of a rig. The default mesh is within 1 % of the converged result (experiments/TABLES.md)."""
+    """The mesh of a rig. Results of the default mesh are within 1 % of converged results (experiments/TABLES.md)."""
 
-    size: float | None = None  # [m] of all cells, in a whole cylinder; None: a graded sector
-    rim: float = 0.04  # size of a sector's cells at the rim of a plate / shortest length there
-    edge: float = 0.02  # the same at the edge of a punch
-    largest: float = 0.34  # longest cells of a sector / radius; twice as long along the axis
-    growth: float = cylinders.GROWTH  # of cells away from rims and edge
-    corners: int = 24  # corners of the polygon in place of the circle; a sector has one edge of it
-    order: int = 2  # of the elements
-    volumetric: str = "auto"  # how volume changes are treated, see `lj.Solve`
+    size: float | None = None  # [m] length of all cells of a whole cylinder; None: a graded sector
+    rim: float = 0.04  # in a sector: cell size at the rim of a plate / shortest length there
+    edge: float = 0.02  # in a sector: cell size at the edge of a punch / shortest length there
+    largest: float = 0.34  # in a sector: longest cells / radius; twice as long along the axis
+    growth: float = cylinders.GROWTH  # increase of the cell length per distance from rims and edge
+    corners: int = 24  # corners of the polygon that replaces the circle; a sector has one of its edges
+    order: int = 2  # order of the elements
+    volumetric: str = "auto"  # how the elements treat volume changes, see `lj.Solve`
 
 
 @struct
 class Rig:
-    """A scene without its law, and the quantity that is read from it along z."""
+    """A scene without its law, and the force or displacement along z that is read from its run."""
 
-    scene: lj.Scene = param("1", "scene whose law `read` replaces")
-    nodes: Indices = param("1", "numbers (n,) of the nodes that are read")
+    scene: lj.Scene = param("1", "scene; `read` replaces its law")
+    nodes: Indices = param("1", "indices (n,) of the nodes that are read")
     weights: Array = param("1", "weights (n,) of these nodes in the reading")
     reading: str = static(default="force", about="force [N], or mean displacement [m], of the whole cylinder's nodes")
     whole: bool = static(default=False, about="the scene is the whole cylinder, not a sector of it")
@@ -70,7 +70,7 @@ class _Sample(NamedTuple):
 
 
 def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]:
-    """Readings of the rig at every step (T,) [N] or [m], and the codes of the steps (T,).
+    """Run the rig and return its reading (T,) [N] or [m] and the status code (T,) of every step.
 
     Raises:
         InputError: the law is not isotropic, but the mesh is a sector, which needs symmetry around the axis.
@@ -80,11 +80,11 @@ def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]
 
 
 def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
-    """Estimate how each reading (T,) [N] or [m] would change with an infinitely fine mesh. It does not work with traced
-    values.
+    """Estimate how each reading (T,) [N] or [m] would change with an infinitely fine mesh. Law and viscosity must not
+    be traced by JAX.
 
-    It needs a run, and one linear solve per step in elements of higher order (`liverjax.simulation.mesh_error`). A step
-    without an estimate has NaN.
+    The estimate needs one run, and for each step one linear solve with elements of higher order
+    (`liverjax.simulation.mesh_error`). The result is NaN for a step without an estimate.
     """
     result = lj.simulate(_with(rig, law, prony), mesh_error=True)
     assert result.mesh_error is not None
@@ -92,26 +92,26 @@ def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
 
 
 def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
-    """The rig's scene with its law and viscosity."""
+    """Return the rig's scene with the given law and viscosity."""
     if not rig.whole and any(part.fibre is not None or part.green_energy is not None for part in law.summands()):
         raise InputError(
-            f"law {type(law).__name__} has directions, and the rig's mesh is a sector of the cylinder: give the rig a "
-            "cell_size, then it is whole"
+            f"law {type(law).__name__} is not isotropic, but the mesh of the rig is a sector of the cylinder: give the "
+            "rig a cell_size, which makes a mesh of the whole cylinder"
         )
     scene = replace(rig.scene, law=law, viscosity=prony)
     most = STIFFEST.get(automatic.form_of_volumes(scene))
     ratio = _ratio(law)
     if not rig.whole and most is not None and ratio is not None and ratio > most * (1 + 1e-9):
         warnings.warn(
-            f"K/mu = {ratio:.3g} is above {most:g}, and the mesh is known to be within 1 % only up to this value: see "
-            "rigs.mesh_error",
+            f"K/mu = {ratio:.3g} is above {most:g}, and the error of the mesh is known to be below 1 % only up to this "
+            "value: estimate the error with rigs.mesh_error",
             stacklevel=3,
         )
     return scene
 
 
 def _ratio(law: Law) -> float | None:
-    """Bulk modulus over shear modulus. None if the law does not give them, or while they are traced."""
+    """Return bulk modulus / shear modulus. Returns None if the law does not define them, or if JAX traces them."""
     try:
         moduli = law.bulk_modulus(), law.shear_modulus()
     except InputError:
@@ -122,7 +122,7 @@ def _ratio(law: Law) -> float | None:
 
 
 def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
-    """Readings from positions [m] and reactions [N] of all steps (T, V, 3)."""
+    """Return the readings (T,) from positions [m] and reactions [N] of all steps (T, V, 3)."""
     if rig.reading == "force":
         return reactions[:, rig.nodes, 2] @ rig.weights
     rest = rig.scene.mesh.points[rig.nodes, 2]
@@ -130,14 +130,14 @@ def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
 
 
 def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size: float | Cells | None = None) -> Rig:
-    """A cylinder that is pulled (or pressed) between glued plates. The force is read.
+    """Return the rig of a cylinder that is pulled (or pressed) between glued plates. The force is read.
 
     Args:
         radius, height: size of the sample [m].
         dt: time step [s].
         strains: nominal strain at the end of every step (T,).
-        cell_size: `Cells`, or an edge length [m]: then the mesh is the whole cylinder with cells of one size. Default:
-            a graded sector.
+        cell_size: `Cells`, or the edge length [m] of a mesh of the whole cylinder with cells of one size. Default: a
+            graded sector.
 
     Raises:
         InputError: a length or a time is not positive, or a strain is not finite or flattens the sample.
@@ -154,16 +154,16 @@ def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size
 def indentation(
     radius: float, height: float, punch: float, dt: float, depths: Numbers, cell_size: float | Cells | None = None
 ) -> Rig:
-    """A glued flat punch of radius `punch` [m] that is pressed into a cylinder by `depths` (T,) [m]. Its force is read.
+    """Return the rig of a cylinder with a glued flat punch of radius `punch` [m]. Its force is read.
 
-    A negative depth pulls.
+    The punch is pressed into the cylinder by `depths` (T,) [m]. At a negative depth, the punch pulls.
 
     Args:
         radius, height, dt, cell_size: see `tension`. A ring of nodes lies at the edge of the punch.
 
     Raises:
-        InputError: see `tension`; or the punch is too wide or too narrow for the sample, or a depth is too large for
-            it.
+        InputError: a length or a time is not positive, a depth is not finite or too large, or the punch is too wide or
+            too narrow.
     """
     depths = _finite_history("depths", depths)
     cells = _cells(radius, height, dt, cell_size)
@@ -173,8 +173,8 @@ def indentation(
         )
     if not NARROWEST * radius <= punch <= (1 - NARROWEST) * radius:
         raise InputError(
-            f"punch = {punch:g} m must be between {NARROWEST:g} and {1 - NARROWEST:g} of the radius {radius:g}: change "
-            "one of them"
+            f"punch = {punch:g} m must be between {NARROWEST:g} and {1 - NARROWEST:g} times the radius {radius:g} m: "
+            "change one of them"
         )
     edge = cells.edge * min(punch, radius - punch, height)
     rings = {punch: edge, radius: cells.rim * min(radius - punch, height)}
@@ -185,13 +185,13 @@ def indentation(
 def creep(
     radius: float, height: float, dt: float, steps: int, stress: float, cell_size: float | Cells | None = None
 ) -> Rig:
-    """A cylinder under a constant pull `stress` [Pa] on its top from time 0 on. The mean displacement of the top is
-    read.
+    """Return the rig of a cylinder with a constant tensile stress `stress` [Pa] on its top from time 0 on.
 
-    The pull rises during the first step, as in a rheometer. The mean is over the area.
+    The stress rises during the first step, as in a rheometer. The mean displacement of the top, weighted with the area,
+    is read.
 
     Raises:
-        InputError: see `tension`; or there are no steps, or the stress is not finite.
+        InputError: a length or a time is not positive, there are no steps, or the stress is not finite.
     """
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
         raise InputError(f"steps = {steps!r} must be a whole number, 1 or more")
@@ -228,16 +228,16 @@ def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | N
     shape = height / radius
     if cells.size is None and not SHAPES[0] * (1 - 1e-9) <= shape <= SHAPES[1] * (1 + 1e-9):
         warnings.warn(
-            f"height = {height:g} m is {shape:.3g} radii, and the mesh is known to be within 1 % only from "
-            f"{SHAPES[0]:g} to {SHAPES[1]:g} radii: see rigs.mesh_error",
+            f"height = {height:g} m is {shape:.3g} radii, and the error of the mesh is known to be below 1 % only from "
+            f"{SHAPES[0]:g} to {SHAPES[1]:g} radii: estimate the error with rigs.mesh_error",
             stacklevel=3,
         )
     return cells
 
 
 def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None) -> _Sample:
-    """A sector with cells of given lengths at given radii (`rings`) and heights (`layers`); with `cells.size`, the
-    whole cylinder."""
+    """Return a sector of the cylinder, or the whole cylinder if `cells.size` is given. `rings` and `layers`: cell
+    length [m] at given radii and heights [m]."""
     radius, height = max(rings), max(layers)
     if cells.size is not None:
         rings, layers = (dict.fromkeys(places, cells.size) for places in (rings, layers))
@@ -255,7 +255,7 @@ def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None)
     bottom = lj.Fixed(nodes=jnp.asarray(sets["bottom"]))
     if normal is None:
         return _Sample(mesh, (bottom,), (), parts, sets["under"], cells.volumetric)
-    # The axis lies in both planes of symmetry, with its mid-edge nodes.
+    # The nodes of the axis, with the mid-edge nodes, lie in both planes of symmetry.
     axis = np.intersect1d(sets["start"], sets["end"])
     fixed = (
         bottom,
@@ -267,7 +267,8 @@ def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None)
 
 
 def _with_punch(mesh: lj.TetMesh, radii: np.ndarray, punch: float | None) -> lj.TetMesh:
-    """The mesh with a node set `under`: the nodes of the top within the ring at `punch`, or all nodes of the top."""
+    """Return the mesh with a node set `under`: the nodes of the top within the radius `punch`, or all nodes of the
+    top."""
     top = np.asarray(mesh.node_sets["top"])
     if punch is not None:
         # The nodes of a layer are numbered from the axis outwards, ring after ring.
@@ -282,8 +283,8 @@ def _driven(sample: _Sample, dt: float, lift: np.ndarray) -> Rig:
     history[1:, 2] = lift
     times = dt * np.arange(len(lift) + 1)
     nodes = jnp.asarray(sample.under)
-    # The motion is prescribed along z only. The planes of symmetry fix other axes of some of these nodes already, and
-    # nothing may be prescribed twice.
+    # The motion is prescribed along z only. The planes of symmetry already fix other directions of some of these nodes,
+    # and no direction may be prescribed twice.
     moved = lj.Displaced(nodes=nodes, times=jnp.asarray(times), history=jnp.asarray(history), axes="z")
     sample = sample._replace(fixed=(*sample.fixed, lj.Fixed(nodes=nodes, axes="xy")))
     scene = _scene(sample, dt, len(lift), displaced=(moved,))

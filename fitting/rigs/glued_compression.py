@@ -2,12 +2,13 @@
 too coarse.
 
 The sample is glued, so it bulges, and the stresses at the rims of the plates are infinite. In this state, the linear
-elements of the torsion rig are a fifth too stiff; in pure torsion they are only a few percent too stiff. So factors and
-force are computed once for each law and strain, on the mesh of a quarter cylinder that is fine at the rims.
+elements of the torsion rig are 20 % too stiff; in pure torsion they are only a few percent too stiff. So factors and
+force are computed with quadratic elements on the mesh of a quarter cylinder that is fine at the rims. This is done once
+for each law and strain.
 
-If the stress of a sample relaxes by m = G*/G0, down to m_inf, its measured modulus is G0 (R m + S m_inf). The factors R
-and S come from two harmonic solutions about the compressed state. Other harmonic solutions are within 1e-4 of this
-formula.
+At each frequency, the stress of the sample relaxes by the factor m = G*/G0; after a long time it relaxes by m_inf. Then
+the measured modulus is G0 (R m + S m_inf). The factors R and S come from two harmonic solutions about the compressed
+state. Other harmonic solutions agree with this formula within 1e-4.
 """
 
 from typing import NamedTuple
@@ -29,17 +30,17 @@ RIMS = (0.1, 0.25)
 #: Size of the cells at the rim of a second mesh, divided by their size in the first mesh. Both meshes have the same
 #: number of cells.
 COARSER = 2.5
-#: Order of convergence in the size of these cells. Cells of 0.25, 0.1 and 0.04 gave 0.74.
+#: Order of convergence with the size of these cells. Sizes of 0.25, 0.1 and 0.04 gave an order of 0.74.
 ORDER = 0.75
-#: Longest cells, divided by the radius; twice as long along the axis.
+#: Length of the longest cells, divided by the radius. Along the axis, cells may be twice as long.
 LARGEST = 0.34
-#: Number of corners of the polygon in place of the circle.
+#: Number of corners of the polygon that replaces the circle.
 CORNERS = 16
 
 
 class Glued(NamedTuple):
-    """Factors [1] from the moduli at rest to the measured moduli of a compressed sample, and its force before
-    relaxation [N]."""
+    """Factors [1] that convert the moduli at rest to the measured moduli of a compressed sample, and the force [N] of
+    this sample before relaxation."""
 
     relaxing: float  # R
     standing: float  # S
@@ -47,20 +48,20 @@ class Glued(NamedTuple):
 
 
 def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Glued]:
-    """Factors and force of a sample that glued plates compress by `strain`; and an estimate of the mesh error in each
-    of them.
+    """Return factors and force of a sample that is compressed by `strain` between glued plates, and an estimate of the
+    mesh error of each value.
 
     The results of two meshes are extrapolated with `ORDER`. This order is low because stresses are infinite at the
-    rims. The second result is the change by the extrapolation, with its sign.
+    rims. The second result is the change due to the extrapolation, with its sign.
 
     Args:
         radius: radius of the plates, and of the sample at rest [m].
         gap: height of the compressed sample [m].
         law: law of the sample.
-        strain: part of the height at rest.
+        strain: compression, as a part of the height at rest.
 
     Raises:
-        InputError: the sample cannot be compressed so far.
+        InputError: the simulation does not converge at this compression.
     """
     for rim in RIMS:
         mesh, wider = (_quarter(radius, gap / (1 - strain), rim, coarser) for coarser in (1.0, COARSER))
@@ -74,8 +75,8 @@ def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Gl
 
 
 def _quarter(radius: float, height: float, rim: float, coarser: float) -> lj.TetMesh:
-    """The mesh of a quarter of the cylinder. The cells at the rims are `coarser` times as long, but their number stays
-    the same."""
+    """Return the mesh of a quarter of the cylinder. The cells at the rims are `coarser` times as long, but their number
+    stays the same."""
     cell = rim * min(radius, height / 2)
     inwards = _wider(cylinders.graded(radius, {0.0: cell}, LARGEST * radius), coarser)
     half = _wider(cylinders.graded(height / 2, {0.0: cell}, 2 * LARGEST * radius), coarser)
@@ -84,16 +85,17 @@ def _quarter(radius: float, height: float, rim: float, coarser: float) -> lj.Tet
 
 
 def _wider(places: np.ndarray, factor: float) -> np.ndarray:
-    """Positions from 0 to the same end, with the first one `factor` times as far from 0."""
+    """Move positions that begin at 0: the position next to 0 gets `factor` times its distance from 0; the last one
+    stays."""
     end = places[-1]
     return end * (places / end) ** (1 + np.log(factor) / np.log(places[1] / end))
 
 
 def _on_mesh(mesh: lj.TetMesh, radius: float, law: Law, strain: float) -> Glued | None:
-    """The result of one mesh; None if the run failed."""
+    """Return factors and force from one mesh. Returns None if the run fails."""
     sets = {name: np.asarray(nodes) for name, nodes in mesh.node_sets.items()}
     bottom, top = sets["bottom"], sets["top"]
-    # Between the plates, without the axis: the planes y = 0 and x = 0.
+    # Nodes of the planes y = 0 and x = 0 between the plates, without the axis.
     planes = [np.setdiff1d(sets[name], np.concatenate([bottom, top, sets["axis"]])) for name in ("start", "end")]
     axis = np.setdiff1d(sets["axis"], np.concatenate([bottom, top]))
     height = float(np.ptp(np.asarray(mesh.points)[:, 2]))
@@ -113,18 +115,19 @@ def _on_mesh(mesh: lj.TetMesh, radius: float, law: Law, strain: float) -> Glued 
     if np.any(np.asarray(pressed.status) != 0):
         return None
     x, force = pressed.positions[-1], 4 * np.asarray(pressed.reactions[-1])[top]
-    # When the sample is twisted, the planes move along their normals.
+    # In torsion, the nodes of these planes move only along the normals of the planes.
     turned = scene(("xz", "yz", "xyz"), 0.0, lj.Solve(kind="harmonic", volumetric="element"))
     turn = jnp.zeros(x.shape, complex).at[top, :2].set(jnp.stack([-x[top, 1], x[top, 0]], axis=1))
     size = 2 * height * (1 - strain) / (np.pi * radius**4) / float(np.asarray(law.shear_modulus()))
 
     def seen(stands: float) -> float:
-        """R + S stands: the measured modulus before relaxation (m = 1), divided by G0; NaN if there is no solution."""
+        """Return R + S stands: the measured modulus before relaxation (m = 1), divided by G0. Returns NaN if there is
+        no solution."""
         prony = lj.Prony(ratios=jnp.array([1 - stands]), relaxation_times=jnp.array([1.0]))
         moved = lj.harmonic(replace(turned, viscosity=prony), [1.0], jnp.ones(1, complex), x, turn)
         on_plate, at = 4 * np.asarray(moved.reactions[0].real)[top], np.asarray(x)[top]
         torque = np.sum(at[:, 0] * on_plate[:, 1] - at[:, 1] * on_plate[:, 0])
-        # The plate turns, but the force on it from the compression keeps its direction.
+        # The force of the compression keeps its direction when the plate turns. Its contribution is subtracted.
         return size * float(torque - stands * np.sum(at[:, :2] * force[:, :2]))
 
     much, little = seen(0.8), seen(0.2)

@@ -16,12 +16,13 @@ class Indenter(NamedTuple):
     shape: str  # one of `SHAPES`
     thickness: float  # [m]
     poisson: float
-    radius: float = 0.0  # [m] of sphere and punch
-    half_angle: float = 45.0  # [deg] of the cone, between axis and side
+    radius: float = 0.0  # radius [m] of sphere or punch
+    half_angle: float = 45.0  # [deg] angle of the cone between axis and side
 
 
 def half_space(rig: Indenter, depth: np.ndarray) -> np.ndarray:
-    """Force [N] for a Young's modulus of 1 Pa at depths [m] (formulas of Hertz and Sneddon). It is 0 before contact."""
+    """Return the force [N] for a Young's modulus of 1 Pa at depths [m] (formulas of Hertz and Sneddon). The force is 0
+    before contact."""
     depth, plane = np.maximum(depth, 0.0), 1 / (1 - rig.poisson**2)
     if rig.shape == "sphere":
         return 4 / 3 * plane * np.sqrt(rig.radius) * depth**1.5

@@ -1,4 +1,5 @@
-"""The torsion rig at small strain: its stiffness, the bias of its mesh, and its moduli, computed without time steps."""
+"""The torsion rig (rheometer with its sample) at small strain: stiffness, bias of the mesh, and moduli without time
+steps."""
 
 from typing import NamedTuple
 
@@ -25,7 +26,8 @@ from liverjax.tensors.matrices import deformation_gradient, matmul
 
 
 def rest_stiffness(rig: Rig, law: Law) -> jax.Array:
-    """Elastic tangent at rest in the coordinates of the rig, a dense matrix (n, n) [N/m]."""
+    """Return the elastic tangent stiffness at rest in the coordinates of the rig (see `plates`), a dense matrix (n, n)
+    [N/m]."""
     mesh = rig.mesh
     V = mesh.points.shape[0]
     dofs = (3 * mesh.tetrahedra[:, :, None] + jnp.arange(3)[None, None]).reshape(-1, 12)
@@ -44,60 +46,62 @@ def rest_stiffness(rig: Rig, law: Law) -> jax.Array:
 
 
 class Response(NamedTuple):
-    """The linear response of the rig: its coordinates for unit arc length (real or complex), and the force per arc
-    length."""
+    """Linear response of the rig when the plate turns by a unit arc length (radius times angle). Values may be
+    complex."""
 
-    shape: jax.Array  # (n,), its last entry 1
-    stiffness: jax.Array  # [N/m]
+    shape: jax.Array  # (n,) coordinates of the rig; the last entry is 1
+    stiffness: jax.Array  # force per arc length [N/m]
 
 
 def _response(column: jax.Array) -> Response:
-    """The response, from the coordinates (n,) that a unit force on the last coordinate causes."""
+    """Return the response from the coordinates (n,) that a unit force on the last coordinate causes."""
     return Response(column / column[-1], 1 / column[-1])
 
 
 def exact_stiffness(rig: Rig, law: Law) -> Number:
-    """Force per arc length of the true elastic cylinder, pi r^2 G / (2 h) [N/m]."""
+    """Return the force per arc length [N/m] of the exact elastic cylinder, pi r^2 G / (2 h)."""
     return jnp.pi * rig.radius**2 * law.shear_modulus() / (2 * rig.height)
 
 
 @jax.jit
 def geometry_factor(rig: Rig, law: Law) -> jax.Array:
-    """Elastic torsional stiffness of the mesh, divided by pi r^4 G / (2 h). It differs from 1 because of the polygonal
-    section and the stiff elements.
+    """Return the elastic torsional stiffness of the mesh, divided by the exact value pi r^4 G / (2 h). This bias
+    differs from 1 because the cross-section is a polygon and the elements are too stiff.
 
-    Moduli divided by this factor have no such bias in the linear range.
+    Moduli that are divided by this factor have no bias in the linear range.
     """
     inverse = jnp.linalg.inv(rest_stiffness(rig, law))
     return _response(inverse[:, -1]).stiffness / exact_stiffness(rig, law)
 
 
 class Vibrations(NamedTuple):
-    """Vibrations of the elastic rig: K v = value M v, with vectors of unit modal mass. They have no derivatives."""
+    """Vibration modes of the elastic rig: K v = value M v, with vectors of unit modal mass. They are not
+    differentiated."""
 
     values: jax.Array  # (n,) [1/s^2]
     vectors: jax.Array  # (n, n) [kg^-1/2]
 
     def solve(self, r: jax.Array, stiffness: Number, mass: Number) -> jax.Array:
-        """x (n,) with (stiffness K + mass M) x = r."""
+        """Return x (n,) with (stiffness K + mass M) x = r."""
         return jnp.asarray(self.vectors @ ((self.vectors.T @ r) / (stiffness * self.values + mass)))
 
 
 class Linearised(NamedTuple):
-    """The linearised rig, before a frequency is given."""
+    """Matrices of the linearised rig that serve for all frequencies."""
 
-    inverse: jax.Array  # inverse of the stiffness (n, n) for a motion too fast to relax
-    relaxing: jax.Array | None  # relaxing part of the stiffness, then its constant part; None: everything relaxes
-    standing: jax.Array | None
-    held: "Held | None" = None  # the compressed sample; then the part of the stress that does not relax
-    stands: Number = 1.0
-    mass: jax.Array | None = None  # (n,) [kg] for each coordinate, if there is inertia; then stiffness and vibrations
-    elastic: jax.Array | None = None  # (n, n) [N/m]
-    modes: Vibrations | None = None
+    inverse: jax.Array  # inverse of the stiffness (n, n) for motions too fast for relaxation
+    relaxing: jax.Array | None  # (n, n) relaxing part of the stiffness; None: everything relaxes
+    standing: jax.Array | None  # (n, n) part of the stiffness that does not relax; None: everything relaxes
+    held: "Held | None" = None  # the compressed sample; None: not compressed
+    stands: Number = 1.0  # part of the stress that does not relax
+    mass: jax.Array | None = None  # (n,) [kg] for each coordinate; None: no inertia
+    elastic: jax.Array | None = None  # (n, n) [N/m] elastic stiffness, only with inertia
+    modes: Vibrations | None = None  # only with inertia
 
 
 def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
-    """The stiffness of the rig for all frequencies, and its inverse; with inertia, also its masses and vibrations."""
+    """Return the stiffness of the rig and its inverse, which serve for all frequencies. With inertia, also return the
+    masses and the vibration modes."""
     rest = _without_inertia(rig, law, prony)
     if rig.density is None:
         return rest
@@ -112,8 +116,8 @@ def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
 
 
 def rest_masses(rig: Rig) -> jax.Array:
-    """Lumped masses (n,) [kg] of the coordinates of the rig: of the nodes, then of lift (if it is free) and turn of the
-    plate."""
+    """Return the lumped masses (n,) [kg] of the rig's coordinates: of the free nodes, then of the plate's lift (if it
+    is free), then of the plate's rotation."""
     assert rig.density is not None
     mass = rig.density * nodal_volumes(rig.mesh)
     plate, X = mass[-rig.top :], rig.mesh.points[-rig.top :]
@@ -134,11 +138,11 @@ def _without_inertia(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
 
 
 def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
-    """Stiffness (n, n) [N/m] of a compressed sample in two parts: the part from changes of the stress, and the part
-    from the constant stress.
+    """Return two parts (n, n) [N/m] of the stiffness of a compressed sample. The first comes from changes of the
+    stress, the second from the constant stress of the compression (geometric stiffness).
 
-    A stress S that has been constant for a long time is only rotated by a motion. The second part is computed with the
-    unrelaxed S.
+    A motion only rotates a stress S that has been constant for a long time. The second part is computed with S before
+    relaxation.
     """
     mesh = rig.mesh
     rest = jnp.zeros(number_of_coordinates(rig), mesh.points.dtype)
@@ -161,7 +165,7 @@ def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
 
 
 def steady_response(rest: Linearised, modulus: Number) -> Response:
-    """Response in a steady cycle, if the relaxing stress is `modulus` (complex) times the elastic stress."""
+    """Return the response in a steady cycle, if the relaxing stress is `modulus` (complex) times the elastic stress."""
     if rest.relaxing is None or rest.standing is None:
         elastic = _response(rest.inverse[:, -1])
         return Response(elastic.shape, elastic.stiffness * modulus)
@@ -170,21 +174,23 @@ def steady_response(rest: Linearised, modulus: Number) -> Response:
 
 
 def torque_for_strain(rig: Rig, modulus: Number, strain: Number) -> Number:
-    """Torque amplitude [N m] that gives about `strain` at the rim of a sample with the dynamic modulus |G*| = `modulus`
-    [Pa]."""
+    """Return the torque amplitude [N m] that gives about `strain` at the rim of a sample with the dynamic modulus |G*|
+    = `modulus` [Pa]."""
     return jnp.pi * rig.radius**3 / 2 * modulus * strain
 
 
 def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """The limit of `torsion.moduli` for small strain: the complex moduli (n,) [Pa] that the recursion in time gives.
+    """Return the complex moduli (n,) [Pa] at small strain that the recursion (the update of the viscous memory from
+    step to step) gives. They are the limit of `torsion.moduli`.
 
-    In this limit, the rig is linear and its bias is divided out. So the moduli depend neither on the mesh nor on the
-    plates. Their derivatives by the parameters equal the derivatives of `torsion.moduli`, up to an error of the order
-    of the strain. So the simulation need not be differentiated. Inertia is not included.
+    In this limit, the rig is linear, and dividing by the bias removes the error of the mesh. So the moduli depend
+    neither on the mesh nor on the plates. Up to an error of the order of the strain, their derivatives with respect to
+    the parameters equal the derivatives of `torsion.moduli`. So the simulation need not be differentiated. Inertia is
+    not included.
 
     Args:
-        law: the law, scaled to G0 (its shear modulus at rest).
-        prony: its relaxation.
+        law: the law; its shear modulus at rest is G0.
+        prony: relaxation of the law.
         omega: angular frequencies (n,) [rad/s].
         steps: time steps per cycle; None: continuous time.
     """
@@ -193,17 +199,17 @@ def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -
 
 
 class Held(NamedTuple):
-    """A compressed sample of a law, before its relaxation is given."""
+    """Stiffness and mesh error of a compressed sample, which do not depend on its relaxation."""
 
     relaxing: jax.Array  # (n, n) [N/m], see `about_held`
     standing: jax.Array
-    bias: jax.Array  # bias of its mesh at rest, see `geometry_factor`
-    factors: jax.Array  # R and S (2,) [1] of its mesh, see `glued_compression`
-    meshless: jax.Array | None  # R and S (2,) without a mesh, if they are known
+    bias: jax.Array  # bias of the uncompressed mesh, see `geometry_factor`
+    factors: jax.Array  # factors R and S (2,) [1] of this mesh, see `glued_compression`
+    meshless: jax.Array | None  # R and S (2,) without mesh error; None: unknown
 
     def bias_at(self, modulus: Number, stands: Number) -> jax.Array:
-        """Bias of the mesh, for a sample whose stress relaxes by the factor `modulus` (complex), and finally to the
-        part `stands`."""
+        """Return the bias of the mesh. `modulus`: complex factor by which the stress relaxes. `stands`: part of the
+        stress that never relaxes."""
         if self.meshless is None:
             return self.bias + 0j
         own, true = (R * modulus + S * stands for R, S in (self.factors, self.meshless))
@@ -211,7 +217,7 @@ class Held(NamedTuple):
 
 
 def held(rig: Rig, law: Law) -> Held:
-    """The input of `held_moduli` for a rig from `compression.compressed`."""
+    """Return stiffness and mesh error of the compressed sample in a rig from `compression.compressed`."""
     relaxing, standing = about_held(rig, law)
     whole, part = (1 / jnp.linalg.inv(relaxing + s * standing)[-1, -1] for s in (1.0, 0.5))
     factors = jnp.stack([2 * part - whole, 2 * (whole - part)]) / exact_stiffness(rig, law)
@@ -220,7 +226,8 @@ def held(rig: Rig, law: Law) -> Held:
 
 
 def moving_response(rest: Linearised, modulus: Number, square: Number) -> Response:
-    """The result of `steady_response` with inertia. Accelerations are -`square` [1/s^2] times displacements."""
+    """Return the response in a steady cycle with inertia (without inertia: `steady_response`). Accelerations are
+    -`square` [1/s^2] times displacements."""
     assert rest.mass is not None and rest.elastic is not None and rest.modes is not None
     mass, modes, elastic = rest.mass, rest.modes, rest.elastic
     unit = jnp.zeros(len(mass), complex).at[-1].set(1.0)
@@ -239,11 +246,11 @@ def moving_response(rest: Linearised, modulus: Number, square: Number) -> Respon
 
 
 def held_moduli(of: Held, rig: Rig, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """The result of `linear_moduli` for the compressed sample `of`: complex moduli (n,) [Pa], from its mesh.
+    """Return the complex moduli (n,) [Pa] of the compressed sample `of` at small strain, computed on its mesh.
 
     Args:
-        of, rig: the sample.
-        prony: its relaxation.
+        of, rig: the compressed sample and its rig.
+        prony: relaxation of the law.
         omega: angular frequencies (n,) [rad/s].
         steps: time steps per cycle; None: continuous time.
     """

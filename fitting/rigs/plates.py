@@ -1,6 +1,7 @@
-"""The sample between the plates of a rheometer: its mesh, and the coordinates of its motion.
+"""The sample between the plates of a rheometer (together called the rig): its mesh, and the coordinates of its motion.
 
-The coordinates are the displacements u of the free nodes, the lift of the top plate, and arc = radius * angle.
+The coordinates are the displacements u of the free nodes, the lift (axial displacement) of the top plate, and arc. The
+arc length of the plate's rotation is arc = radius * angle.
 """
 
 import math
@@ -14,8 +15,8 @@ from liverjax.core.struct import Number, param, static, struct
 from liverjax.mesh import shapes
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: From the chapter, section 5.3. Section 5.2 prints 41 mm in place of 4 mm +- 1 mm (at 41 mm, the sample would be in
-#: resonance within the band).
+#: Radius and height [m] from section 5.3 of the chapter. Section 5.2 prints 41 mm instead of 4 mm +- 1 mm (at 41 mm,
+#: the sample would be in resonance within the band).
 RADIUS, HEIGHT = 0.010, 0.004
 
 
@@ -28,26 +29,26 @@ class Rig:
     radius: Number = param("m", "plate radius")
     height: Number = param("m", "gap")
     density: Number | None = param("kg/m^3", "None: no inertia, and no velocity in the state", default=None)
-    bottom: int = static(about="number of nodes on the gripped plate")
+    bottom: int = static(about="number of nodes on the fixed plate")
     top: int = static(about="number of nodes on the turning plate")
     held: jax.Array | None = param(
-        "m", "positions (V, 3) of the compressed sample; None: it is not (`compression`)", default=None
+        "m", "positions (V, 3) of the compressed sample; None: not compressed (`compression`)", default=None
     )
     meshless: jax.Array | None = param(
-        "1", "R and S (2,) of the compressed sample without a mesh (`glued_compression`); None: not known", default=None
+        "1", "factors R and S (2,) without mesh error (`glued_compression`); None: unknown", default=None
     )
-    free_height: bool = static(default=False, about="the top plate may also move along the axis under no axial force")
+    free_height: bool = static(default=False, about="the top plate also moves along the axis, without axial force")
 
 
 def cell_size_for(radius: float, height: float) -> float:
-    """Default cell size [m]. It gives 100 to 400 nodes for any shape. `geometry_factor` removes the error of such a
-    mesh at small strain."""
+    """Return the default cell size [m], which gives 100 to 400 nodes for any shape. `geometry_factor` removes the error
+    of such a mesh at small strain."""
     return max((math.pi * radius**2 * height / 100) ** (1 / 3), radius / 6, height / 12)
 
 
 def linear_cell_for(radius: float, height: float) -> float:
-    """Cell size [m] for about 100 nodes. This is enough for small strain without inertia: then `bias` is the whole
-    error of the mesh.
+    """Return a cell size [m] that gives about 100 nodes. This is enough for small strain without inertia, because the
+    bias (`geometry_factor`) is then the whole error of the mesh.
 
     The remaining error is of the order of the strain. At a strain of 1e-3, the moduli differ by 1e-5 from the moduli
     with `cell_size_for` (experiments/benchmarks/torsion_speed.py).
@@ -62,12 +63,12 @@ def make_rig(
     free_height: bool = False,
     density: float | None = None,
 ) -> Rig:
-    """A rig with a generated cylinder.
+    """Return a rig with a generated mesh of the cylinder.
 
     Args:
         radius, height: size of the sample [m].
         cell_size: edge length of the mesh [m]; default `cell_size_for`.
-        free_height: the top plate may rise (Poynting effect); otherwise the gap is held.
+        free_height: the top plate may rise (Poynting effect); otherwise the gap is fixed.
         density: density [kg/m^3]; None: without inertia.
 
     Raises:
@@ -83,7 +84,7 @@ def make_rig(
 def rig_from_mesh(
     mesh: TetMesh, radius: float, height: float, free_height: bool = False, density: float | None = None
 ) -> Rig:
-    """A rig with any mesh. The axis of the mesh must be z, and its lowest and highest planes are the plates."""
+    """Return a rig with any mesh. The axis of the mesh must be z, and the plates are its lowest and highest planes."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     z = points[:, 2]
     near = 1e-9 * (z.max() - z.min())
@@ -102,7 +103,7 @@ def rig_from_mesh(
 
 
 def sample_positions(rig: Rig, u: jax.Array, lift: Number, angle: Number) -> jax.Array:
-    """Positions (V, 3) [m] for displacements u of the free nodes, and lift and angle of the top plate."""
+    """Return the positions (V, 3) [m] for displacements u of the free nodes, and lift and angle of the top plate."""
     X = rig.mesh.points if rig.held is None else rig.held
     n = X.shape[0] - rig.top
     c, s = jnp.cos(angle), jnp.sin(angle)
@@ -112,7 +113,7 @@ def sample_positions(rig: Rig, u: jax.Array, lift: Number, angle: Number) -> jax
 
 
 def work_conjugates(rig: Rig, x: jax.Array, f: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Forces [N] that are work-conjugate to (u, lift, arc): nodal forces, axial force, torque / radius."""
+    """Return the forces [N] that are work-conjugate to (u, lift, arc): nodal forces, axial force, torque / radius."""
     n = x.shape[0] - rig.top
     top, force = x[n:], f[n:]
     torque = jnp.sum(top[:, 0] * force[:, 1] - top[:, 1] * force[:, 0])
@@ -120,14 +121,15 @@ def work_conjugates(rig: Rig, x: jax.Array, f: jax.Array) -> tuple[jax.Array, ja
 
 
 def coordinates(rig: Rig, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(u, lift, angle) from the full vector of coordinates."""
+    """Split the full vector q of coordinates into (u, lift, angle) [m, m, rad]."""
     if rig.free_height:
         return q[:-2], q[-2], q[-1] / rig.radius
     return q[:-1], jnp.zeros((), q.dtype), q[-1] / rig.radius
 
 
 def packed(rig: Rig, u: jax.Array, axial: jax.Array, arc: jax.Array) -> jax.Array:
-    """The full vector of coordinates, or of the forces along the coordinates."""
+    """Join u, lift (`axial`) and arc into the full vector of coordinates; or join the forces that are conjugate to
+    them."""
     return jnp.concatenate([u, axial[None], arc[None]] if rig.free_height else [u, arc[None]])
 
 

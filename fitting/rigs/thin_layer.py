@@ -1,9 +1,9 @@
 """A rigid indenter on an elastic layer that is bonded to a rigid base: small strains, no friction, no adhesion.
 
-There is an exact solution for a layer of any thickness under a punch, a sphere or a cone. For every wave number xi, the
-surface of the layer moves K(xi h) times as much as the surface of a half-space. This gives one integral equation on the
-contact circle, which is solved at Gauss points. The force is linear in the modulus, so one table of force over depth is
-enough for a whole fit.
+There is an exact solution for a layer of any thickness under a punch, a sphere or a cone. Under a pressure with wave
+number xi, the surface of a layer of thickness h moves K(xi h) times as much as the surface of a half-space. This gives
+one integral equation on the contact circle, which is solved at Gauss points. The force is linear in the modulus, so a
+fit needs only one table of force over depth.
 
 Sources: Lebedev and Ufliand 1958, J. Appl. Math. Mech. 22:442; Hayes et al. 1972, J. Biomech. 5:541 (the layer);
 Dimitriadis et al. 2002, Biophys. J. 82:2798 (the series).
@@ -27,13 +27,13 @@ _WAVES, _POINTS, _ROWS = 160, 48, 48
 class Factors(NamedTuple):
     """Table of the force on a layer divided by the force on a half-space at the same depth."""
 
-    reach: np.ndarray  # (n,) ascending from 0: size of a half-space's contact / thickness, see `reach`
+    reach: np.ndarray  # (n,) ascending from 0: size of the contact on a half-space / thickness, see `reach`
     factor: np.ndarray  # (n,) force / force on the half-space
 
 
 def stiffening(eta: np.ndarray, poisson: float) -> np.ndarray:
-    """1 - K(eta). K is the surface motion of a bonded layer, divided by the surface motion of a half-space, at the wave
-    number eta/h."""
+    """Return 1 - K(eta). K is the surface motion of a bonded layer, divided by the surface motion of a half-space, at
+    the wave number eta/h."""
     c = 3 - 4 * poisson
     # All terms are divided by exp(2 eta), so that no hyperbolic function overflows.
     e = np.exp(-2 * eta)
@@ -43,8 +43,8 @@ def stiffening(eta: np.ndarray, poisson: float) -> np.ndarray:
 
 
 def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
-    """Depth and force at the contact radius `width` times the thickness, divided by depth and force of a half-space at
-    the same contact radius."""
+    """Return depth and force if the contact radius is `width` times the thickness. Both are divided by the values of a
+    half-space with the same contact radius."""
     tau, w = np.polynomial.legendre.leggauss(_POINTS)
     tau, w = np.append((tau + 1) / 2, 1.0), np.append(w / 2, 0.0)  # the edge of the contact has no weight
     eta, v = np.polynomial.legendre.leggauss(_WAVES)
@@ -61,7 +61,7 @@ def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
 
 
 def factors(poisson: float, shape: str) -> Factors:
-    """The table for a sphere or a cone, for contact radius / thickness from 0 to 8.
+    """Compute the table for a sphere or a cone, for contact radius / thickness from 0 to 8.
 
     Args:
         poisson: 0 to 0.5.
@@ -75,13 +75,14 @@ def factors(poisson: float, shape: str) -> Factors:
 
 
 def punch_factor(radius: float, thickness: float, poisson: float) -> float:
-    """The factor that Hayes tabulates: the force of a flat punch on a layer, divided by its force on a half-space."""
+    """Return the force of a flat punch on a layer, divided by its force on a half-space. Hayes et al. tabulate this
+    factor."""
     return _contact(radius / thickness, poisson, "punch")[1]
 
 
 def reach(rig: Indenter, depth: np.ndarray) -> np.ndarray:
-    """Size of the contact on a half-space, divided by the thickness: sqrt(R d)/h for a sphere, d tan(angle)/h for a
-    cone."""
+    """Return the size of the contact on a half-space, divided by the thickness h: sqrt(R d)/h for a sphere of radius R,
+    d tan(angle)/h for a cone."""
     depth = np.maximum(depth, 0.0)
     if rig.shape == "sphere":
         return np.sqrt(rig.radius * depth) / rig.thickness
@@ -89,7 +90,7 @@ def reach(rig: Indenter, depth: np.ndarray) -> np.ndarray:
 
 
 def check_indenter(rig: Indenter) -> None:
-    """Refuse an indenter that cannot be computed.
+    """Check that an indenter can be computed.
 
     Raises:
         InputError: the shape is not known, a length is not above 0, Poisson's ratio or the angle is out of range, or a
@@ -107,7 +108,7 @@ def check_indenter(rig: Indenter) -> None:
         raise InputError(f"half_angle = {rig.half_angle} of the cone must be between 0 and 90: give it in degrees")
     if rig.shape == "punch" and rig.radius > WIDEST * rig.thickness:
         raise InputError(
-            f"radius = {rig.radius} m of the punch is over {WIDEST:g} times the thickness: use a smaller one"
+            f"radius = {rig.radius} m of the punch is over {WIDEST:g} times the thickness: use a smaller punch"
         )
 
 
@@ -115,7 +116,7 @@ class Layer:
     """Force of an indenter on its layer. The table is computed once.
 
     Raises:
-        InputError: the rig cannot be used, or a depth is beyond `deepest`.
+        InputError: the indenter cannot be computed, or a depth is beyond `deepest`.
     """
 
     def __init__(self, rig: Indenter) -> None:
@@ -131,7 +132,8 @@ class Layer:
         self.deepest = float((table.reach[-1] / unit) ** (2 if rig.shape == "sphere" else 1))
 
     def force(self, depth: np.ndarray) -> np.ndarray:
-        """Force [N] for a Young's modulus of 1 Pa, at depths [m] up to `deepest`. It is 0 before contact."""
+        """Return the force [N] for a Young's modulus of 1 Pa, at depths [m] up to `deepest`. The force is 0 before
+        contact."""
         largest = float(np.max(depth, initial=0.0))
         if not largest <= self.deepest:
             raise InputError(
@@ -143,7 +145,8 @@ class Layer:
 
 
 def series(chi: np.ndarray, poisson: float) -> np.ndarray:
-    """The factor of a sphere for small chi = sqrt(R d)/h, to third order in chi, from the same integral equation."""
+    """Return the factor (force / force on a half-space) of a sphere for small chi = sqrt(R d)/h, to third order in chi.
+    It is derived from the same integral equation."""
     eta, v = np.polynomial.legendre.leggauss(_WAVES)
     eta, v = _LAST_WAVE * (eta + 1) / 2, _LAST_WAVE * v / 2
     missing = v * stiffening(eta, poisson)
@@ -152,6 +155,6 @@ def series(chi: np.ndarray, poisson: float) -> np.ndarray:
 
 
 def dimitriadis(chi: np.ndarray) -> np.ndarray:
-    """The factor of a sphere on an incompressible layer for small chi, as printed by Dimitriadis et al. (equation
-    12)."""
+    """Return the factor of a sphere on an incompressible layer for small chi = sqrt(R d)/h, as printed by Dimitriadis
+    et al. (equation 12)."""
     return 1 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4

@@ -1,8 +1,8 @@
 """The rheometer as a differentiable simulation (chapter, sections 5.2 and 5.3).
 
 The sample is a cylinder of tetrahedra. Its bottom is fixed, and its top turns rigidly about the axis by one angle. A
-sinusoidal torque (the stress-controlled AR2000) or a sinusoidal angle drives the top. Every time step is solved by
-Newton's method and differentiated implicitly. The moduli come from demodulation of the last cycle.
+sinusoidal torque (as in the stress-controlled rheometer AR2000) or a sinusoidal angle drives the top. Every time step
+is solved by Newton's method and differentiated implicitly. The moduli come from demodulation of the last cycle.
 
 By default, the run starts on the steady cycle of the linearised discrete problem. So there is no transient in the
 linear range.
@@ -63,10 +63,11 @@ from liverjax.tensors.matrices import deformation_gradient
 
 
 class Drive(NamedTuple):
-    """Drive of the rig and number of steps; static in compiled programs.
+    """How the rig (the rheometer with its sample) is driven, and the number of steps. All values are static in compiled
+    programs.
 
-    `steps`: time steps per cycle. `cycles`: cycles of a run; the last one is demodulated. `by`: "torque" or "angle".
-    `start`: "cycle" or "rest".
+    `steps`: time steps per cycle. `cycles`: cycles of a run; the last one is demodulated. `by`: imposed quantity,
+    "torque" or "angle". `start`: initial state, "cycle" (the steady linear cycle) or "rest".
     """
 
     steps: int = 50
@@ -100,11 +101,11 @@ class Moduli(NamedTuple):
 def scene_of(
     rig: Rig, law: Law, prony: Prony | None, omega: Number, amplitude: Number, drive: Drive = Drive()
 ) -> Scene:
-    """The oscillation from rest, as a scene with a rigid plate for `lj.simulate`. The arguments are the same as for
-    `oscillate`.
+    """Return the oscillation from rest as a scene with a rigid plate for `lj.simulate`. The arguments are the same as
+    for `oscillate`.
 
-    `oscillate` with `start="rest"` gives the same result in a fraction of the time: it uses the inverse of the
-    stiffness, because the body is small.
+    `oscillate` with `start="rest"` gives the same result in a fraction of the time. It uses the inverse of the
+    stiffness, which is possible because the mesh is small.
     """
     steps, n = drive.steps * drive.cycles, rig.mesh.number_of_nodes
     dt = 2 * jnp.pi / (omega * drive.steps)
@@ -158,13 +159,13 @@ class _Oscillation(NamedTuple):
         return sample_positions(self.rig, *coordinates(self.rig, q))
 
     def full(self, q: jax.Array, t: Number) -> jax.Array:
-        """All coordinates at time t, from the unknown coordinates q."""
+        """Return all coordinates at time t from the unknown coordinates q."""
         if self.by_torque:
             return q
         return jnp.append(q, self.rig.radius * self.amplitude * jnp.sin(self.omega * t))
 
     def solved_part(self, q: jax.Array) -> jax.Array:
-        """The unknown coordinates, from all coordinates."""
+        """Return the unknown coordinates from all coordinates."""
         return q if self.by_torque else q[:-1]
 
 
@@ -173,10 +174,8 @@ class _Cycle(NamedTuple):
 
     steady: Response
     arc: Number | complex  # amplitude of the last coordinate [m]
-    precondition: Callable[[jax.Array], jax.Array]  # approximate inverse of the tangent by the unknowns
-    twist: Number = (
-        0.0  # force [N] that turns a compressed mesh, which is not quite symmetric, without a load: it is subtracted
-    )
+    precondition: Callable[[jax.Array], jax.Array]  # approximate inverse of the tangent matrix of the unknowns
+    twist: Number = 0.0  # [N] torque / radius of an unloaded compressed mesh, which is not quite symmetric; subtracted
 
     def at(self, omega: Number, t: Number) -> jax.Array:
         """Coordinates at time t [s]."""
@@ -184,12 +183,14 @@ class _Cycle(NamedTuple):
 
 
 def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
-    """The run, and the bias of the mesh at this frequency. The bias is complex if only the isochoric part relaxes."""
+    """Return the run, and the bias of the mesh at this frequency. The bias is complex if only the isochoric part
+    relaxes."""
     rig, drive = o.rig, o.drive
     modulus = 1.0 if o.prony is None else 1 - jnp.sum(viscosity.complex_ratios(o.prony, o.omega, o.dt), axis=0)
     still = steady_response(rest, modulus)
     steady = still if rig.density is None else moving_response(rest, modulus, o.rate**2)
-    # A sin(w t) = Re(-i A e^(i w t)). This is the complex arc of the linearised discrete problem.
+    # A sin(w t) = Re(-i A e^(i w t)). `arc` is the complex amplitude of the last coordinate in the linearised discrete
+    # problem.
     arc = -1j * o.amplitude * (1 / (steady.stiffness * rig.radius) if o.by_torque else rig.radius)
     twist = 0.0 if rig.held is None else jax.lax.stop_gradient(_twist(o))
     cycle = _Cycle(steady, arc, _preconditioner(o, rest), twist)
@@ -213,8 +214,8 @@ def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
 
 
 def _preconditioner(o: _Oscillation, rest: Linearised) -> Callable[[jax.Array], jax.Array]:
-    """An approximate inverse of the tangent of a step: the inverse of the elastic stiffness, plus Newmark's masses if
-    there is inertia."""
+    """Return an approximate inverse of the tangent matrix of a step: the inverse of the elastic stiffness, to which
+    Newmark's masses are added if there is inertia."""
     if rest.modes is None:
         inverse = jax.lax.stop_gradient(rest.inverse if o.by_torque else _without_last(rest.inverse))
         return lambda r: inverse @ r
@@ -231,20 +232,21 @@ def _preconditioner(o: _Oscillation, rest: Linearised) -> Callable[[jax.Array], 
 
 
 def _twist(o: _Oscillation) -> jax.Array:
-    """Torque of the compressed sample without a load after relaxation, divided by the radius [N]."""
+    """Return torque / radius [N] of the compressed, relaxed sample without a load."""
     standing = 1.0 if o.prony is None else 1 - jnp.sum(jnp.asarray(o.prony.ratios))
     x = o.positions(jnp.zeros(number_of_coordinates(o.rig), o.rig.mesh.points.dtype))
     return standing * work_conjugates(o.rig, x, mjed.internal_force(o.rig.mesh, o.law, x))[2]
 
 
 def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tuple[tuple, tuple]:
-    """One time step. Returns coordinates and memories; and angle, torque, lift and Newton's statistics."""
+    """Solve one time step. Returns the new coordinates and memories, then angle, torque, lift and Newton's
+    statistics."""
     (q_old, memories), rig, mesh = carry, o.rig, o.rig.mesh
     mask = jnp.ones_like(mesh.points)
     if not o.by_torque and o.drive.start == "rest":
-        # The speed of the top plate jumps at the start, so its average acceleration would oscillate and grow. It is
-        # left out here. The remaining error is of first order in the time step. If the run starts on the cycle, nothing
-        # jumps, and the error is of second order.
+        # The velocity of the top plate jumps at the start, so its acceleration would oscillate and grow in the average
+        # acceleration method. Therefore this acceleration is left out. The remaining error is of first order in the
+        # time step. If the run starts on the cycle, the velocity does not jump, and the error is of second order.
         mask = mask.at[len(mask) - rig.top :, :2].set(0.0)
     physics, free = _sample_physics(rig, o.law, o.prony), Free(mask)
     steps, tolerance = o.drive.steps * o.drive.cycles, o.drive.options.tolerance
@@ -260,7 +262,7 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
     load = jnp.zeros_like(q_old)
     if o.by_torque:
         load = load.at[-1].set(o.amplitude * jnp.sin(o.omega * t) / rig.radius)
-    # The linear solution at this time, plus the deviation of the last step from the linear solution.
+    # The guess is the linear solution at this time, plus the deviation of the last step from the linear solution.
     guess = cycle.at(o.omega, t) + (q_old - cycle.at(o.omega, t - o.dt))
     q, statistics = newton.newton_root(
         lambda v: o.solved_part(forces(o.full(v, t)) - load),
@@ -279,20 +281,21 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
 
 
 def _without_last(inverse: jax.Array) -> jax.Array:
-    """Inverse of a symmetric matrix without its last row and column, from the whole inverse (Schur complement)."""
+    """Return the inverse of a symmetric matrix without its last row and column, from the whole inverse (Schur
+    complement)."""
     b = inverse[:-1, -1]
     return inverse[:-1, :-1] - jnp.outer(b, b) / inverse[-1, -1]
 
 
 def _sample_physics(rig: Rig, law: Law, prony: Prony | None) -> tuple[Physics, ...]:
-    """The physics of the sample: its solid, and its mass if the rig has a density."""
+    """Return the physics objects of the sample: its solid, and its inertia if the rig has a density."""
     solid = Elasticity(law=law) if prony is None else Viscoelasticity(law=law, prony=prony)
     return (solid,) if rig.density is None else (solid, Inertia(density=rig.density, integrator="newmark"))
 
 
 def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[jax.Array, tuple]:
-    """Coordinates at time 0 and the memories of the physics, either at rest or on the cycle of the linearised
-    problem."""
+    """Return the coordinates at time 0 and the memories of the physics objects, either at rest or on the cycle of the
+    linearised problem."""
     rig, prony, on_cycle, mesh = o.rig, o.prony, o.drive.start == "cycle", o.rig.mesh
     q = jnp.real(shape * arc) if on_cycle else jnp.zeros(shape.shape, mesh.points.dtype)
     history = None if prony is None else viscosity.initial_history(prony, mesh.volumes.shape[0], q.dtype)
@@ -300,13 +303,13 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[
     def S(q):
         return viscosity.relaxing_stress(prony, o.law, deformation_gradient(mesh, o.positions(q)))
 
-    if prony is not None and rig.held is not None:  # the sample was held until its stress had relaxed
+    if prony is not None and rig.held is not None:  # the sample stayed compressed until its stress had relaxed
         stands = S(jnp.zeros_like(q))
         history = viscosity.relaxed_history(prony, stands)
     if prony is not None and on_cycle:
         _, slope = jax.linearize(S, jnp.zeros_like(q))
         S_shape = slope(jnp.real(shape)) * arc
-        if jnp.iscomplexobj(shape):  # a real shape needs only one slope, which is a fifth of the program
+        if jnp.iscomplexobj(shape):  # a real shape needs one derivative only; the other is a fifth of the program
             S_shape += slope(jnp.imag(shape)) * 1j * arc
         ratios = viscosity.complex_ratios(prony, o.omega, o.dt)
         gamma = jnp.real(ratios[:, None, None] * S_shape[None])
@@ -325,7 +328,7 @@ def oscillate(rig: Rig, law: Law, prony: Prony | None, omega: Number, amplitude:
 
     Args:
         rig: the rig, from `make_rig`.
-        law: any law; it gives the instantaneous response.
+        law: any law of the instantaneous response.
         prony: relaxation of the law, or None.
         omega: angular frequency [rad/s].
         amplitude: amplitude of the torque [N m] or of the angle [rad].
@@ -335,7 +338,7 @@ def oscillate(rig: Rig, law: Law, prony: Prony | None, omega: Number, amplitude:
 
 
 def demodulate(run: Run, omega: Number, drive: Drive) -> tuple[jax.Array, jax.Array]:
-    """Complex amplitudes of torque [N m] and angle [rad] over the last cycle."""
+    """Return the complex amplitudes of torque [N m] and angle [rad] over the last cycle."""
     carrier = 2 / drive.steps * jnp.exp(-1j * omega * run.time[-drive.steps :])
     return jnp.sum(carrier * run.torque[-drive.steps :]), jnp.sum(carrier * run.angle[-drive.steps :])
 
@@ -344,15 +347,16 @@ def demodulate(run: Run, omega: Number, drive: Drive) -> tuple[jax.Array, jax.Ar
 def moduli(
     rig: Rig, law: Law, prony: Prony | None, omega: jax.Array, amplitude: jax.Array, drive: Drive = Drive()
 ) -> Moduli:
-    """G* = 2 h / (pi r^4) M / theta for many oscillations at once (section 5.3), with one compiled program.
+    """Return G* = 2 h / (pi r^4) M / theta of many oscillations (section 5.3), with torque M and angle theta, in one
+    compiled program.
 
     The moduli are divided by the bias of the mesh, `geometry_factor`. If only the isochoric part relaxes, the bias
-    depends on the frequency, because the bulk modulus has more effect as the shear modulus falls. With a density, the
-    inertial part is divided by the bias too, which is not exact: refine the mesh. The moduli times `Moduli.bias` are
-    the moduli of the mesh without this correction.
+    depends on the frequency, because the bulk modulus has more effect when the shear modulus has relaxed. With a
+    density, the inertial part is divided by the bias too. This is not exact: refine the mesh. Multiply the moduli by
+    `Moduli.bias` to get the moduli of the mesh without this correction.
 
     Args:
-        omega, amplitude: (n,) or single values, which are broadcast; see `oscillate`.
+        omega, amplitude: arrays (n,) or single values, which are broadcast; see `oscillate`.
     """
     rest = linearised_rig(rig, law, prony)
     omega, amplitude = jnp.broadcast_arrays(jnp.asarray(omega, float), jnp.asarray(amplitude, float))
@@ -366,16 +370,16 @@ def moduli(
         return Moduli(jnp.real(G), jnp.imag(G), jnp.abs(angle) * rig.radius / rig.height, defect, bias, worst)
 
     lanes = jnp.atleast_1d(omega), jnp.atleast_1d(amplitude)
-    # On a CPU, one lane after another stays in the cache (1.7 times faster for the Jacobian). A GPU runs all lanes at
-    # once.
+    # On a CPU, one oscillation runs after the other, because each fits into the cache (1.7 times faster for the
+    # Jacobian). A GPU runs all of them at once.
     return jax.lax.map(lambda lane: one(*lane), lanes) if jax.default_backend() == "cpu" else jax.vmap(one)(*lanes)
 
 
 def strain_sweep(
     rig: Rig, law: Law, prony: Prony | None, strains: Numbers, omega: float = 2 * math.pi, drive: Drive | None = None
 ) -> Moduli:
-    """Dynamic strain sweep (section 5.2): moduli at strain amplitudes of the rim. By default the angle is driven, for
-    three cycles each.
+    """Return the moduli of a dynamic strain sweep (section 5.2) at strain amplitudes of the rim. By default, the angle
+    is imposed, for three cycles at each amplitude.
 
     Args:
         strains: amplitudes at the rim, e.g. 1e-4 … 0.2.
@@ -386,10 +390,10 @@ def strain_sweep(
 
 
 def linearity_limit(strains: Numbers, storage: Numbers, deviation: float = 0.05) -> float:
-    """Strain at which G' differs by `deviation` from its value at the smallest strain; infinity if it never differs so
-    much.
+    """Return the strain at which G' differs by `deviation` from its value at the smallest strain. Returns infinity if
+    G' never differs that much.
 
-    If a modulus is not finite (a diverged run) before that, the last good strain is returned.
+    If a modulus is not finite (a diverged run) before this strain, the last strain with a finite modulus is returned.
     """
     strains, change = np.asarray(strains), np.abs(np.asarray(storage) / np.asarray(storage)[0] - 1)
     beyond = np.flatnonzero(~(change <= deviation))

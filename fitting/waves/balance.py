@@ -1,16 +1,19 @@
 """The balance of forces in measured waves, and the modulus that follows from it.
 
-At the inner nodes of a body no force acts from outside, so C(G) u + B p = 0. C has the rows of K(G) - omega^2 M at
-these nodes, where K contains the shear stress alone. B p are the forces of a pressure p, which is linear in the
-elements and continuous. The pressure is unknown, so no bulk modulus is needed. The measured motion is d = u + noise, at
-all nodes. If the pressure has a large prior variance g sd^2, the likeliest motion that fulfils this balance is
+No external force acts at the inner nodes of a body, so C(G) u + B p = 0, with the moduli G and the nodal displacements
+u. C consists of the rows of K(G) - omega^2 M at these nodes. K is the stiffness matrix of the shear stress alone, and M
+is the mass matrix. B p are the nodal forces of a pressure p, which is continuous and linear in each element. The
+pressure is unknown, so no bulk modulus is needed. The measured motion at all nodes is d = u + noise, and the noise has
+the standard deviation sd. If the pressure has a large prior variance g sd^2, the most probable motion that fulfils this
+balance is
 
     u = d - C^H q,   S q = C d,   S = C C^H + g B B^H,   chi^2 = (C d)^H q / sd^2.
 
-No condition is needed at the surface of the body: its motion is measured with noise, like all other motion. As a
-function of the modulus, chi^2 / 2 has the gradient Re(q^H C' u) / sd^2 and the Gauss-Newton Hessian
-(C' u)^H S^-1 C' u / sd^2 (variable projection: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10, 413). Since C' acts on
-u and not on d, noise does not lower the modulus. In the direct inversion of second derivatives, noise lowers it.
+No condition is needed at the surface of the body: the motion of the surface is measured with noise, like all other
+motion. Let C' be the derivative of C with respect to a modulus. As a function of the modulus, chi^2 / 2 has the
+gradient Re(q^H C' u) / sd^2 and the Gauss-Newton Hessian (C' u)^H S^-1 C' u / sd^2 (variable projection: Golub and
+Pereyra 1973, SIAM J. Numer. Anal. 10, 413). C' acts on the fitted motion u and not on the noisy d, so noise does not
+lower the modulus. In a direct inversion with second derivatives, noise lowers the modulus.
 """
 
 import itertools
@@ -32,28 +35,31 @@ from liverjax.waves.harmonic import element_operator
 
 
 class Matrices(NamedTuple):
-    """Parts of the dynamic stiffness of every element with n nodes, and their positions in the matrices."""
+    """Parts of the dynamic stiffness of every element with n nodes, and the positions of these parts in the matrices.
+
+    There are E elements, V nodes and I unknowns at inner nodes. I is also the number of rows of C.
+    """
 
     shear: np.ndarray  # (n, 3, n, 3, E) for a shear modulus of 1 Pa [N/m/Pa]
     mass: np.ndarray  # (n, n, E) of one component [kg]
-    unknowns: np.ndarray  # (n, 3, E) index of each in 3 V, x, y, z of a node together
-    rows: np.ndarray  # (n, 3, E) index among the inner unknowns, -1: none
-    pattern: scipy.sparse.csr_array  # of C
-    places: np.ndarray  # positions in pattern.data of the elements' entries with an inner row
-    entries: np.ndarray  # indices of these entries among all
-    pressure: np.ndarray  # g B B^H (bandwidth + 1, I), by diagonals
-    balances: int  # real equations that chi^2 sums over
+    unknowns: np.ndarray  # (n, 3, E) index of each unknown in a vector (3 V,) with x, y, z of a node together
+    rows: np.ndarray  # (n, 3, E) row of C of each unknown, -1 if the node is not an inner node
+    pattern: scipy.sparse.csr_array  # positions of the entries of C
+    places: np.ndarray  # positions in pattern.data of the element entries that are in a row of C
+    entries: np.ndarray  # indices of these entries among all element entries
+    pressure: np.ndarray  # lower triangle of g B B^H, stored by diagonals (bandwidth + 1, I)
+    balances: int  # number of real equations in chi^2
     parts: tuple[slice, ...]  # rows of C of each part of the body: rows of different parts have no common unknowns
 
 
-#: FREE: ratio of two parts of S, the part of the pressures to the part of the shear stress at the modulus `TYPICAL`
-#: [Pa]. The error that a finite ratio causes is about its inverse. The part of the pressures is the same for every
-#: modulus, so that chi^2 of two moduli can be compared.
+#: FREE: ratio of the two terms of S: the term of the pressures divided by the term of the shear stress at the modulus
+#: `TYPICAL` [Pa]. A finite ratio causes a relative error of about 1 / FREE. The term of the pressures is the same for
+#: every modulus, so the values of chi^2 for two moduli can be compared.
 FREE, TYPICAL = 1e4, 3000.0
 
 
 def _columns_of(band: np.ndarray, a: int, b: int) -> np.ndarray:
-    """Columns a to b of a banded lower triangle, from row a to the last row that is not zero."""
+    """Return columns a to b of a lower triangle stored by diagonals, from row a to the last nonzero row."""
     bands, size = len(band), b - a
     out = np.zeros((size, size + bands - 1), band.dtype)  # transposed
     diagonals = np.lib.stride_tricks.as_strided(
@@ -64,7 +70,7 @@ def _columns_of(band: np.ndarray, a: int, b: int) -> np.ndarray:
 
 
 class Balanced(NamedTuple):
-    """The likeliest motion at a modulus."""
+    """The most probable motion for given moduli, and the quantities of its computation (see the module docstring)."""
 
     chi2: float
     motion: np.ndarray  # u (3 V,) complex [m]
@@ -72,11 +78,12 @@ class Balanced(NamedTuple):
     factor: np.ndarray  # (bandwidth + 1, I): L of S = L L^H, by diagonals
 
     def of(self, rows: slice) -> "Balanced":
-        """The result for some rows that have no common unknowns with the others. The motion stays that of all."""
+        """Return the result for some rows of C that have no common unknowns with the other rows. The motion is not
+        changed."""
         return self._replace(multipliers=self.multipliers[rows], factor=self.factor[:, rows])
 
     def whitened(self, columns: scipy.sparse.csc_array, kind: type = np.complex128) -> np.ndarray:
-        """L^-1 times columns (I, k). The scalar product of two such results is a product of the columns with S^-1."""
+        """Return L^-1 times columns (I, k). For columns a and b, the scalar product of the results is a^H S^-1 b."""
         left, (bands, n) = columns.astype(kind).toarray(), self.factor.shape
         for a in range(0, n, bands):
             b = min(a + bands, n)
@@ -88,7 +95,7 @@ class Balanced(NamedTuple):
 
 
 def matrices(body: VoxelBody, density: float) -> Matrices:
-    """The matrices of a body with this density [kg/m^3]."""
+    """Return the matrices of a body with this density [kg/m^3]."""
     scene = lj.Scene(
         mesh=body.mesh,
         law=lj.laws.NeoHookean(mu=1.0, bulk=1.0),
@@ -120,22 +127,26 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
 
 
 def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_array:
-    """Forces of pressures, scaled to the prior variance that `FREE` sets. B: forces of pressures of 1 Pa; `shear`:
-    entries of C at the modulus `TYPICAL`."""
+    """Return the forces of the pressures, scaled to the prior variance that `FREE` determines.
+
+    Args:
+        B: forces of pressures of 1 Pa.
+        shear: entries of C at the modulus `TYPICAL`.
+    """
     part = np.sum(shear**2) / B.shape[0]  # mean of the diagonal of C C^H
     return np.sqrt(FREE * part / B.power(2).sum(axis=1).mean()) * B
 
 
 def _in_order(body: VoxelBody) -> np.ndarray:
-    """Unknowns of the inner nodes in the order of `by_part_and_slice`."""
+    """Return the indices of the unknowns of the inner nodes, in the order of `by_part_and_slice`."""
     nodes = np.flatnonzero(body.inner)
     order = by_part_and_slice(body.voxel[nodes], body.part[nodes])
     return (3 * nodes[order][:, None] + np.arange(3)).ravel()
 
 
 def by_part_and_slice(voxel: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Order (n,) of nodes on voxels (n, 3), part by part, and slice by slice along the longest side of each part. So
-    coupled nodes have close indices."""
+    """Return the order (n,) of nodes with voxel indices (n, 3): part by part, and slice by slice along the longest side
+    of each part. In this order, coupled nodes have close indices."""
     longest_last = voxel.copy()
     for k in np.unique(part):
         own = voxel[part == k]
@@ -144,11 +155,11 @@ def by_part_and_slice(voxel: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 
 def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy.sparse.csr_array:
-    """B (I, P): integrals of the linear function of each corner times the divergence of the function of each inner
-    node."""
+    """Return B (I, P): integrals of the linear shape function of each corner times the divergence of the quadratic
+    shape function of each inner node."""
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
     gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3) of the linear functions
-    second = (1 + np.eye(4)) / 20  # integrals of their products, over the volume
+    second = (1 + np.eye(4)) / 20  # integrals of the products of two linear functions, divided by the volume
     parts = [np.einsum("v,ec->vce", 4 * second[i] - 0.25, gradients[:, i]) for i in range(4)]
     for i, j in PAIRS:
         both = np.einsum("v,ec->vce", second[i], gradients[:, j]) + np.einsum("v,ec->vce", second[j], gradients[:, i])
@@ -163,7 +174,7 @@ def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy
 
 
 def rows_of_balance(m: Matrices, G: np.ndarray, omega: float) -> scipy.sparse.csr_array:
-    """C (I, 3 V) for complex moduli G of the elements (E,) [Pa] at an angular frequency [rad/s]."""
+    """Return C (I, 3 V) for complex moduli G of the elements (E,) [Pa] at an angular frequency [rad/s]."""
     mass = m.mass[:, None, :, None] * np.eye(3)[None, :, None, :, None]
     real = G.real * m.shear - omega**2 * mass
     C = m.pattern.copy()
@@ -173,10 +184,10 @@ def rows_of_balance(m: Matrices, G: np.ndarray, omega: float) -> scipy.sparse.cs
 
 
 def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float) -> Balanced:
-    """The likeliest motion.
+    """Return the most probable motion for given moduli.
 
     Args:
-        m: from `matrices`.
+        m: result of `matrices`.
         G: complex moduli of the elements (E,) [Pa].
         omega: angular frequency [rad/s].
         d: measured motion (3 V,) complex [m], x, y, z of a node together.
@@ -188,24 +199,24 @@ def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float)
 def likeliest(
     C: scipy.sparse.csr_array, B: np.ndarray, d: np.ndarray, sd: float, spread: np.ndarray | None = None
 ) -> Balanced:
-    """The likeliest motion (U,) that C (I, U) balances.
+    """Return the most probable motion (U,) for which the equations with the matrix C (I, U) are in balance.
 
     Args:
-        C: rows of balance.
-        B: covariance of the forces of pressures, by diagonals.
+        C: matrix of the equations of balance.
+        B: covariance of the forces of the pressures, stored by diagonals.
         d: measured motion (U,) [m]; 0 where it was not measured.
         sd: standard deviation of real and imaginary part of one component [m].
-        spread: variance (U,) of the difference between each unknown and d, divided by sd^2; None: 1.
+        spread: variance (U,) of the difference between each unknown and d, divided by sd^2. None means 1.
     """
     CH = C.conj().T.tocsr()
     WCH = CH if spread is None else scipy.sparse.diags_array(spread) @ CH
-    # S is Hermitian and positive definite: no pivots are needed, and an order for symmetric matrices keeps the factor
-    # small.
+    # S is Hermitian and positive definite. So no pivots are needed, and an order for symmetric matrices keeps the
+    # factor small.
     S = by_diagonals((C @ WCH).tocsr())
     if len(S) < len(B):
         S = np.pad(S, ((0, len(B) - len(S)), (0, 0)))
     S[: len(B)] += B
-    # A banded factor is faster here than a sparse one, which would fill the band too.
+    # A banded factorisation is faster here than a sparse one, whose factor would also fill the band.
     factor = _factor_of_blocks(S)
     r = C @ d
     q = scipy.linalg.cho_solve_banded((factor, True), r, check_finite=False)
@@ -213,8 +224,8 @@ def likeliest(
 
 
 def _factor_of_blocks(S: np.ndarray) -> np.ndarray:
-    """L of S = L L^H, by diagonals. Blocks that are not coupled, as of the parts of a body, are factorised in
-    parallel."""
+    """Return L of S = L L^H, stored by diagonals. Uncoupled blocks, for example those of the parts of a body, are
+    factorised in parallel."""
     gaps = np.flatnonzero(~S[1:2, :-1].any(axis=0))  # rows that are not coupled with the next one
     ends = [k + 1 for k in gaps.tolist() if not _coupled_across(S, k)]
     blocks = [slice(a, b) for a, b in itertools.pairwise([0, *ends, S.shape[1]])]
@@ -232,12 +243,15 @@ def _factor_of_blocks(S: np.ndarray) -> np.ndarray:
 
 
 def _coupled_across(S: np.ndarray, k: int) -> bool:
-    """Whether a row up to k is coupled with a later one, by the diagonals S. In one part, the first column tells."""
+    """Return whether a row up to k is coupled with a later row. S is stored by diagonals.
+
+    In a body of one part, the first tested column already shows a coupling, so the search ends at once.
+    """
     return any(S[k - j + 1 :, j].any() for j in range(k, max(-1, k - len(S)), -1))
 
 
 def by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:
-    """The lower triangle of a Hermitian matrix as LAPACK stores it, (bandwidth + 1, n)."""
+    """Return the lower triangle of a Hermitian matrix in the band storage of LAPACK, (bandwidth + 1, n)."""
     at = S.tocoo()
     below = at.row >= at.col
     row, column = at.row[below], at.col[below]
@@ -247,14 +261,14 @@ def by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:
 
 
 def gigabytes(body: VoxelBody) -> float:
-    """Memory [GB] of the factor of S for one frequency."""
+    """Return the memory [GB] of the factor of S for one frequency."""
     voxel, part = body.voxel[body.inner], body.part[body.inner]
     sides = [np.sort(np.ptp(voxel[part == k], axis=0) + 1) for k in np.unique(part)]
     return 16e-9 * 3 * len(voxel) * 3 * max(4 * a * b + 4 * a + 5 for a, b, _ in sides)
 
 
 def by_modulus(m: Matrices, u: np.ndarray) -> scipy.sparse.csc_array:
-    """C' u: derivatives (I, E) of C u by the modulus of every element."""
+    """Return C' u: the derivatives (I, E) of C u with respect to the modulus of every element."""
     forces = np.einsum("arbse,bse->are", m.shear, u[m.unknowns], optimize=True)
     inside = m.rows >= 0
     element = np.broadcast_to(np.arange(m.rows.shape[-1]), m.rows.shape)

@@ -1,14 +1,18 @@
-"""Noise that neighbouring voxels share: how much larger it makes the errors of moduli, compared with white noise.
+"""Noise that is correlated between neighbouring voxels: how much larger it makes the errors of moduli than white noise.
 
-Scanners and filters smooth the data, so neighbours share their noise. Then fewer independent values are measured, and
-the estimate from fourth differences contains only a part of the noise. The residual motion d - u shows both effects. It
-is a projection of the noise: even white noise leaves residuals with a small negative correlation between neighbours. So
-random white noise and smoothed noise are projected in the same way. This tells which width of a Gaussian filter gives
-the observed correlation along each axis, and which part of the noise is left in the residuals.
+Scanners and filters smooth the data, so the noise of neighbouring voxels is correlated. Then the data contain fewer
+independent values, and the noise estimate from fourth differences contains only a part of the noise. The residual
+motion d - u (measured minus fitted) shows both effects. The residual is a projection of the noise, so even white noise
+leaves residuals with a small negative correlation between neighbours. Therefore random white noise and smoothed noise
+are projected in the same way. The comparison determines which width of a Gaussian filter gives the observed correlation
+along each axis, and which part of the noise is left in the residuals.
 
-The error of a modulus is a sum over the voxels, v^H n / H, with the noise n and v = C^H S^-1 C' u
-(`fitting.waves.balance`). So the variance for white noise is multiplied by sum_l R(l) sum_x conj(v(x)) v(x + l) / sum_x
-|v(x)|^2, where R is the autocorrelation of the noise.
+The error of a modulus is a sum over the voxels, v^H n / H, with the noise n, v = C^H S^-1 C' u and H = (C' u)^H S^-1
+C' u (`fitting.waves.balance`). So the variance for white noise is multiplied by
+
+    sum_l R(l) sum_x conj(v(x)) v(x + l) / sum_x |v(x)|^2,
+
+where R(l) is the autocorrelation of the noise at the distance l, and x is a voxel.
 """
 
 from typing import NamedTuple
@@ -20,25 +24,25 @@ import scipy.sparse
 
 from fitting.waves.balance import Balanced
 
-#: Widths [voxels] of the filters that are tried; DRAWS: number of random draws for each width if the body has `SMALL`
-#: voxels; REACH: half length of a filter [voxels].
+#: WIDTHS: standard deviations [voxels] of the Gaussian filters that are tried. DRAWS: number of random draws for each
+#: width if the body has `SMALL` voxels. REACH: half length of a filter [voxels].
 WIDTHS = (0.0, 0.35, 0.45, 0.55, 0.65, 0.75, 0.9, 1.1, 1.4, 1.8)
 DRAWS, SMALL, REACH = 6, 1500, 6
-#: The noise counts as correlated if the correlation of neighbouring residuals exceeds the correlation for white noise
-#: by more than SEEN, and by more than BY_CHANCE standard deviations.
+#: The noise is regarded as correlated if the correlation of neighbouring residuals exceeds the correlation for white
+#: noise by more than SEEN, and by more than BY_CHANCE standard deviations.
 SEEN, BY_CHANCE = 0.04, 4.0
 
 
 class Correlation(NamedTuple):
-    """What the residuals of one frequency tell about the noise."""
+    """The correlation of the noise at one frequency, estimated from the residuals."""
 
-    beyond: float  # largest correlation of neighbours along an axis, minus that for white noise
-    seen: bool  # whether this is more than chance
-    enlarged: np.ndarray  # (R,) error of each modulus over its error for white noise with the given sd at each node
+    beyond: float  # largest correlation of neighbours along an axis, minus the correlation for white noise
+    seen: bool  # whether this difference is larger than a difference by chance
+    enlarged: np.ndarray  # (R,) error of each modulus, divided by its error for white noise with the given sd
 
 
 class _Projection(NamedTuple):
-    """The matrices of the likeliest motion, and the voxels of the measured unknowns."""
+    """The matrices of the most probable motion, and the voxels of the measured unknowns."""
 
     C: scipy.sparse.csr_array
     here: Balanced
@@ -49,13 +53,13 @@ class _Projection(NamedTuple):
         return 3 * len(self.voxel)
 
     def grid(self, values: np.ndarray) -> np.ndarray:
-        """Values (3 V,) of the nodes on the voxels, (nx, ny, nz, 3), 0 outside."""
+        """Return nodal values (3 V,) as an array over the voxels (nx, ny, nz, 3), with 0 outside of the body."""
         out = np.zeros((*(self.voxel.max(axis=0) + 1), 3), complex)
         out[tuple(self.voxel.T)] = values[: self.measured].reshape(-1, 3)
         return out
 
     def residual(self, noise: np.ndarray) -> np.ndarray:
-        """The residuals that noise (nx, ny, nz, 3) leaves if it is added to the likeliest motion."""
+        """Return the residuals (nx, ny, nz, 3) if noise (nx, ny, nz, 3) is added to the most probable motion."""
         n = np.zeros(self.C.shape[1], complex)
         n[: self.measured] = noise[tuple(self.voxel.T)].ravel()
         q = scipy.linalg.cho_solve_banded((self.here.factor, True), self.C @ n, check_finite=False)
@@ -65,12 +69,12 @@ class _Projection(NamedTuple):
 def correlation(
     C: scipy.sparse.csr_array, here: Balanced, columns: np.ndarray, d: np.ndarray, sd: float, voxel: np.ndarray
 ) -> Correlation:
-    """The correlation of the noise, estimated from the residuals at the fitted moduli.
+    """Estimate the correlation of the noise from the residuals at the fitted moduli.
 
     Args:
-        C: rows of balance (I, U) at these moduli.
-        here: the likeliest motion.
-        columns: derivatives of C u by the moduli (I, R).
+        C: matrix of the equations of balance (I, U) at these moduli.
+        here: the most probable motion.
+        columns: derivatives of C u with respect to the moduli (I, R).
         d: measured motion (3 V,) [m], x, y, z of a node together.
         sd: assumed standard deviation of real and imaginary part of one component [m].
         voxel: voxel index of each node (V, 3).
@@ -94,20 +98,20 @@ def correlation(
 
 
 def _mean_square(own: _Projection, values: np.ndarray) -> float:
-    """Mean square of real and imaginary part over the measured components."""
+    """Return the mean square of real and imaginary parts over the measured components."""
     return float(np.sum(np.abs(values) ** 2)) / (2 * own.measured)
 
 
 def _of_neighbours(values: np.ndarray) -> np.ndarray:
-    """Correlation (3,) of neighbours along the axes of values (nx, ny, nz, 3)."""
+    """Return the correlation (3,) between neighbours along each axis, for values (nx, ny, nz, 3)."""
     rows = [np.moveaxis(values, a, 0) for a in range(3)]
     whole = max(float(np.sum(np.abs(values) ** 2)), 1e-300)
     return np.array([np.sum(r[1:].conj() * r[:-1]).real / whole for r in rows])
 
 
 def _drawn(own: _Projection, width: float, draws: int) -> tuple[np.ndarray, float]:
-    """For random noise smoothed with this width: the correlation (3,) of neighbouring residuals, and the part of the
-    noise that is left in them."""
+    """Return the correlation (3,) of neighbouring residuals, and the part of the noise that is left in the residuals,
+    for random noise that is smoothed with this width."""
     rng, shape = np.random.default_rng(0), tuple(own.voxel.max(axis=0) + 1 + 2 * REACH)
     inside = (slice(REACH, -REACH),) * 3
     found, parts = [], []
@@ -125,14 +129,15 @@ def _drawn(own: _Projection, width: float, draws: int) -> tuple[np.ndarray, floa
 
 
 def _filter(width: float) -> np.ndarray:
-    """A Gaussian filter (2 `REACH` + 1,)."""
+    """Return the weights (2 `REACH` + 1,) of a Gaussian filter with this standard deviation [voxels]."""
     weights = np.exp(-0.5 * (np.arange(-REACH, REACH + 1) / width) ** 2)
     return weights / weights.sum()
 
 
 def _enlargement(own: _Projection, column: np.ndarray, widths: np.ndarray) -> float:
-    """Error of one modulus for noise smoothed with these widths (3,), divided by its error for white noise of the same
-    size at each node. Nodes on the same voxel, of different parts of the body, share its noise."""
+    """Return the error of one modulus for noise smoothed with these widths (3,), divided by the error for white noise
+    with the same standard deviation at each node. Nodes of different parts of the body on the same voxel have the same
+    noise."""
     q = scipy.linalg.cho_solve_banded((own.here.factor, True), column, check_finite=False)
     each = (own.C.conj().T @ q)[: own.measured]
     v = np.zeros((*(own.voxel.max(axis=0) + 1), 3), complex)

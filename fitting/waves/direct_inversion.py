@@ -1,13 +1,13 @@
-"""The usual direct inversion of waves (algebraic Helmholtz), as a baseline for the balance of forces.
+"""The usual direct inversion of waves (algebraic Helmholtz inversion), for comparison with the balance of forces.
 
-Where G is uniform, the curl q of the displacement fulfils G laplace(q) = - density omega^2 q, since the curl contains
-no pressure. Least squares over the three components and a window of voxels give
+Where the modulus G is uniform, the curl q of the displacement fulfils G laplace(q) = - density omega^2 q: taking the
+curl removes the pressure. Least squares over the three components and a window of voxels give
 
     G = - density omega^2 sum(conj(laplace q) q) / sum(|laplace q|^2)
 
 (Oliphant et al. 2001, Magn. Reson. Med. 45, 299; Papazoglou et al. 2008, Phys. Med. Biol. 53, 3147). The denominator
-contains the square of the noise of laplace(q), so noise makes the modulus too small. A window over an edge mixes both
-sides. Both are known faults of the method; they are not corrected here.
+contains the square of the noise of laplace(q), so noise makes the modulus too small. A window over an edge mixes the
+moduli of both sides. Both errors of the method are well known. They are not corrected here.
 """
 
 import math
@@ -25,20 +25,20 @@ WINDOW = 3
 
 
 def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, window: int = WINDOW) -> np.ndarray:
-    """Complex modulus (F, nx, ny, nz) [Pa]. It is NaN outside of the mask, and where derivatives or smoothing reach the
-    edge of the mask.
+    """Return the complex modulus (F, nx, ny, nz) [Pa]. The modulus is NaN outside of the mask, and near the edge of the
+    mask, where derivatives or smoothing need voxels outside.
 
     Args:
         field: measured waves. If not all three components are measured, the result is NaN everywhere.
         density: [kg/m^3].
-        smoothing: standard deviation of the Gaussian [voxels]. Along an axis that is too short for it, nothing is
+        smoothing: standard deviation of the Gaussian [voxels]. An axis that is too short for the Gaussian is not
             smoothed.
         window: side of the window [voxels], an odd number.
     """
     if not density > 0 or window < 1 or window % 2 == 0 or smoothing < 0:
         raise InputError(
-            f"density {density:g}, smoothing {smoothing:g}, window {window}: give a density above 0, a smoothing not "
-            "below 0 and an odd window"
+            f"density = {density:g}, smoothing = {smoothing:g}, window = {window}: density must be above 0, smoothing "
+            "must be 0 or more, and window must be odd"
         )
     omega = 2 * np.pi * field.frequencies
     ratios = [_one(field, U, smoothing, window) for U in field.displacement]
@@ -47,7 +47,7 @@ def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, windo
 
 def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.ndarray:
     inside = field.mask & np.all(np.isfinite(U), axis=-1)
-    # A derivative and a second difference reach one voxel each, the Gaussian three of its standard deviations.
+    # A derivative and a second difference reach one voxel each. The Gaussian reaches three standard deviations.
     reach = [2 + math.ceil(3 * smoothing)] * 3
     ends = [np.flatnonzero(inside.any(axis=tuple(b for b in range(3) if b != a))) for a in range(3)]
     widths = [0.0] * 3
@@ -73,7 +73,8 @@ def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.n
 
 
 def _smooth(u: np.ndarray, inside: np.ndarray, widths: list[float]) -> np.ndarray:
-    """Mean over the voxels inside, weighted by a Gaussian. `widths`: its standard deviation along each axis."""
+    """Return the mean over the voxels inside, weighted by a Gaussian. `widths`: standard deviation of the Gaussian
+    along each axis [voxels]."""
     known = np.where(inside, u, 0.0)
     if not any(widths):
         return known
@@ -83,7 +84,7 @@ def _smooth(u: np.ndarray, inside: np.ndarray, widths: list[float]) -> np.ndarra
 
 
 def _second(q: np.ndarray, axis: int, h: float) -> np.ndarray:
-    """Second difference along an axis, 0 at its ends."""
+    """Return the second difference along an axis divided by h^2; it is 0 at the ends of the axis."""
     out = np.zeros_like(q)
     rows, to = np.moveaxis(q, axis, 0), np.moveaxis(out, axis, 0)
     to[1:-1] = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / h**2

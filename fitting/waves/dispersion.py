@@ -1,5 +1,5 @@
-"""Phase velocities of shear waves over frequency, with or without attenuation, from files, for example from
-ultrasound."""
+"""Read phase velocities of shear waves at several frequencies from files, with or without attenuation. Such data come
+for example from ultrasound."""
 
 import os
 import re
@@ -14,7 +14,7 @@ from fitting.readers.units import WAVE_UNITS
 from fitting.waves.shear_waves import DENSITY
 from liverjax.core.errors import InputError
 
-#: First words of a heading, and its quantity.
+#: First words of a column heading, and the quantity of the column.
 WORDS = (
     ("angular frequency", "frequency"),
     ("frequency", "frequency"),
@@ -40,7 +40,7 @@ class Dispersion(NamedTuple):
 
     @property
     def resolved(self) -> tuple[float, float]:
-        """Shortest and longest relaxation time [s] that the frequencies resolve."""
+        """Shortest and longest relaxation time [s] that the data at these frequencies can determine."""
         return float(1 / self.angular_frequency[-1]), float(1 / self.angular_frequency[0])
 
     @property
@@ -50,13 +50,13 @@ class Dispersion(NamedTuple):
 
     @property
     def scales(self) -> np.ndarray:
-        """Smooth curves through the measured values: the divisors of relative errors."""
+        """Values of smooth curves through the measured values. Relative errors are errors divided by these values."""
         columns = [self.velocity] if self.attenuation is None else [self.velocity, self.attenuation]
         return np.concatenate([smooth_curve(self.angular_frequency, column) for column in columns])
 
 
 def names_velocities(path: str | os.PathLike) -> bool:
-    """Whether a line of the file names a frequency and a velocity."""
+    """Return whether a line of the file names a frequency and a velocity."""
     return _header(text_of(Path(path), "shear waves").splitlines()) is not None
 
 
@@ -65,26 +65,26 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
 
     Args:
         path: text file.
-        density: density of the material [kg/m^3]; None: `DENSITY` is used, with a note.
+        density: density of the material [kg/m^3]. If it is None, `DENSITY` is used, and a note is added.
 
     Raises:
-        InputError: one sentence with the file, the line or column, the value and the remedy.
+        InputError: the file cannot be used; the message names the file, the line or column, the value and the remedy.
     """
     lines = text_of(Path(path), "shear waves").splitlines()
     header = _header(lines)
     if header is None:
-        raise InputError(f"{path}: no header names frequency_Hz and phase_velocity_m/s; add that header")
-    notes = [] if density is not None else [f"a density of {DENSITY:g} kg/m^3 is assumed; --density gives another"]
+        raise InputError(f"{path}: no header names frequency_Hz and phase_velocity_m/s: add this header")
+    notes = [] if density is not None else [f"a density of {DENSITY:g} kg/m^3 is assumed: change it with --density"]
     columns = _columns(str(path), lines, header)
     order = np.argsort(columns["frequency"], kind="stable")
     columns = {q: v[order] for q, v in columns.items()}
     for quantity, values in columns.items():
         bad = np.flatnonzero(~(np.isfinite(values) & (values > 0)))
         if bad.size:
-            raise InputError(f"{path}: {quantity} {values[bad[0]]:g} must be above 0: correct or remove its row")
+            raise InputError(f"{path}: {quantity} {values[bad[0]]:g} must be above 0: correct or remove this row")
     if len(np.unique(columns["frequency"])) < FEWEST:
         raise InputError(
-            f"{path}: {len(order)} rows of numbers are below the header; give {FEWEST} frequencies or more"
+            f"{path}: {len(order)} rows of numbers are below the header: give at least {FEWEST} different frequencies"
         )
     return Dispersion(
         columns["frequency"],
@@ -97,7 +97,7 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
 
 
 def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispersion:
-    """The waves at frequencies from `low` to `high` [Hz]. A note tells how many are left out.
+    """Return the waves at frequencies from `low` to `high` [Hz]. A note states how many waves are left out.
 
     Raises:
         InputError: fewer than `FEWEST` frequencies are left.
@@ -111,11 +111,11 @@ def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispers
     if len(np.unique(hertz[kept])) < FEWEST:
         left = len(np.unique(hertz[kept]))
         raise InputError(
-            f"{waves.source}: only {left} frequencies are left by --min-frequency and --max-frequency, but {FEWEST} "
+            f"{waves.source}: only {left} frequencies are between --min-frequency and --max-frequency, but {FEWEST} "
             "are needed: widen the band"
         )
     attenuation = None if waves.attenuation is None else waves.attenuation[kept]
-    note = f"{np.sum(~kept)} waves outside of the band asked for are left out"
+    note = f"{np.sum(~kept)} waves outside of the given frequency band are left out"
     return waves._replace(
         angular_frequency=waves.angular_frequency[kept],
         velocity=waves.velocity[kept],
@@ -125,8 +125,8 @@ def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispers
 
 
 def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | None:
-    """Index and delimiter of the first line that names frequency and velocity, and the column and unit of each quantity
-    in it."""
+    """Return the index and the delimiter of the first line that names frequency and velocity, and the column and unit
+    of each quantity in this line. Return None if no line names both."""
     for k, line in enumerate(lines):
         delimiter, cells = split_line(line.lstrip("# "))
         found: dict[str, tuple[int, str]] = {}
@@ -140,7 +140,8 @@ def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | N
 
 
 def _quantity_named(cell: str) -> tuple[str, str] | None:
-    """Quantity and unit of a heading, for example "Phase velocity (m/s)" or "attenuation_Np/m"."""
+    """Return quantity and unit of a heading, for example "Phase velocity (m/s)" or "attenuation_Np/m"; None if the
+    heading is not known."""
     parts = re.match(r'^"?([^\[(]*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?"?$', cell.strip())
     if parts is None:
         return None

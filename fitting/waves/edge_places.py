@@ -1,10 +1,10 @@
 """Positions of the edges of labels between the voxels, and the uncertainty of these positions.
 
-Labels change in steps of a voxel. Smoothed labels give the volume of a region, but the shape of its edge is known only
-to a part of a voxel. For circles of 2.5 to 8 voxels, the mean radius is wrong by 0.05 to 0.1 voxels. The local position
-of the edge is wrong by another 0.13 voxels, with a correlation length of 1.6 voxels. This changes the modulus of a
-stiff cylinder of 5 voxels by 3 to 4 % (`tests/test_wave_edges.py`). So the edges are cut into patches, and the outward
-shift of each patch is an unknown of the fit.
+The labels give one region for each whole voxel. From smoothed labels the volume of a region is known, but
+the position of its edge has an error of a fraction of a voxel. For circles of 2.5 to 8 voxels, the mean radius is wrong
+by 0.05 to 0.1 voxels. The local position of the edge is wrong by another 0.13 voxels, with a correlation length of 1.6
+voxels. This changes the modulus of a stiff cylinder of 5 voxels by 3 to 4 % (`tests/test_wave_edges.py`). So the edges
+are divided into patches, and the outward shift of each patch is an unknown of the fit.
 """
 
 from typing import NamedTuple
@@ -16,14 +16,14 @@ from fitting.waves.voxels import VoxelBody
 
 #: Standard deviation of the Gaussian that smooths the steps of labels [voxels].
 SMOOTHING = 1.4
-#: Number of parts into which the side of a voxel is divided to count volumes.
+#: Number of parts into which each side of a voxel is divided when volumes are computed.
 FINE = 4
-#: Shift of the edges [voxels] with which the effect of their position is computed.
+#: Shift of the edges [voxels] in the finite difference that gives the derivative with respect to their position.
 FARTHER = 0.1
 #: Side of a patch, and maximum distance between an edge and a node of a cut element [voxels].
 SIDE, REACH = 2.0, 2.0
-#: Standard deviations of the position of a whole edge (rounding to a voxel) and of its patches; correlation length of
-#: the patches. All in voxels.
+#: Standard deviation of the position of a whole edge (rounding to a voxel), standard deviation of its patches, and
+#: correlation length of the patches [voxels].
 WHOLE, PATCH, ALIKE = 1 / np.sqrt(12), 0.13, 1.6
 
 
@@ -41,7 +41,7 @@ class Patches(NamedTuple):
         return np.asarray(same * (WHOLE**2 + PATCH**2 * np.exp(-0.5 * apart / ALIKE**2)))
 
     def means(self, values: np.ndarray, regions: int) -> np.ndarray:
-        """Means (regions,) of values (P,) over the patches of each region; 0 if a region has no patch."""
+        """Return the means (regions,) of values (P,) over the patches of each region; 0 if a region has no patch."""
         count = np.bincount(self.region, minlength=regions)
         return np.asarray(np.bincount(self.region, values, regions) / np.maximum(count, 1))
 
@@ -50,15 +50,15 @@ NO_PATCHES = Patches(np.zeros(0, int), np.zeros((0, 3)))
 
 
 def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: float = 0.0) -> np.ndarray:
-    """Smoothed indicator functions s_k (R, V) of the labels `known` (R,) at the nodes.
+    """Return the smoothed indicator functions s_k (R, V) of the labels `known` (R,) at the nodes.
 
-    They are smoothed twice, so that curved edges hardly move. A constant is added, so that each region keeps the volume
-    of its label.
+    With a Gaussian filter g, the smoothed function is 2 g - g g, which hardly moves curved edges. A constant is added,
+    so that each region keeps the volume of its label.
 
     Args:
-        labels: (nx, ny, nz).
-        body: the labels at its voxels are used. Every other voxel gets the nearest label.
-        known: (R,).
+        labels: label of each voxel (nx, ny, nz).
+        body: labels are used only at the voxels of this body. Every other voxel gets the nearest of these labels.
+        known: the R labels that occur in the body.
         farther: distance [voxels] by which the edges of all regions except the largest are moved outwards.
     """
     measured = np.zeros(labels.shape, bool)
@@ -71,8 +71,8 @@ def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: floa
     for k in range(len(known)):
         if k != largest:
             others = np.delete(s, k, axis=0).max(axis=0)
-            # The constant is added only near the label. A small label needs a large constant, which would move the
-            # edges of the other labels.
+            # The constant is added only near this region. A small region needs a large constant, and elsewhere this
+            # constant would move the edges of other regions.
             apart = ndimage.distance_transform_edt(whole != known[k])
             out[k] += _level(s[k] - others, whole == known[k], counts[k]) * np.clip(2 - 0.5 * apart, 0, 1)
             if farther:
@@ -87,23 +87,25 @@ def _smoothed(place: np.ndarray) -> np.ndarray:
 
 
 def _level(above: np.ndarray, place: np.ndarray, count: int) -> float:
-    """The constant to add to a field near a label, so that the field is positive in the same volume as the label."""
+    """Return the constant to add to a field near a label, so that the volume with a positive field is the volume of
+    the label."""
     reach = ndimage.find_objects(place.astype(int))[0]
     box = tuple(slice(max(0, r.start - 2), r.stop + 2) for r in reach)
-    # Values inside the voxels, by linear interpolation between the centres.
+    # Values at several points within each voxel, by linear interpolation between the centres of the voxels.
     inside = [np.clip(np.arange(n * FINE) / FINE + (0.5 / FINE - 0.5), 0, n - 1) for n in above[box].shape]
     fine = ndimage.map_coordinates(above[box], np.meshgrid(*inside, indexing="ij"), order=1)
     return -float(np.partition(fine.ravel(), -count * FINE**3)[-count * FINE**3])
 
 
 def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patches, np.ndarray]:
-    """Patches of the edges near given nodes; and for each node (V,) the nearest patch, -1 for all other nodes.
+    """Return the patches of the edges near given nodes, and the index of the nearest patch for each node (V,). The
+    index is -1 for nodes that are not given.
 
-    The largest region has no patches: its edges are the edges of the other regions.
+    The largest region has no patches, because its edges are already the edges of the other regions.
 
     Args:
-        s: `places` (R, V).
-        body: its voxels.
+        s: result of `places` (R, V).
+        body: the body of the nodes.
         nodes: indices of the nodes of cut elements.
     """
     of_node = np.full(body.mesh.number_of_nodes, -1)
@@ -125,8 +127,8 @@ def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patch
 
 
 def _feet(above: np.ndarray, body: VoxelBody) -> np.ndarray:
-    """For each node, the nearest point (V, 3) [voxels] at which a field (V,) is zero, estimated from the gradient of
-    the field. It is at most `REACH` away."""
+    """Return for each node the nearest point (V, 3) [voxels] with a field value of zero. The point is estimated from
+    the nodal values (V,) and the gradient of the field, and is at most `REACH` away from the node."""
     first = body.voxel.min(axis=0)
     at = tuple((body.voxel - first).T)
     grid, known = np.zeros(np.ptp(body.voxel, axis=0) + 1), np.zeros(np.ptp(body.voxel, axis=0) + 1, bool)

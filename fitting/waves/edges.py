@@ -1,16 +1,17 @@
-"""Regions with edges inside the elements: at an edge the motion has a kink and the pressure a jump.
+"""Regions with edges inside the elements. At an edge the displacement has a kink and the pressure has a jump.
 
-Across an edge between two materials, displacement and traction are continuous, but strain and pressure are not. A
-quadratic element cannot have a kink inside. So it is too stiff, and the fitted modulus of a region of few voxels is too
-low. Elements that an edge cuts have one more function L_i psi for each of their corners i, where L_i is the linear
-function of the corner and
+At an edge between two materials, displacement and traction are continuous, but strain and pressure are not. The
+displacement within a quadratic element cannot have a kink. So a standard element at an edge is too stiff, and the
+fitted modulus of a region of few voxels is too low. Therefore an element that is cut by an edge has one additional
+shape function L_i psi for each of its corners i. L_i is the linear shape function of the corner, and
 
     psi = sum_a N_a max_k s_k(x_a) - max_k sum_a N_a s_k(x_a).
 
-s_k is the smoothed indicator function of region k. Psi is continuous, has a kink at the edges and is zero at all nodes
-(extended finite elements: Moes et al. 2003, Comput. Methods Appl. Mech. Eng. 192, 3163). Nodes keep the motion of their
-voxels. The amplitudes of the kinks are not measured. Every point has the modulus and the pressure of its side of the
-edge.
+N_a is the quadratic shape function of node a, x_a is the position of this node, and s_k is the smoothed indicator
+function of region k. Psi is continuous, has a kink at the edges and is zero at all nodes (extended finite elements:
+Moes et al. 2003, Comput. Methods Appl. Mech. Eng. 192, 3163). So the displacements of the nodes are still the
+displacements of their voxels. The amplitudes of the kinks are unknowns without a measured value. Every point has the
+modulus and the pressure of its side of the edge.
 """
 
 from typing import NamedTuple
@@ -24,39 +25,44 @@ from fitting.waves.edge_places import NO_PATCHES, Patches, patches_of
 from fitting.waves.voxels import VoxelBody
 from liverjax.mesh.adjacency import PAIRS
 
-#: Number of times that cut elements are halved; in the resulting parts, edges are planes. Then the number of elements
-#: that are computed at once.
+#: HALVINGS: number of times that the sides of cut elements are halved; in each resulting part, edges are planes.
+#: CHUNK: number of elements that are computed at once.
 HALVINGS, CHUNK = 3, 60
 
 
 class RegionMatrices(NamedTuple):
-    """Parts of the balance of R regions, with U unknowns: 3 V unknowns of the nodes, then the unknowns of the kinks."""
+    """Matrices for the balance of forces with R regions.
+
+    There are U unknowns: the 3 V displacements of the nodes, then the amplitudes of the kinks. C (I, U) is the matrix
+    of the balance, as in `fitting.waves.balance`.
+    """
 
     stiffness: np.ndarray  # (R, N) entries of C for a shear modulus of 1 Pa in each region
     mass: np.ndarray  # (N,) entries of C that are multiplied by -omega^2
     pattern: scipy.sparse.csr_array  # (I, U): positions of these entries
-    forces: scipy.sparse.csr_array  # (I, P) of pressures, each with the same large variance
-    pressure: np.ndarray  # their covariance, as in `Matrices`
-    kinks: int  # number of unknowns that are not measured
+    forces: scipy.sparse.csr_array  # (I, P) nodal forces of the pressures, which have the same large variance
+    pressure: np.ndarray  # covariance of these forces, stored as in `Matrices`
+    kinks: int  # number of unknowns of the kinks, which are not measured
     patches: Patches
-    patch: np.ndarray  # (I,) the patch of the edges nearest to each row, -1: none
-    farther: "RegionMatrices | None" = None  # the same, with edges moved out by `edge_places.FARTHER`
+    patch: np.ndarray  # (I,) index of the nearest patch for each row of C, -1 for rows away from cut elements
+    farther: "RegionMatrices | None" = None  # the same matrices, with edges moved outwards by `edge_places.FARTHER`
 
     @property
     def balances(self) -> int:
-        """Real equations that chi^2 sums over."""
+        """Number of real equations in chi^2."""
         return 2 * (self.forces.shape[0] - int(np.sum(np.diff(self.forces.tocsc().indptr) > 0)) - self.kinks)
 
     def rows(self, G: np.ndarray, omega: float) -> scipy.sparse.csr_array:
-        """C (I, U) for moduli G (R,) [Pa] at an angular frequency [rad/s]."""
+        """Return C (I, U) for moduli G (R,) [Pa] at an angular frequency [rad/s]."""
         return self._filled(G @ self.stiffness - omega**2 * self.mass)
 
     def by_moduli(self, u: np.ndarray) -> np.ndarray:
-        """Derivatives (I, R) of C u by the moduli."""
+        """Return the derivatives (I, R) of C u with respect to the moduli."""
         return np.stack([self._filled(own) @ u for own in self.stiffness], axis=1)
 
     def by_edges(self, here: balance.Balanced, G: np.ndarray, omega: float) -> np.ndarray:
-        """Derivatives (I, P) of C u - B p by the outward shift [voxels] of each patch of the edges."""
+        """Return the derivatives (I, P) of C u - B p with respect to the outward shift [voxels] of each of the P
+        patches of the edges."""
         out = np.zeros((len(self.patch), len(self.patches.region)), complex)
         if self.farther is not None:
             p = self.forces.T @ here.multipliers
@@ -71,26 +77,26 @@ class RegionMatrices(NamedTuple):
 
 
 class _CutElements(NamedTuple):
-    """Some elements with n functions, or the parts of them that lie in one region."""
+    """K elements with n shape functions each, or the parts of these elements that lie in one region."""
 
     region: np.ndarray  # (K,)
-    functions: np.ndarray  # (K, n) indices of the functions
+    functions: np.ndarray  # (K, n) indices of the shape functions
     shear: np.ndarray  # (K, n, 3, n, 3) for a shear modulus of 1 Pa
     mass: np.ndarray  # (K, n, n) for a density of 1
-    corners: np.ndarray  # (K, 4)
-    divergence: np.ndarray  # (K, n, 3, 4): integrals of the divergence times the linear functions of the corners
+    corners: np.ndarray  # (K, 4) node numbers of the corners
+    divergence: np.ndarray  # (K, n, 3, 4): integrals of the divergence times the linear shape functions of the corners
 
 
 def region_matrices(
     m: Matrices, body: VoxelBody, density: float, s: np.ndarray, farther: np.ndarray | None = None
 ) -> RegionMatrices:
-    """The parts of the balance of regions.
+    """Return the matrices for the balance of forces with R regions.
 
     Args:
         m, body: the result of `balance.matrices`, and the body for which it was computed.
         density: [kg/m^3].
-        s: `places` (R, V).
-        farther: `places` with edges moved outwards by `edge_places.FARTHER`.
+        s: result of `edge_places.places` (R, V).
+        farther: result of `edge_places.places` with edges moved outwards by `edge_places.FARTHER`.
     """
     nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
     both = [s] if farther is None else [s, farther]
@@ -115,12 +121,12 @@ def region_matrices(
 
 
 def _nodes_of_elements(body: VoxelBody) -> np.ndarray:
-    """Indices (10, E) of the nodes of the elements."""
+    """Return the indices (10, E) of the nodes of the elements."""
     return body.mesh.element_nodes_on_host
 
 
 def _numbers_of_rows(body: VoxelBody, kinked: np.ndarray) -> np.ndarray:
-    """Index of the row of each unknown, -1 if it has no row. The rows have the order of
+    """Return the row of C for each unknown, -1 for unknowns without a row. The rows have the order of
     `balance.by_part_and_slice`."""
     inner, hidden = np.flatnonzero(body.inner), np.flatnonzero(body.inner[kinked])
     at = np.concatenate([inner, kinked[hidden]])
@@ -147,7 +153,7 @@ def _whole_parts(m: Matrices, body: VoxelBody, region: np.ndarray, chosen: np.nd
 
 
 def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarray) -> list[_CutElements]:
-    """For each region, the parts of the cut elements that lie in it."""
+    """Return the parts of the cut elements in each region, one entry for each region and chunk of elements."""
     corners = _equal_parts(HALVINGS)  # (Q, 4, 4)
     lam = corners.mean(axis=1)
     N, dN = _quadratic_functions(lam)
@@ -165,7 +171,7 @@ def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarr
         functions = np.concatenate([nodes[:, chunk].T, hidden[tets[chunk]]], axis=1)
         weights = _parts_by_region(at) * np.asarray(body.linear.volumes)[chunk, None] / len(lam)
         for region, weight in zip(there, weights, strict=True):
-            # In this region, psi is the interpolated maximum minus the function of this region.
+            # In this region, psi is the interpolated maximum minus the indicator function of this region.
             above = highest - own[region]  # (10, K)
             psi = np.einsum("ak,qa->kq", above, N)
             slope = np.einsum("ak,kqaj->kqj", above, plain)
@@ -177,14 +183,14 @@ def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarr
 
 
 def _parts_by_region(at: np.ndarray) -> np.ndarray:
-    """For each of R linear functions, the part (R, ...) of each tetrahedron in which it is the largest; from the values
-    at the corners (R, ..., 4)."""
+    """Return for each of R linear functions the volume fraction (R, ...) of each tetrahedron in which this function is
+    the largest. `at` (R, ..., 4): values of the functions at the corners."""
     if len(at) == 1:
         return np.ones(at.shape[:-1])
     out = []
     for k in range(len(at)):
         g = at[k] - np.delete(at, k, axis=0).max(axis=0)
-        # The formula fails if two corners have equal values. This line moves the values apart, by about 1e-3.
+        # The formula fails if two corners have equal values. So the values are changed slightly, by about 1e-3.
         g = g + 1e-3 * np.abs(g).max(axis=-1, keepdims=True) * np.array([0.0, 1.0, -1.5, 2.5]) + 1e-30
         apart = g[..., :, None] - g[..., None, :] + np.where(np.eye(4, dtype=bool), 1.0, 0.0)
         out.append(np.sum(np.maximum(g, 0) ** 3 / np.prod(apart, axis=-1), axis=-1))
@@ -195,19 +201,26 @@ def _parts_by_region(at: np.ndarray) -> np.ndarray:
 def _integrals(
     values: np.ndarray, gradients: np.ndarray, lam: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shear stiffness, mass and divergence of functions, from their values (K, Q, n) and gradients (K, Q, n, 3)."""
+    """Return shear stiffness, mass and divergence of shape functions, as in `_CutElements`.
+
+    Args:
+        values: values (K, Q, n) of the shape functions at Q points.
+        gradients: gradients (K, Q, n, 3) of the shape functions.
+        lam: linear shape functions of the corners (Q, 4).
+        weights: integration weights (K, Q).
+    """
     K, Q, n = values.shape
     flat = gradients.reshape(K, Q, 3 * n)
     D = np.matmul(np.swapaxes(flat * weights[..., None], 1, 2), flat).reshape(K, n, 3, n, 3)
-    # The double contraction of twice the strain deviator with the strain.
+    # Double contraction of twice the deviatoric strain with the strain.
     shear = np.einsum("ik,eajbj->eaibk", np.eye(3), D) + np.einsum("eakbi->eaibk", D) - 2 / 3 * D
     mass = np.matmul(np.swapaxes(values * weights[..., None], 1, 2), values)
     return shear, mass, np.einsum("kq,qv,kqaj->kajv", weights, lam, gradients, optimize=True)
 
 
 def _with_forces(parts: list[_CutElements], kinks: int, nodes: int) -> np.ndarray:
-    """For each kink function (kinks,): whether it is not zero. If an edge meets an element only at a node, the kink
-    function is zero."""
+    """Return for each kink function (kinks,) whether it differs from zero. If an edge meets an element only at a node,
+    the kink function is zero."""
     size = np.zeros(kinks)
     for p in parts:
         np.add.at(size, p.functions[:, 10:] - nodes, np.einsum("eaibi->eab", p.shear)[:, range(10, 14), range(10, 14)])
@@ -222,7 +235,7 @@ def _renumbered(p: _CutElements, alive: np.ndarray, nodes: int) -> _CutElements:
 
 
 def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: float) -> RegionMatrices:
-    """The matrices of all parts together. `rows` (U,): the row of each unknown."""
+    """Return the sum of the matrices of all parts. `rows` (U,): row of C for each unknown."""
     I, U = int(rows.max()) + 1, len(rows)
     known, ends, at = _pattern(parts, rows)
     stiffness, mass = np.zeros((R, len(known))), np.zeros(len(known))
@@ -245,7 +258,8 @@ def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: 
 def _pattern(
     parts: list[_CutElements], rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-    """Sorted keys of the entries, ends of the rows, and for each part the entries that exist, with their positions."""
+    """Return the sparsity pattern: sorted keys of the entries, ends of the rows, and for each part which of its entries
+    exist and the positions of these entries."""
     keys, insides, U = [], [], len(rows)
     for p in parts:
         unknowns, lines = _unknowns_and_rows(p, rows)
@@ -259,7 +273,8 @@ def _pattern(
 
 
 def _unknowns_and_rows(p: _CutElements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (K, n, 3) of the unknowns of the functions, and of the rows of these unknowns; -1 if there is none."""
+    """Return the indices (K, n, 3) of the unknowns of the shape functions, and the rows of these unknowns. An index is
+    -1 if there is no such unknown or row."""
     unknowns = np.where(p.functions[..., None] < 0, -1, 3 * p.functions[..., None] + np.arange(3))
     return unknowns, np.where(unknowns < 0, -1, rows[unknowns])
 
@@ -267,7 +282,7 @@ def _unknowns_and_rows(p: _CutElements, rows: np.ndarray) -> tuple[np.ndarray, n
 def _pressure_columns(
     parts: list[_CutElements], rows: np.ndarray, shape: tuple[int, int], corners: int
 ) -> scipy.sparse.csr_array:
-    """Forces (I, P R) of the pressures at corners, separately for each region."""
+    """Return the nodal forces (I, P R) of the pressures at the corners. Each region has separate pressures."""
     lines, columns, values = [], [], []
     for p in parts:
         own = p.corners + corners * p.region[:, None]
@@ -280,13 +295,14 @@ def _pressure_columns(
 
 
 def _corner_gradients(body: VoxelBody) -> np.ndarray:
-    """Gradients (E, 4, 3) of the linear functions of the corners."""
+    """Return the gradients (E, 4, 3) of the linear shape functions of the corners."""
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
     return np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
 
 
 def _quadratic_functions(lam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (Q, 10) of the quadratic functions, and derivatives (Q, 10, 4) by the barycentric coordinates (Q, 4)."""
+    """Return values (Q, 10) of the quadratic shape functions, and their derivatives (Q, 10, 4) with respect to the
+    barycentric coordinates (Q, 4)."""
     values, slopes = [lam[:, i] * (2 * lam[:, i] - 1) for i in range(4)], np.zeros((len(lam), 10, 4))
     slopes[:, range(4), range(4)] = 4 * lam - 1
     for k, (i, j) in enumerate(PAIRS):
@@ -296,13 +312,14 @@ def _quadratic_functions(lam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rule_of_four() -> np.ndarray:
-    """Barycentric coordinates of the points of an integration rule that is exact for quadratic functions."""
+    """Return the barycentric coordinates (4, 4) of the points of an integration rule that is exact for quadratic
+    functions."""
     low = (5 - np.sqrt(5)) / 20
     return low + (1 - 4 * low) * np.eye(4)
 
 
 def _equal_parts(halvings: int) -> np.ndarray:
-    """Barycentric corners (8^halvings, 4, 4) of equal parts of a tetrahedron."""
+    """Return the barycentric coordinates (8^halvings, 4, 4) of the corners of equal parts of a tetrahedron."""
     parts = [np.eye(4)]
     for _ in range(halvings):
         parts = [part for t in parts for part in _split_in_eight(t)]
@@ -310,7 +327,7 @@ def _equal_parts(halvings: int) -> np.ndarray:
 
 
 def _split_in_eight(t: np.ndarray) -> list[np.ndarray]:
-    """The eight parts (4, 4) of a tetrahedron with corners (4, 4)."""
+    """Return the corners (4, 4) of the eight parts of a tetrahedron with corners (4, 4)."""
     middle = {pair: 0.5 * (t[pair[0]] + t[pair[1]]) for pair in PAIRS}
     ab, ac, ad, bc, bd, cd = (middle[pair] for pair in PAIRS)
     a, b, c, d = t

@@ -1,4 +1,4 @@
-"""An organ and its waves: moduli of the whole organ and of its regions, and the input of a map."""
+"""Moduli of an organ and of its regions from measured waves, and the input for a map of the modulus."""
 
 import itertools
 from collections.abc import Callable
@@ -17,19 +17,20 @@ from fitting.waves.wave_field import WaveField
 from liverjax.core.errors import InputError
 
 __all__ = ["Found", "Organ", "body_of", "gigabytes", "organ_of", "plane_wave_biases", "problem_of_map", "regions_of"]
-#: Directions of plane waves: from a voxel to its neighbours, and only one of two opposite directions. SHARPNESS:
-#: exponent with which the weight of directions falls that differ from the directions of the measured waves.
+#: DIRECTIONS: the D directions of plane waves, from a voxel to its neighbours. Only one of two opposite directions is
+#: used. SHARPNESS: exponent of the weights of the directions. A large exponent gives a weight only to directions close
+#: to those of the measured waves.
 DIRECTIONS = tuple(n for n in itertools.product((1, 0, -1), repeat=3) if n > (0, 0, 0))
 SHARPNESS = 4
 
 
-#: Minimum number of equations of one frequency, after subtraction of the unknown pressures. Two values (storage and
-#: loss) must be found from noisy data.
+#: Minimum number of equations at one frequency after the number of unknown pressures is subtracted. Two values (storage
+#: and loss modulus) must be determined from noisy data.
 FEWEST_BALANCES = 10
 
 
 class Organ(NamedTuple):
-    """The body of the measured voxels."""
+    """Measured waves of an organ, with the elements on the measured voxels and their equations."""
 
     field: WaveField
     body: VoxelBody
@@ -39,20 +40,21 @@ class Organ(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Moduli of an organ."""
+    """Fitted moduli of an organ, and the relative errors that the elements cause in these moduli (mesh bias)."""
 
-    whole: Regions  # with one region
-    labels: np.ndarray | None  # (R,) of the regions
-    parts: Regions | None
-    mesh_bias: np.ndarray  # (F,) complex, relative: from plane waves, with the modulus of the whole
-    bias_left: np.ndarray  # (F, D) uncertainty of this mean, from each direction of these waves
-    parts_bias: np.ndarray | None = None  # (F, R) the same, with the moduli of the regions
-    parts_bias_left: np.ndarray | None = None  # (F, R, D)
+    whole: Regions  # fit with one region
+    labels: np.ndarray | None  # (R,) label of each region
+    parts: Regions | None  # fit with R regions
+    mesh_bias: np.ndarray  # (F,) complex mesh bias of `whole`: weighted mean over plane waves
+    bias_left: np.ndarray  # (F, 2 D) contribution of each of these waves to the uncertainty of this mean
+    parts_bias: np.ndarray | None = None  # (F, R) mesh bias of `parts`
+    parts_bias_left: np.ndarray | None = None  # (F, R, 2 D) contributions to its uncertainty
 
 
 def body_of(field: WaveField, side: int | None = None) -> VoxelBody:
-    """The body of elements on the voxels that are measured and in the mask, in parts of at most `side` bricks along
-    each side.
+    """Return the body of elements on the voxels that are measured and in the mask.
+
+    The body is divided into parts of at most `side` bricks along each axis. If `side` is None, it has one part.
 
     Raises:
         InputError: there are too few such voxels, or the displacements have fewer than three components.
@@ -66,14 +68,16 @@ def body_of(field: WaveField, side: int | None = None) -> VoxelBody:
     return voxels.voxel_body(field.mask & np.all(measured, axis=-1), field.spacing, field.origin, side)
 
 
-#: Most bricks along the side of a part. Larger parts would take much longer to factorise; in smaller ones, most of the
-#: balance would be lost at their faces.
+#: Maximum number of bricks along the side of a part: the values are tried in this order. Larger parts would take much
+#: longer to factorise. In smaller parts, most of the equations would be lost at the faces between the parts.
 SIDES = (8, 7, 6)
 
 
 def body_that_fits(field: WaveField, most_memory: float, most_corners: int | None = None) -> VoxelBody | None:
-    """The body in one part, or else in parts as large as possible, whose factor for one frequency needs less than
-    `most_memory` [GB]; None: there is none. A body with more corners than `most_corners` is not divided.
+    """Return the undivided body if its matrix factor for one frequency needs less than `most_memory` [GB].
+
+    Otherwise return the body divided into the largest parts for which this holds. Return None if no division is small
+    enough. A body with more corners than `most_corners` is not divided.
     """
     body = body_of(field)
     if gigabytes(body) < most_memory:
@@ -83,31 +87,32 @@ def body_that_fits(field: WaveField, most_memory: float, most_corners: int | Non
     return next((body for body in divided if gigabytes(body) < most_memory), None)
 
 
-#: If gaps within the organ leave less than this part of the bricks, a note is given.
+#: A note is given if gaps within the organ leave less than this fraction of the bricks.
 GAPS = 0.8
 
 
 def notes_on_gaps(field: WaveField) -> list[str]:
-    """A note if voxels without displacement within the organ remove many elements: each brick needs all its 27
-    voxels."""
+    """Return a note if voxels without displacement within the organ remove many elements. An element exists only if
+    all 27 voxels of its brick are measured."""
     inside = field.mask & np.isfinite(field.displacement).all(axis=(0, 4))
     whole = scipy.ndimage.binary_fill_holes(inside)
     left, most = voxels.number_of_bricks(inside), voxels.number_of_bricks(whole)
     if not left < GAPS * most:
         return []
     return [
-        f"{int((whole & ~inside).sum())} voxels within the organ have no displacement or are not in the mask, and "
-        f"{100 * left / most:.2g} % of its elements are left: fill single gaps from their neighbours to get smaller "
-        "errors"
+        f"{int((whole & ~inside).sum())} voxels within the organ have no displacement or are not in the mask, so only "
+        f"{100 * left / most:.2g} % of the elements are left: interpolate single missing voxels from their neighbours "
+        "to reduce the errors"
     ]
 
 
-#: If more than this part of the voxels lies in last layers without elements, a note is given.
+#: A note is given if more than this fraction of the voxels lies in outer layers without elements.
 LEFT_OUT = 0.1
 
 
 def notes_on_layers(field: WaveField) -> list[str]:
-    """A note if many voxels lie beyond the last brick along an axis: a brick is two voxel steps long."""
+    """Return a note if many voxels lie beyond the last brick along an axis. A brick is two voxel spacings long, so the
+    last of an even number of voxels is in no brick."""
     inside = field.mask & np.isfinite(field.displacement).all(axis=(0, 4))
     box = scipy.ndimage.find_objects(inside.astype(int))[0]
     odd = tuple(slice(0, n - 1 + n % 2) for n in inside[box].shape)
@@ -116,22 +121,22 @@ def notes_on_layers(field: WaveField) -> list[str]:
     if every - kept < LEFT_OUT * every:
         return []
     return [
-        f"{every - kept} of {every} voxels are in no element. An element takes 3 voxels along an axis and shares the "
+        f"{every - kept} of {every} voxels are in no element. An element needs 3 voxels along an axis and shares the "
         f"last one with the next element, so the last layer along {', '.join(axes)} is left out: measure an odd "
         "number of voxels"
     ]
 
 
 def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
-    """The organ of a field, with the equations of its body. `density` is in kg/m^3."""
+    """Return the organ of a wave field, with the equations of its body. `density` is in kg/m^3."""
     motion = field.displacement[(slice(None), *body.voxel.T)]
     omega = 2 * np.pi * field.frequencies
     waves = MeasuredWaves(omega, motion.reshape(len(omega), -1), np.maximum(field.noise, 1e-9 * np.abs(motion).max()))
     m = balance.matrices(body, density)
     if m.balances < FEWEST_BALANCES:
         raise InputError(
-            f"the {len(body.voxel)} measured voxels of the mask give {max(0, m.balances)} equations beside the unknown "
-            f"pressures: waves need at least {FEWEST_BALANCES}; give a larger mask or a smaller --stride"
+            f"the {len(body.voxel)} measured voxels of the mask give {max(0, m.balances)} equations, without those for "
+            f"the unknown pressures. At least {FEWEST_BALANCES} are needed: give a larger mask or a smaller --stride"
         )
     return Organ(field, body, m, waves, density)
 
@@ -141,7 +146,10 @@ def regions_of(
     progress: Callable[[int, float], None] = lambda k, cost: None,
     keep: Keep = lambda name, find: find(),
 ) -> Found:
-    """Moduli of the whole organ, and of its regions if labels are given. `keep`: see `kept_regions.kept_in`."""
+    """Fit the modulus of the whole organ, and the moduli of its regions if labels are given.
+
+    `keep` stores the results in a file (see `kept_regions.kept_in`); by default nothing is stored.
+    """
     m, waves, body = organ.matrices, organ.waves, organ.body
 
     def of_whole() -> Regions:
@@ -165,14 +173,17 @@ def regions_of(
     return Found(whole, known, parts, bias, left, *_biases(organ, parts.modulus))
 
 
-#: The bias is in proportion to the square of the wave number. So moduli within this factor of each other use the same
-#: plane waves.
+#: The mesh bias is nearly proportional to the square of the wave number, so inversely proportional to the modulus. The
+#: scaled bias of one modulus is therefore used for moduli that are larger by less than this factor.
 ALIKE = 1.15
 
 
 def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Relative error (F, R) that the elements cause in moduli (F, R): its mean over plane waves, and the remaining
-    uncertainty (F, R, 2 D) from each of these waves."""
+    """Return the relative error that the elements cause in moduli (F, R).
+
+    The first result is the mean (F, R) over plane waves. The second result (F, R, 2 D) contains the contributions of
+    these waves to the uncertainty of the mean.
+    """
     bias, left = np.zeros(moduli.shape, complex), np.zeros((*moduli.shape, 2 * len(DIRECTIONS)), complex)
     for f, strength in enumerate(waves_of_field(organ.field)):
         known = 0.0
@@ -182,24 +193,25 @@ def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 each, weights = plane_wave_biases(G, organ.waves.omega[f], organ, strength)
                 known, mean = abs(G), each @ weights
             bias[f, r] = mean * known / abs(G)
-            # The error of the mean is the root of the sum of these squares.
+            # The uncertainty of the mean is the root of the sum of the squares of these contributions.
             left[f, r] = weights * (each - mean) * known / abs(G)
     return bias, left
 
 
 def _uniform(m: Matrices, body: VoxelBody, density: float) -> edges.RegionMatrices:
-    """The balance of a uniform organ: one region."""
+    """Return the matrices of a uniform organ, which has one region."""
     return edges.region_matrices(m, body, density, np.ones((1, body.mesh.number_of_nodes)))
 
 
 def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.Course:
-    """The input of `stiffness_map.map_of` for a map around the moduli of the whole organ, with this correlation length
-    [m]."""
+    """Return the input of `stiffness_map.map_of`: a map relative to the moduli of the whole organ, with a prior of this
+    correlation length [m]."""
     return stiffness_map.course_of(organ.body, organ.matrices, organ.waves, found.whole.modulus[:, 0], length)
 
 
 def plane_waves() -> list[tuple[np.ndarray, np.ndarray]]:
-    """Direction and polarisation, (3,) each, of 2 D plane shear waves: two along each of `DIRECTIONS`."""
+    """Return direction (3,) and polarisation (3,) of 2 D plane shear waves: two polarisations for each of
+    `DIRECTIONS`."""
     found = []
     for d in DIRECTIONS:
         n = np.array(d) / np.linalg.norm(d)
@@ -210,16 +222,17 @@ def plane_waves() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def waves_of_field(field: WaveField) -> np.ndarray:
-    """Relative energies (F, 2 D) of `plane_waves` in the displacement.
+    """Return the relative energies (F, 2 D) of `plane_waves` in the displacement. The sum at each frequency is 1.
 
-    A direction has the squared slopes along it, to the power `SHARPNESS`. Its two waves share this in proportion to the
-    squared slopes of their components. Slopes along an axis are differences between neighbours, without those of the
-    noise.
+    The energy of a direction n is the sum over the axes a of n_a^2 times the mean squared derivative along axis a, to
+    the power `SHARPNESS`. This energy is divided between the two waves in proportion to the squared derivatives of the
+    components along their polarisations. Derivatives are differences between neighbours, and the contribution of the
+    noise is subtracted.
     """
     waves = plane_waves()
     rows = []
     for u, noise in zip(field.displacement, field.noise, strict=True):
-        steep = np.empty((3, 3, 3))  # along an axis, products of the components
+        steep = np.empty((3, 3, 3))  # mean products of the derivatives of two components, for each axis
         for axis in range(3):
             slope = np.diff(u, axis=axis).reshape(-1, 3)
             slope = slope[np.isfinite(slope).all(axis=1)]
@@ -236,17 +249,19 @@ def waves_of_field(field: WaveField) -> np.ndarray:
 
 
 def plane_wave_biases(G: complex, omega: float, organ: Organ, strength: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Relative errors (2 D,) of the modulus that these elements give for `plane_waves` without noise; and the weights
-    (2 D,) of these waves in a common modulus: strength times what a wave tells about it.
+    """Return the relative errors (2 D,) of moduli that are fitted to `plane_waves` without noise, and weights (2 D,).
 
-    It takes one Gauss-Newton step from the true modulus, in the body of the organ: its edges and holes add to the error
-    of the elements.
+    The errors come from the elements. A weight is the strength of a wave times the information of the wave about the
+    modulus. The weighted mean of the errors is the error of one modulus that is fitted to all waves.
+
+    An error is one Gauss-Newton step from the true modulus. The step is computed in the body of the organ, because the
+    surface and the holes of the body add to the error of the elements.
 
     Args:
         G: modulus [Pa].
         omega: angular frequency [rad/s].
-        organ: its body and density.
-        strength: relative energies (2 D,) of the waves. Waves near 0 are left out, with an error and a weight of 0.
+        organ: the body and its density are used.
+        strength: relative energies (2 D,) of the waves. Waves with an energy near 0 get an error and a weight of 0.
     """
     m, X = organ.matrices, np.asarray(organ.body.mesh.points)
     uniform, X = _uniform(m, organ.body, organ.density), X - X.mean(axis=0)

@@ -1,5 +1,5 @@
-"""Complex moduli of the regions of an organ from its waves, with their uncertainty. Each frequency is fitted by
-itself."""
+"""Complex moduli of the regions of an organ from measured waves, with the uncertainty of the moduli. Each frequency is
+fitted separately."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,10 +12,11 @@ from fitting.waves.balance import Balanced, Matrices
 from fitting.waves.correlated_noise import Correlation, correlation
 from fitting.waves.edges import RegionMatrices
 
-#: Moduli [Pa] from which the start of a search is chosen, and their ratio of loss to storage.
+#: STARTS: storage moduli [Pa] from which the starting point of a search is chosen. LOSS: ratio of loss to storage
+#: modulus at the starting point.
 STARTS, LOSS = np.geomspace(500.0, 40500.0, 5), 0.3
-#: Maximum number of iterations. The iteration ends if the step of each modulus, divided by its standard error, is below
-#: the second value.
+#: ITERATIONS: maximum number of iterations. ENOUGH: the iteration ends if the step of each modulus, divided by its
+#: standard error, is below this value.
 ITERATIONS, ENOUGH = 20, 0.1
 
 
@@ -32,45 +33,46 @@ class Regions(NamedTuple):
 
     modulus: np.ndarray  # (F, R) complex [Pa]
     covariance: np.ndarray  # (F, 2 R, 2 R) [Pa^2]: storage of all regions, then loss
-    farther: np.ndarray  # (F, R) mean outward shift of the edges against the labels [voxels]
+    farther: np.ndarray  # (F, R) mean outward shift of the edges from the labels [voxels]
     chi2: np.ndarray  # (F,)
-    components: int  # of one frequency
+    components: int  # number of real equations in chi^2 of one frequency
     iterations: np.ndarray  # (F,)
     converged: np.ndarray  # (F,) bool
-    correlations: tuple[Correlation, ...] = ()  # of the noise at each frequency, if asked for
+    correlations: tuple[Correlation, ...] = ()  # correlation of the noise at each frequency, if it was computed
 
     @property
     def noise_factor(self) -> np.ndarray:
-        """Factor (F, R), at least 1, by which the errors exceed the errors for white noise with the given standard
+        """Factor (F, R), at least 1, by which the errors are larger than for white noise with the given standard
         deviations.
 
-        It is the ratio of residuals to noise. If the noise is correlated, it is the factor of correlated noise.
+        The factor is sqrt(chi^2 / number of equations). If the noise is correlated, the factor is
+        `Correlation.enlarged`.
         """
         factor = np.repeat(np.maximum(1.0, np.sqrt(self.chi2 / self.components))[:, None], self.modulus.shape[1], 1)
         for f, own in enumerate(self.correlations):
-            # Also without correlated noise, parts of the body share the noise of their common voxels.
+            # Even if the noise is not correlated, parts of the body have the same noise on their common voxels.
             factor[f] = np.maximum(1.0, own.enlarged if own.seen else factor[f] * own.enlarged)
         return factor
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Standard errors of storage, and of loss as the imaginary part (F, R) [Pa]."""
+        """Standard errors (F, R) [Pa]: of the storage modulus (real part) and of the loss modulus (imaginary part)."""
         R = self.modulus.shape[1]
         sd = np.tile(self.noise_factor, 2) * np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         return sd[:, :R] + 1j * sd[:, R:]
 
 
 class _State(NamedTuple):
-    """The likeliest motion for moduli (R,), with the gradient and the Gauss-Newton Hessian of chi^2 / 2."""
+    """The most probable motion for moduli (R,), with the gradient and the Gauss-Newton Hessian of chi^2 / 2."""
 
     G: np.ndarray
     here: Balanced
-    gradient: np.ndarray  # (2 R + P,) by storage, loss and patches of edges
+    gradient: np.ndarray  # (2 R + P,) with respect to storage, loss and shifts of the P patches of the edges
     hessian: np.ndarray
 
 
 def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
-    """The modulus [Pa] of `STARTS` with the lowest chi^2 at the lowest frequency."""
+    """Return the complex modulus [Pa] from `STARTS` and `LOSS` with the lowest chi^2 at the lowest frequency."""
     ones = np.ones(m.rows.shape[-1])
 
     def out_of_balance(G):
@@ -87,17 +89,18 @@ def moduli_of_regions(
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
     voxel: np.ndarray | None = None,
 ) -> Regions:
-    """Find the moduli by Gauss-Newton, for every frequency by itself.
+    """Find the moduli by the Gauss-Newton method, separately for every frequency.
 
-    The positions of the edges are unknowns too (`edge_places`).
+    The positions of the edges are also unknowns (`edge_places`).
 
     Args:
         m: the result of `edges.region_matrices`.
         waves: the measured waves.
-        start: complex modulus of each region (R,) [Pa] at the lowest frequency.
-        progress: called after every iteration with its number, and with chi^2 per component.
-        voxel: voxel index of each node (V, 3), from which the correlation of the noise is found; None: the noise counts
-            as white.
+        start: complex modulus of each region (R,) [Pa] at the starting point for the lowest frequency. The search at
+            the next frequency starts from the moduli of this frequency.
+        progress: called after every iteration with the number of the iteration and chi^2 per equation.
+        voxel: voxel index of each node (V, 3), for an estimate of the correlation of the noise. If it is None, the
+            noise is assumed to be white.
     """
     found, G, correlations = [], np.asarray(start, complex), []
     for f in range(len(waves.omega)):
@@ -113,18 +116,18 @@ def moduli_of_regions(
 
 
 def _one_frequency(m, waves, f, G, progress):
-    """Moduli (R,), covariance (2 R, 2 R), mean shifts of the edges (R,), chi^2, number of iterations, whether the
-    search converged, and the state."""
+    """Return moduli (R,), covariance (2 R, 2 R), mean shifts of the edges (R,), chi^2, number of iterations, whether
+    the search converged, and the last state."""
     R, at = len(G), (waves.omega[f], waves.motion[f], waves.sd[f])
     now, converged, k = _state_of_regions(m, G, *at), False, 0
     labels = _of_labels(m, R)
     step, covariance = _gauss_newton(now, labels)
     for k in range(1, ITERATIONS + 1):
         both = step[:R] + 1j * step[R : 2 * R]
-        part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # at most by half of its value
+        part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # a modulus changes by half of it at most
         new = None
-        # The likeliest edges, and with them chi^2, change with the moduli. So chi^2 cannot judge steps within a
-        # standard error.
+        # The most probable positions of the edges change with the moduli, and so does chi^2. So chi^2 cannot judge a
+        # step that is shorter than a standard error.
         close = _in_errors(step, covariance, R) < 1
         for _ in range(8):
             if np.all((now.G + part * both).real > 0):
@@ -146,16 +149,17 @@ def _one_frequency(m, waves, f, G, progress):
 
 
 def _in_errors(step: np.ndarray, covariance: np.ndarray, R: int) -> float:
-    """The largest step of the R moduli, divided by its standard error."""
+    """Return the largest ratio of step to standard error over the 2 R storage and loss moduli."""
     return float(np.max(np.abs(step[: 2 * R]) / np.sqrt(np.diagonal(covariance)[: 2 * R])))
 
 
 def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Step (2 R + P,) of storage, loss and edges, and their covariance.
+    """Return the step (2 R + P,) of storage moduli, loss moduli and edges, and the covariance of these unknowns.
 
     In every step, the edges start from the labels, because the equations are nearly linear in the positions of the
-    edges. The derivatives by the moduli use these edges too. With the likeliest edges, the errors of the edges would
-    count twice: cylinders of 2.5 voxels would become a percent stiffer.
+    edges. The derivatives with respect to the moduli are also computed with these edges. If they were computed with
+    the most probable edges, the errors of the edges would count twice, and cylinders of 2.5 voxels would become one
+    percent stiffer.
     """
     H = now.hessian + labels
     silent = np.diagonal(H) == 0  # a region without any element
@@ -166,8 +170,8 @@ def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
-    """Inverse covariance from the labels alone: 0 for the moduli, and the inverse covariance of the patches for the
-    edges."""
+    """Return the inverse covariance (2 R + P, 2 R + P) from the labels alone. It is 0 for the moduli. For the edges it
+    is the inverse covariance of the patches."""
     P = len(m.patches.region)
     out = np.zeros((2 * R + P, 2 * R + P))
     out[2 * R :, 2 * R :] = np.linalg.inv(m.patches.covariance)
@@ -175,7 +179,7 @@ def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
 
 
 def _least(now: _State, labels: np.ndarray) -> float:
-    """chi^2 with the best positions of the edges for these moduli."""
+    """Return chi^2 with the best positions of the edges for these moduli."""
     R = len(now.G)
     g, H = now.gradient[2 * R :], (now.hessian + labels)[2 * R :, 2 * R :]
     return float(now.here.chi2 - g @ np.linalg.solve(H, g))

@@ -1,7 +1,7 @@
-"""Plane shear waves in a viscoelastic solid: phase velocity and attenuation from the complex modulus, and back.
+"""Plane shear waves in a viscoelastic solid: phase velocity and attenuation from the complex modulus, and the inverse.
 
-A wave exp(i omega t - i k z) has k^2 = rho omega^2 / G*, with k = omega / c - i alpha (Catheline et al. 2004, J.
-Acoust. Soc. Am. 116, 3734).
+A wave exp(i omega t - i k z) in a material of density rho has k^2 = rho omega^2 / G*, with k = omega / c - i alpha
+(Catheline et al. 2004, J. Acoust. Soc. Am. 116, 3734).
 """
 
 import numpy as np
@@ -13,21 +13,21 @@ DENSITY = 1060.0
 
 
 def velocity_and_attenuation(storage: Number, loss: Number, omega: Number, density: Number) -> tuple[Array, Array]:
-    """Phase velocity c [m/s], and attenuation alpha [1/m] of the amplitude, from moduli (n,) [Pa], in NumPy or JAX.
+    """Return the phase velocity c [m/s] and the attenuation alpha [1/m] of the amplitude for n moduli, in NumPy or JAX.
 
     Args:
-        storage, loss: G', G'' [Pa].
+        storage, loss: G' and G'' (n,) [Pa].
         omega: angular frequencies [rad/s].
         density: [kg/m^3].
     """
     size = (storage**2 + loss**2) ** 0.5
-    # |G| - G' is computed as G''^2 / (|G| + G'): this has no cancellation if the loss is small.
+    # |G| - G' is computed as G''^2 / (|G| + G'), which has no cancellation error if the loss is small.
     velocity = size * (2 / (density * (size + storage))) ** 0.5
     return velocity, omega * loss * (density / (2 * (size + storage))) ** 0.5 / size
 
 
 def moduli_of(velocity: Array, attenuation: Array, omega: Array, density: Number) -> tuple[Array, Array]:
-    """G' and G'' [Pa] from velocity and attenuation: the inverse of `velocity_and_attenuation`."""
+    """Return G' and G'' [Pa] from velocity [m/s] and attenuation [1/m] (the inverse of `velocity_and_attenuation`)."""
     real, imaginary = omega / velocity, attenuation
     square = (real**2 + imaginary**2) ** 2
     scale = density * omega**2 / square
@@ -35,7 +35,7 @@ def moduli_of(velocity: Array, attenuation: Array, omega: Array, density: Number
 
 
 def waves_of_moduli(storage: np.ndarray, loss: np.ndarray, omega: np.ndarray, density: float | None) -> Content:
-    """The part `shear_waves` of fit.json: waves of a fitted model with moduli (n,) [Pa]."""
+    """Return the entry `shear_waves` of fit.json: the waves in a material with the fitted moduli (n,) [Pa]."""
     density = DENSITY if density is None else density
     velocity, attenuation = velocity_and_attenuation(storage, loss, omega, density)
     return {

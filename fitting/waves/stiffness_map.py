@@ -1,20 +1,25 @@
 """A map of the complex modulus from measured waves: a smooth field, with its uncertainty.
 
-At frequency f the modulus of an element is g_f exp(c + l_f). g_f is the modulus that a uniform organ would have. c =
-ln(size) + i (loss angle) is the mean over the element of a complex nodal field (P,). This field is the same for all
-frequencies. Its real and its imaginary part have the prior of `fitting.methods.prior`, with the same standard
-deviation. The levels l_f are complex, with mean 0 and the standard deviation `LEVEL`. They are needed because in an
-organ that is not uniform the ratios of the g_f may be wrong. With only one frequency there is no level: the mean of c
-has the same effect. Larger and larger standard deviations of c are tried. This ends when chi^2 is as low as the number
-of equations (discrepancy principle; Morozov 1966), or when the evidence -(chi^2/n + |z|^2)/2 - ln det H falls. The
-standard deviation with the highest evidence is used. For each one, Gauss-Newton minimises chi^2/2 + |z|^2/2 over the
-whitened field z. A search ends if the next step is shorter than `NEAR` standard deviations.
+At frequency f the complex modulus of an element is G = g_f exp(c + l_f). The factor g_f is the modulus that is fitted
+to a uniform organ. The real part of the exponent is ln(|G| / |g_f|), and the imaginary part is the difference of the
+loss angles of G and g_f. The term c is the mean over the element of a complex nodal field (P,), which is the same for
+all frequencies. The real and the imaginary part of this field have the prior of `fitting.methods.prior`, with the same
+standard deviation. Each frequency has a complex level l_f with mean 0 and standard deviation `LEVEL`. The levels are
+needed because the ratios of the g_f may be wrong if the organ is not uniform. With only one frequency there is no
+level, because the mean of c has the same effect.
 
-The uncertainty has two parts. The first part comes from the Hessian H = I + J^H J/n, where n is chi^2 divided by its
-expected value. The second part is needed because the position of a change in modulus is not known exactly. The prior
-turns a step into a slope over the correlation length, or over a brick if a brick is longer. The step may lie anywhere
-within the slope. So its position is known only within this length w, with the variance w^2/12. This adds |w dc/dx|^2/12
-to the variance of c.
+The standard deviation of c is increased step by step. This ends when chi^2 is as low as the number of equations
+(discrepancy principle; Morozov 1966), or when the evidence -(chi^2/n + |z|^2)/2 - ln det H falls. Here z is the
+whitened field, and n is chi^2 divided by its expected value. The Hessian is H = I + J^H J/n, with the derivative J of
+the unbalanced forces. The standard deviation with the highest evidence is used. For each standard deviation, the
+Gauss-Newton method minimises chi^2/2 + |z|^2/2. A search ends if the next step is shorter than `NEAR` standard
+deviations.
+
+The uncertainty has two parts. The first part comes from the Hessian H, with the noise enlarged by the correlation
+between neighbouring voxels (`fitting.waves.correlated_noise`). The second part is needed because the position
+of a change of the modulus is not known exactly. The prior smooths a jump of the modulus over a width w: the correlation
+length, or the side of a brick if this is longer. The jump may lie anywhere within this width, so its position has the
+variance w^2/12. This adds |w dc/dx|^2/12 to the variance of c.
 """
 
 import time
@@ -30,20 +35,22 @@ import scipy.sparse
 from fitting.methods import prior as smooth
 from fitting.waves import balance
 from fitting.waves.balance import Balanced, Matrices
+from fitting.waves.correlated_noise import correlation
 from fitting.waves.regions import MeasuredWaves
 from fitting.waves.voxels import VoxelBody
 from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.struct import Content
 
-#: Standard deviations of c to try: from a nearly uniform organ to an organ whose modulus may vary strongly.
+#: Standard deviations of c that are tried: from a nearly uniform organ to an organ with a strongly varying modulus.
 DEVIATIONS = (0.2, 0.4, 0.8)
 #: Standard deviation of the real and the imaginary part of the levels.
 LEVEL = 0.5
-#: Maximum number of Gauss-Newton steps for each of `DEVIATIONS`. A search ends if the next step is shorter than NEAR,
-#: and a map has converged if it is shorter than FAR (in standard deviations of the map).
+#: STEPS: maximum number of Gauss-Newton steps for each of `DEVIATIONS`. NEAR: a search ends if the next step is shorter
+#: than this. FAR: a map has converged if the next step is shorter than this (both in standard deviations of the map).
 STEPS, NEAR, FAR = 40, 0.1, 0.2
-#: If a step is longer than this part of the step before, the Hessian was computed too far away and is computed again.
+#: The Hessian is computed again if a step is longer than this fraction of the step before: then the point of the last
+#: Hessian is too far away.
 _SLOW = 0.3
 
 
@@ -51,16 +58,17 @@ class WaveMap(NamedTuple):
     """The map and its uncertainty."""
 
     exponent: np.ndarray  # c + l_f (F, P) complex at the corners
-    sd: np.ndarray  # (F, P) complex: sd of the real part (ln of the size) + i sd of the imaginary part (loss angle)
-    posterior_sd: np.ndarray  # (F, P) of both parts, without the uncertainty of positions
-    prior_sd: np.ndarray  # (F, P)
-    draws: np.ndarray  # (D, F, P) complex: samples of the posterior, displaced within the length w
+    sd: np.ndarray  # (F, P) complex: sd of the real part (ln of the absolute value) + i sd of the loss angle
+    posterior_sd: np.ndarray  # (F, P) sd of real and of imaginary part, without the uncertainty of positions
+    prior_sd: np.ndarray  # (F, P) the same, before the measurement
+    draws: np.ndarray  # (D, F, P) complex: samples of the posterior, displaced by random parts of the width w
     modulus: np.ndarray  # (F, P) complex [Pa]
-    deviation: float  # standard deviation of the prior that was chosen
-    length: float  # [m]
+    deviation: float  # chosen standard deviation of the prior
+    length: float  # correlation length of the prior [m]
     chi2: float
-    components: int
-    reached: bool
+    components: int  # number of real equations in chi2
+    noise_factor: np.ndarray  # (F,) by which the errors are larger than for white noise with the given sd
+    reached: bool  # whether chi2 is at most this number
     distance: float  # distance to the minimum: length of the next step, in standard deviations of the map
     history: list[dict[str, float]]
     seconds: float
@@ -71,29 +79,32 @@ class Course(NamedTuple):
 
     m: Matrices
     waves: MeasuredWaves
-    whole: np.ndarray  # (F,) complex
-    exponents: tuple[scipy.sparse.csr_array, ...]  # (F,) of (E, P + L): c and levels -> c + l_f of the elements
-    slopes: tuple[scipy.sparse.csr_array, ...]  # (3,) of (P, P): change over the length w along x, y, z
+    whole: np.ndarray  # (F,) complex: modulus g_f of the uniform organ at each frequency [Pa]
+    exponents: tuple[scipy.sparse.csr_array, ...]  # F matrices (E, P + L): c and L levels -> c + l_f of the elements
+    slopes: tuple[scipy.sparse.csr_array, ...]  # 3 matrices (P, P): change of c over the width w along x, y and z
     p: smooth.Prior
-    length: float  # [m]
+    length: float  # correlation length of the prior [m]
+    voxel: np.ndarray | None = None  # (V, 3) voxel index of each node; None: the noise counts as white
 
     @property
     def corners(self) -> int:
-        """P."""
+        """Number P of corners."""
         return len(self.p.root_mass)
 
     def moduli(self, y: np.ndarray) -> list[np.ndarray]:
-        """Moduli (E,) of the elements at every frequency. y (P + L,) has c at the corners, then the levels."""
+        """Return the moduli (E,) [Pa] of the elements at every frequency. y (P + L,) contains c at the corners, then
+        the levels."""
         return [g * np.exp(own @ y) for g, own in zip(self.whole, self.exponents, strict=True)]
 
     def at(self, y: np.ndarray) -> list[Balanced]:
-        """The likeliest motion at every frequency, for y (P + L,)."""
+        """Return the most probable motion at every frequency, for y (P + L,)."""
         w = self.waves
         each = zip(self.moduli(y), w.omega, w.motion, w.sd, strict=True)
         return [balance.balanced(self.m, *own) for own in each]
 
     def jacobians(self, y: np.ndarray, here: list[Balanced]) -> list[scipy.sparse.csc_array]:
-        """Derivatives (I, P + L) of the unbalanced forces by y, divided by the noise."""
+        """Return the derivatives (I, P + L) of the unbalanced forces with respect to y, divided by the standard
+        deviation of the noise, for every frequency."""
         each = zip(self.moduli(y), self.exponents, here, self.waves.sd, strict=True)
         return [
             (balance.by_modulus(self.m, b.motion) @ scipy.sparse.diags_array(G) @ own).tocsc() / sd
@@ -101,29 +112,29 @@ class Course(NamedTuple):
         ]
 
     def scales(self, k: int) -> np.ndarray:
-        """Factors (P + L,) from the result of `natural` to y, for `DEVIATIONS[k]`."""
+        """Return factors (P + L,): y = `natural`(z) times these factors, for the standard deviation `DEVIATIONS[k]`."""
         return np.where(np.arange(self.exponents[0].shape[1]) < self.corners, DEVIATIONS[k], 1.0)
 
     def natural(self, z: np.ndarray) -> np.ndarray:
-        """y from whitened complex z, (P + L,) or (P + L, n). c has the standard deviation 1, the levels have
-        `LEVEL`."""
+        """Return y for a whitened complex field z, (P + L,) or (P + L, n). In the result, c has the standard deviation
+        1, and the levels have the standard deviation `LEVEL`."""
         c, levels = z[: self.corners], LEVEL * z[self.corners :]
         return np.concatenate(
             [smooth.field_at_nodes(self.p, c.real) + 1j * smooth.field_at_nodes(self.p, c.imag), levels]
         )
 
     def whitened(self, g: np.ndarray) -> np.ndarray:
-        """The transpose of `natural`, (P + L,) or (P + L, n)."""
+        """Return the transpose of `natural` times g, (P + L,) or (P + L, n)."""
         c, levels = g[: self.corners], LEVEL * g[self.corners :]
         return np.concatenate([smooth.to_whitened(self.p, c.real) + 1j * smooth.to_whitened(self.p, c.imag), levels])
 
     def by_frequency(self, y: np.ndarray) -> np.ndarray:
-        """c + l_f at the corners (F, P, …), from y (P + L, …)."""
+        """Return c + l_f at the corners (F, P, …), from y (P + L, …)."""
         c, levels = y[: self.corners], y[self.corners :]
         return c[None] + (levels[:, None] if len(levels) else np.zeros((1, 1, *y.shape[1:])))
 
     def marks(self) -> dict[str, object]:
-        """Marks that identify the problem, by name."""
+        """Return a dictionary of digests and values that identify the problem."""
         m, w = self.m, self.waves
         return {
             "length": self.length,
@@ -153,12 +164,12 @@ class _Begun(NamedTuple):
 
 
 def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndarray, length: float) -> Course:
-    """The problem of a map.
+    """Return the fixed input of the search for a map.
 
     Args:
         body, m: the body and its matrices.
         waves: the measured waves.
-        whole: modulus of the whole organ at each frequency (F,) complex [Pa].
+        whole: complex modulus of the whole organ at each frequency (F,) [Pa].
         length: correlation length of the prior [m].
     """
     mean, p, number = _mean_of_corners(body), smooth.prior(body.whole, length), len(whole)
@@ -166,7 +177,7 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
     every = np.ones((mean.shape[0], 1))
     exponents = tuple(scipy.sparse.hstack([mean, scipy.sparse.csr_array(every * own)], "csr") for own in levels)
     slopes = _changes_over_slopes(body, mean, length)
-    return Course(m, waves, np.asarray(whole, complex), exponents, slopes, p, length)
+    return Course(m, waves, np.asarray(whole, complex), exponents, slopes, p, length, body.voxel)
 
 
 def map_of(
@@ -180,10 +191,10 @@ def map_of(
 
     Args:
         course: the result of `course_of`.
-        file: HDF5 file into which every step is written; None: no file.
-        resume: begin from that file if it exists.
+        file: HDF5 file that is written after every step. If it is None, no file is written.
+        resume: whether the search begins at the point in this file, if the file exists.
         draws: number of samples of the posterior.
-        progress: called after every step with the index of the deviation, and with chi^2 per equation.
+        progress: called after every step with the index in `DEVIATIONS` and with chi^2 per equation.
 
     Raises:
         InputError: `file` belongs to another fit.
@@ -198,7 +209,8 @@ def map_of(
     point, information = visited[int(np.argmax(evidence))]
     y = course.natural(course.scales(point.k) * point.z)
     exponent = course.by_frequency(y)
-    before, after, departures = _spread(course, point, information / excess, draws)
+    factors = _noise_factors(course, point, y, excess)
+    before, after, departures = _spread(course, point, _with_factors(course, point, information, factors), draws)
     slopes = np.stack([D @ y[: course.corners] for D in course.slopes])
     place = np.random.default_rng(1).uniform(-0.5, 0.5, (draws, 3)) @ slopes
     return WaveMap(
@@ -212,6 +224,7 @@ def map_of(
         length=course.length,
         chi2=point.chi2,
         components=components,
+        noise_factor=factors,
         reached=point.chi2 <= components,
         distance=_newton_step(course, point, information, excess)[1],
         history=history,
@@ -220,13 +233,16 @@ def map_of(
 
 
 def sd_of_modulus(G: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Standard deviations [Pa] of storage (real part) and loss (imaginary part) of moduli G, from `WaveMap.sd`."""
+    """Return standard deviations [Pa] of the storage modulus (real part) and the loss modulus (imaginary part).
+
+    `G`: complex moduli [Pa]; `sd`: as `WaveMap.sd`.
+    """
     return np.hypot(G.real * sd.real, G.imag * sd.imag) + 1j * np.hypot(G.imag * sd.real, G.real * sd.imag)
 
 
 def _with_place(sd: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Standard deviations (F, P) that contain the uncertainty of positions. `slopes` (3, P): changes of c over the
-    length w."""
+    """Return the standard deviations (F, P) including the uncertainty of positions. `slopes` (3, P): changes of c over
+    the width w."""
     return np.sqrt(sd**2 + np.sum(slopes**2, axis=0) / 12)
 
 
@@ -240,10 +256,10 @@ def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
 def _changes_over_slopes(
     body: VoxelBody, mean: scipy.sparse.csr_array, length: float
 ) -> tuple[scipy.sparse.csr_array, ...]:
-    """For each axis, a matrix (P, P) that gives the change of a field over a length [m], or over the side of a brick if
-    the side is longer.
+    """Return for each axis a matrix (P, P) that gives the change of a nodal field over the width w. The width is the
+    given length [m], or the side of a brick if the side is longer.
 
-    The slope at a corner is the mean over the elements around it, weighted by volume.
+    The gradient at a corner is the mean over the elements around this corner, weighted by volume.
     """
     tets, volumes = np.asarray(body.whole.tetrahedra), np.asarray(body.whole.volumes)
     D = np.moveaxis(np.asarray(body.whole.shape_vectors), -1, 0)
@@ -267,27 +283,28 @@ def _reached(course: Course, z: np.ndarray, k: int) -> _Reached:
 def _evidences(
     course: Course, visited: list[tuple[_Reached, np.ndarray]], components: int
 ) -> tuple[float, list[float]]:
-    """The factor by which chi^2 is too large, and the evidence of each tried deviation."""
+    """Return the factor, at least 1, by which chi^2 is too large, and the evidence of each tried standard deviation."""
     excess = max(1.0, min(p.chi2 for p, _ in visited) / components)
     return excess, [_evidence(course, p, information, excess) for p, information in visited]
 
 
 def _hessian(course: Course, k: int, information: np.ndarray) -> np.ndarray:
-    """The Hessian (P + L, P + L) by whitened z, for `DEVIATIONS[k]`."""
+    """Return the Hessian (P + L, P + L) with respect to whitened z, for the standard deviation `DEVIATIONS[k]`."""
     scales = course.scales(k)
     return np.eye(len(information)) + scales[:, None] * information * scales
 
 
 def _evidence(course: Course, point: _Reached, information: np.ndarray, excess: float) -> float:
-    """Logarithm of the probability of the data for this standard deviation of the prior, up to a constant."""
+    """Return the logarithm of the evidence: the probability of the data for this standard deviation of the prior. A
+    constant is left out."""
     H = _hessian(course, point.k, information / excess)
     logarithm = 2 * float(np.sum(np.log(np.real(np.diagonal(np.linalg.cholesky(H))))))
     return -0.5 * (point.chi2 / excess + float(np.vdot(point.z, point.z).real)) - logarithm
 
 
 def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reached, np.ndarray]]:
-    """Try one deviation after another, until chi^2 is as low as the noise or the evidence falls. Each search begins at
-    the last field."""
+    """Try one standard deviation after another, until chi^2 is as low as for noise alone, or until the evidence falls.
+    Each search begins at the result of the search before. Return the end points and their `_information`."""
     components = course.m.balances * len(course.waves.omega)
     point, visited, history = begun
     information, fresh = (visited[-1][1], False) if visited else (_information(course, point), True)
@@ -323,29 +340,61 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
 
 
 def _next_start(course: Course, point: _Reached) -> _Reached:
-    """The same field, expressed with the next deviation."""
+    """Return the same field, expressed with the next standard deviation."""
     return _reached(course, point.z * course.scales(point.k) / course.scales(point.k + 1), point.k + 1)
 
 
-def _information(course: Course, point: _Reached) -> np.ndarray:
-    """J^H J by whitened z for a field of deviation 1, complex (P + L, P + L)."""
+def _noise_factors(course: Course, point: _Reached, y: np.ndarray, excess: float) -> np.ndarray:
+    """Return the factors (F,) by which the noise is larger than white noise with the given sd.
+
+    Correlated noise enlarges the errors of a map as it enlarges the error of one modulus of the whole organ. The
+    correlation is that of the residuals of the map: residuals of a uniform organ also contain its real changes of
+    modulus. `excess`: chi^2 divided by its expected value, at least 1.
+    """
+    root, w = np.sqrt(excess), course.waves
+    if course.voxel is None:
+        return np.full(len(w.omega), root)
+    found = []
+    for G, omega, d, sd, here in zip(course.moduli(y), w.omega, w.motion, w.sd, point.here, strict=True):
+        column = np.asarray(balance.by_modulus(course.m, here.motion) @ G)[:, None]
+        own = correlation(balance.rows_of_balance(course.m, G, omega), here, column, d, sd, course.voxel)
+        found.append(max(own.enlarged[0], root if own.seen else root * own.enlarged[0]))
+    return np.array(found)
+
+
+#: Factors of the frequencies count as equal if they differ by less than this.
+_SAME = 1.05
+
+
+def _with_factors(course: Course, point: _Reached, information: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Return `information` for noise that is larger by `factors` (F,)."""
+    if factors.max() < _SAME * factors.min():
+        return information / factors.max() ** 2
+    return _information(course, point, factors)
+
+
+def _information(course: Course, point: _Reached, factors: np.ndarray | None = None) -> np.ndarray:
+    """Return J^H J (P + L, P + L), complex, where J is the derivative with respect to whitened z for a standard
+    deviation of 1. `factors` (F,): the noise is larger than the given sd by these; default: 1."""
     y = course.natural(course.scales(point.k) * point.z)
-    H = np.zeros((len(y), len(y)), complex)
-    for J, b in zip(course.jacobians(y, point.here), point.here, strict=True):
-        every = J.tocsr()
+    H, factors = np.zeros((len(y), len(y)), complex), np.ones(len(point.here)) if factors is None else factors
+    for J, b, factor in zip(course.jacobians(y, point.here), point.here, factors, strict=True):
+        every = (J / factor).tocsr()
         for rows in course.m.parts:
             own = every[rows].tocsc()
             known = np.flatnonzero(np.diff(own.indptr))
-            X = b.of(rows).whitened(own[:, known], np.complex64)  # single precision is enough for directions of steps
+            X = b.of(rows).whitened(own[:, known], np.complex64)  # single precision is enough for the Hessian of a step
             H[np.ix_(known, known)] += X.conj().T @ X
-    # This is T^T H T, where T is the real matrix of `natural`.
+    # The result is T^T H T, where T is the real matrix of `natural`.
     half = course.whitened(H)
     return course.whitened(half.conj().T).conj().T
 
 
 def _newton_step(course: Course, point: _Reached, information: np.ndarray, excess: float) -> tuple[np.ndarray, float]:
-    """The Gauss-Newton step (P + L,), and its length in standard deviations. The noise counts as so large that chi^2 is
-    `excess` times its expected value.
+    """Return the Gauss-Newton step (P + L,) and its length in standard deviations of the map.
+
+    `excess` is chi^2 divided by its expected value. The standard deviations are those for a noise variance that is
+    larger by this factor.
     """
     scales = course.scales(point.k)
     y = course.natural(scales * point.z)
@@ -356,8 +405,8 @@ def _newton_step(course: Course, point: _Reached, information: np.ndarray, exces
 
 
 def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None:
-    """The point after the step, or after a part of the step, at which the cost is lower; None if it is not lower at any
-    of them."""
+    """Return the point after the step, or after a part of the step, with a lower cost. Return None if no such point is
+    found."""
     for part in (1.0, 0.5, 0.25, 0.1):
         new = _reached(course, point.z + part * step, point.k)
         if new.cost < point.cost:
@@ -368,8 +417,8 @@ def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None
 def _spread(
     course: Course, point: _Reached, information: np.ndarray, draws: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Standard deviations (F, P) without and with the data, and differences (D, F, P) of posterior samples from the
-    map."""
+    """Return the standard deviations (F, P) before and after the use of the data, and the differences (D, F, P) between
+    posterior samples and the map."""
     scales, n = course.scales(point.k)[:, None], len(point.z)
     L = np.linalg.cholesky(_hessian(course, point.k, information))
 
@@ -379,8 +428,8 @@ def _spread(
     before = course.natural(scales * np.eye(n))
 
     def each(y: np.ndarray) -> Iterator[np.ndarray]:
-        """c + l_f at the corners (P, n), one frequency at a time: all frequencies together would not fit into the
-        memory."""
+        """Yield c + l_f at the corners (P, n) for one frequency after another. All frequencies together would not fit
+        into the memory."""
         levels = y[course.corners :]
         return (y[: course.corners] + level for level in (levels if len(levels) else [0.0]))
 
@@ -394,7 +443,7 @@ _HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")
 
 
 def _write(file: Path | None, course: Course, begun: _Begun) -> None:
-    """Write the current point. The file is replaced as a whole, so it is never half written."""
+    """Write the state of the search. The file is replaced as a whole, so the file on disk is always complete."""
     if file is None:
         return
     with whole(file) as new, h5py.File(new, "w") as f:
@@ -405,8 +454,8 @@ def _write(file: Path | None, course: Course, begun: _Begun) -> None:
 
 
 def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
-    """Begin at a uniform organ, or at the point of an earlier run. The end points of its earlier deviations are
-    evaluated again."""
+    """Return the state at the beginning: a uniform organ, or the state of an earlier run in the file. The end points of
+    searches that this run has finished are evaluated again."""
     if file is None or not file.is_file():
         return _Begun(_reached(course, np.zeros(course.exponents[0].shape[1], complex), 0), [], [])
     try:
@@ -415,7 +464,7 @@ def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
             history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
             z, ends = f["z"][:], f["visited"][:]
     except (OSError, KeyError):
-        raise InputError(f"{file} is damaged, or of another program: leave out --resume") from None
+        raise InputError(f"{file} is damaged, or from another program: leave out --resume") from None
     visited = []
     for k, end in enumerate(ends):
         point = _reached(course, end, k)

@@ -1,4 +1,5 @@
-"""A body of quadratic elements whose nodes are voxels. So the measured displacements are displacements of nodes."""
+"""A body of quadratic elements. Each node is the centre of a voxel, so the measured displacements are displacements of
+nodes."""
 
 import itertools
 from typing import NamedTuple
@@ -11,45 +12,45 @@ from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 
 class VoxelBody(NamedTuple):
-    """Bricks of 3 x 3 x 3 voxels, each cut into six quadratic elements. Neighbouring bricks share their outer
-    voxels.
+    """Bricks of 3 x 3 x 3 voxels, each divided into six quadratic tetrahedra. Neighbouring bricks have common voxels on
+    their common face.
 
-    A large body has parts. Neighbouring parts have nodes of their own on the voxels that they share.
+    A large body is divided into parts. On a voxel that is common to two parts, each part has a separate node.
     """
 
     linear: TetMesh  # linear mesh of the corners
     mesh: TetMesh  # quadratic; the nodes of `linear` come first
     voxel: np.ndarray  # (V, 3) index of the voxel of each node
-    inner: np.ndarray  # (V,) bool: nodes with elements of their part on all sides, where forces must balance
+    inner: np.ndarray  # (V,) bool: nodes with elements of their part on all sides; here the forces must balance
     part: np.ndarray  # (V,) number of the part of each node
-    whole: TetMesh  # linear mesh of the same elements, without parts: for fields that are continuous in the body
-    corner: np.ndarray  # (P,) node of `whole` at each node of `linear`
+    whole: TetMesh  # linear mesh of the undivided body, for fields that are continuous between the parts
+    corner: np.ndarray  # (P,) node of `whole` for each node of `linear`
 
 
 def voxel_body(
     mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None = None, side: int | None = None
 ) -> VoxelBody:
-    """The body of all bricks whose 27 voxels are in the mask.
+    """Return the body of all bricks with 27 voxels in the mask.
 
     Args:
         mask: (nx, ny, nz) bool.
         spacing: spacing of the voxels (3,) [m].
-        origin: centre of the first voxel (3,) [m]; None: 0.
-        side: most bricks along the side of a part; None: one part.
+        origin: centre of the first voxel (3,) [m]. None means 0.
+        side: maximum number of bricks along the side of a part. If it is None, the body has one part.
 
     Raises:
-        InputError: the mask has no room for a brick, or for a node with bricks on all sides.
+        InputError: no brick fits into the mask, or no node has bricks on all sides.
     """
     first = _corner(mask)
     cells = tuple(int(n) for n in (np.array(mask.shape) - 1 - first) // 2)
     if min(cells) < 1:
         raise InputError(
-            f"the mask reaches over {' x '.join(map(str, np.array(mask.shape) - first))} voxels: waves need at least "
-            "3 along every axis, and better 5 or more; measure more slices"
+            f"the mask covers only {' x '.join(map(str, np.array(mask.shape) - first))} voxels: waves need at least "
+            "3 along every axis, and 5 or more are better; measure more slices"
         )
     kept = _whole_bricks(mask[tuple(slice(f, None) for f in first)], cells)
     if not _surrounded(kept).any():
-        raise InputError("no voxel has two more voxels of the mask on every side: give a larger mask")
+        raise InputError("no voxel has two voxels of the mask on every side: give a larger mask")
     parts = _part_of_each_brick(kept, side)
     used, tets = np.unique(_sixths(np.argwhere(kept), kept.shape), return_inverse=True)
     at = 2 * np.stack(np.unravel_index(used, tuple(n + 1 for n in kept.shape)), axis=1)
@@ -70,7 +71,8 @@ def voxel_body(
 
 
 def _part_of_each_brick(kept: np.ndarray, side: int | None) -> np.ndarray:
-    """The part of every brick, -1 where no brick is kept. Parts along an axis are about equally long."""
+    """Return the number of the part of every brick, -1 for bricks that are not kept. Parts along an axis are about
+    equally long."""
     parts = np.zeros(kept.shape, int)
     for axis, n in enumerate(kept.shape):
         number = 1 if side is None else -(-n // side)
@@ -82,14 +84,15 @@ def _part_of_each_brick(kept: np.ndarray, side: int | None) -> np.ndarray:
 
 
 def number_of_bricks(mask: np.ndarray) -> int:
-    """How many bricks `voxel_body` makes of a mask (nx, ny, nz)."""
+    """Return the number of bricks in the body that `voxel_body` makes from a mask (nx, ny, nz)."""
     first = _corner(mask)
     cells = tuple(int(n) for n in (np.array(mask.shape) - 1 - first) // 2)
     return int(_whole_bricks(mask[tuple(slice(f, None) for f in first)], cells).sum()) if min(cells) > 0 else 0
 
 
 def _sixths(brick: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
-    """Corners (6 n, 4) of the elements of bricks (n, 3). Along each axis, every second brick is a mirror image.
+    """Return the corners (6 n, 4) of the elements of n bricks (n, 3). Along each axis, every second brick is a mirror
+    image of the brick before.
 
     So the diagonals have no common direction, and waves in all directions have about the same speed.
     """
@@ -105,14 +108,14 @@ def _sixths(brick: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
 
 
 def _corner(mask: np.ndarray) -> np.ndarray:
-    """First voxel (3,) of the smallest box around the mask."""
+    """Return the first voxel (3,) of the smallest box around the mask."""
     if not mask.any():
         raise InputError("the mask contains no voxel: give a mask that is true within the organ")
     return np.array([np.flatnonzero(mask.any(axis=tuple(b for b in range(3) if b != a)))[0] for a in range(3)])
 
 
 def _whole_bricks(mask: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
-    """Bricks (cells) with every voxel in the mask."""
+    """Return for each brick (array of shape `cells`) whether all 27 voxels are in the mask."""
     kept = np.ones(cells, bool)
     for offset in np.ndindex(3, 3, 3):
         kept &= mask[_every_second(offset, cells)]
@@ -120,7 +123,8 @@ def _whole_bricks(mask: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
 
 
 def _surrounded(kept: np.ndarray) -> np.ndarray:
-    """For each voxel (2 cells + 1): whether all its bricks are kept and it is not at the end of the grid."""
+    """Return for each voxel of the grid whether all bricks at this voxel are kept and the voxel is not at the end of
+    the grid. The grid has twice as many voxels as bricks along each axis, plus one."""
     inside = np.ones(tuple(2 * n + 1 for n in kept.shape), bool)
     for offset in np.ndindex(3, 3, 3):
         inside[_every_second(offset, kept.shape)] &= kept
@@ -134,8 +138,8 @@ def _every_second(offset: tuple[int, ...], cells: tuple[int, ...]) -> tuple[slic
 
 
 def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
-    """Values (V,) at all nodes of a field that is linear in the elements, from its values at the corners
-    (the nodes of `body.whole`)."""
+    """Return the values (V,) at all nodes for a field that is linear in each element. `corners`: values at the nodes of
+    `body.whole`."""
     from liverjax.mesh.adjacency import PAIRS
 
     values = np.empty(body.mesh.number_of_nodes, corners.dtype)

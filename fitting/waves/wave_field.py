@@ -1,4 +1,4 @@
-"""Complex displacements of a harmonic motion on voxels, from files."""
+"""Read complex displacements of a harmonic motion on voxels from files."""
 
 import os
 from pathlib import Path
@@ -16,15 +16,15 @@ UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "rad": 1.0}
 
 
 class WaveField(NamedTuple):
-    """Complex displacements on the voxels of a box: u(t) is the real part of U exp(i omega t)."""
+    """Complex displacements U on the voxels of a box. The displacement u(t) is the real part of U exp(i omega t)."""
 
     frequencies: np.ndarray  # (F,) [Hz], ascending
     displacement: np.ndarray  # (F, nx, ny, nz, 3) complex [m]; NaN where it is not measured
     spacing: np.ndarray  # (3,) [m]
     origin: np.ndarray  # (3,) [m], centre of the first voxel
     mask: np.ndarray  # (nx, ny, nz) bool: voxels of the organ
-    labels: np.ndarray | None  # (nx, ny, nz) whole numbers: the region of each voxel; None: not given
-    noise: np.ndarray  # (F,) [m] standard deviation of real and of imaginary part of one component
+    labels: np.ndarray | None  # (nx, ny, nz) whole numbers: the region of each voxel; None if no labels are given
+    noise: np.ndarray  # (F,) [m] standard deviation of the noise in real and imaginary part of one component
     source: str = ""
     notes: tuple[str, ...] = ()
 
@@ -37,18 +37,18 @@ def read_waves(
     unit: str | None = None,
     spacing: list[float] | None = None,
 ) -> WaveField:
-    """Read .npz, .npy, HDF5, CSV or NIfTI (`formats`).
+    """Read a wave field from a file (.npz, .npy, HDF5, MATLAB, CSV or NIfTI; see `formats`).
 
     Args:
         path: file of the displacements.
-        frequencies: [Hz], if the file does not contain them.
+        frequencies: frequencies [Hz], if the file does not contain them.
         mask, labels: files with whole numbers on the same voxels, if the file of the displacements does not contain
             them.
-        unit: unit of the displacements, one of `UNITS`. Default: the unit in the file, or else m.
-        spacing: spacing of the voxels (3,) [m], if the file does not contain it.
+        unit: unit of the displacements, one of `UNITS`. Default: the unit in the file, or m if the file has no unit.
+        spacing: spacing of the voxels (3,) [m], if the file does not contain the spacing or states a wrong one.
 
     Raises:
-        InputError: one sentence with the file, the field, the value and the remedy.
+        InputError: the file cannot be used; the message names the file, the field, the value and the remedy.
     """
     name, found = str(path), formats.arrays(Path(path))
     more = {"mask": mask, "labels": labels}
@@ -63,7 +63,7 @@ def read_waves(
         phases = _instants(name, "wrapped", found["wrapped"])
         only = _whole_numbers(name, "mask", found.get("mask"), phases.shape[2:5])
         if only is not None:
-            phases = np.where((only != 0)[..., None], phases, np.nan)  # phases of air are noise
+            phases = np.where((only != 0)[..., None], phases, np.nan)  # in air, the measured phase is noise
         found["phases"], jumps = unwrapped(name, phases)
         found["unit"] = "rad"
     U, notes = _motion(name, found)
@@ -79,11 +79,11 @@ def read_waves(
     chosen = _whole_numbers(name, "mask", found.get("mask"), shape)
     inside = measured if chosen is None else measured & (chosen != 0)
     if not inside.any():
-        raise InputError(f"{name}: no voxel of the mask has a displacement: give the mask of these voxels")
+        raise InputError(f"{name}: no voxel of the mask has a displacement: give a mask of voxels with displacements")
     now_and_then = inside & ~np.isfinite(U).any(axis=4).all(axis=0)
     if now_and_then.any() and np.isfinite(U).any(axis=(1, 2, 3, 4)).all():
         notes.append(
-            f"{now_and_then.sum()} of {inside.sum()} voxels are not measured at every frequency, and not used at any"
+            f"{now_and_then.sum()} of {inside.sum()} voxels are not measured at every frequency, so they are not used"
         )
     regions = _whole_numbers(name, "labels", found.get("labels"), shape)
     order = np.argsort(hertz)
@@ -92,64 +92,66 @@ def read_waves(
 
 
 def _of_another_spacing(name: str, found: Content, step: np.ndarray) -> list[str]:
-    """A note if the file states another spacing than the one that is used [m]."""
+    """Return a note if the spacing in the file differs from the spacing [m] that is used."""
     if found.get("spacing") is None or formats.CONFLICT in found:
         return []
     stated = _lengths(name, "spacing", found["spacing"], "its spacing")
     if np.allclose(stated, step, rtol=1e-3):
         return []
     return [
-        f"the file states a spacing of {stated.tolist()} m, and --spacing {step.tolist()} m is used: moduli grow with "
-        "its square"
+        f"the file states a spacing of {stated.tolist()} m, but --spacing {step.tolist()} m is used: the moduli are "
+        "proportional to the square of the spacing"
     ]
 
 
 def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object, spacing_given: bool) -> np.ndarray:
-    """Read the mask or the labels from a separate file. It must have the same voxels as the waves. `place`:
-    `formats.PLACE` of the waves, or None.
+    """Read the mask or the labels from a separate file, which must have the same voxels as the waves.
+
+    `place`: position of the voxels of the waves in space, as in `formats.PLACE`; None if it is unknown.
     """
     values, own, elsewhere = formats.single(file, key, spacing_given)
     if elsewhere is not None and place is not None:
         apart = np.abs(np.asarray(elsewhere) - np.asarray(place)).max()
         if apart > SAME_PLACE * float(np.min(spacing)):
             raise InputError(
-                f"{file}: its voxels lie elsewhere than those of the waves, or its axes run the other way: resample "
-                f"{key} to the voxels of the waves"
+                f"{file}: the voxels are not at the positions of the voxels of the waves, or the axes have other "
+                f"directions: resample {key} to the voxels of the waves"
             )
     if own is not None:
         size = _lengths(str(file), "spacing", own, "its spacing")
         if not np.allclose(size, spacing, rtol=0.01):
             raise InputError(
-                f"{file}: its voxels are {size.tolist()} m and those of the waves {spacing.tolist()} m: give {key} on "
-                "the voxels of the waves"
+                f"{file}: the voxel size is {size.tolist()} m, but the waves have voxels of {spacing.tolist()} m: give "
+                f"{key} on the voxels of the waves"
             )
     return values
 
 
-#: Two positions count as equal if they differ by less than this (in voxels).
+#: Two positions are regarded as equal if they differ by less than this (in voxels).
 SAME_PLACE = 0.1
-#: Components of exactly 0 are reported if they are fewer than this part of the voxels.
+#: Components that are exactly 0 are reported if this happens in less than this fraction of the voxels.
 FEW = 0.2
 
 
 def _leave_out_rest(U: np.ndarray) -> list[str]:
-    """Set voxels that do not move to NaN, in place. Many programs write 0 where they did not measure. Return notes."""
+    """Replace the displacements U of voxels that do not move by NaN, and return notes. Many programs write 0 where
+    they did not measure."""
     notes, nothing = [], (U == 0) | np.isnan(U)
     still = np.all(nothing, axis=(0, 4))
     if np.any(still & np.any(U == 0, axis=(0, 4))):
         U[:, still] = np.nan
-        notes.append(f"{still.sum()} voxels that do not move at all count as not measured")
+        notes.append(f"{still.sum()} voxels do not move at all: they are treated as not measured")
     for f, u in enumerate(U):
         rests = np.all(u == 0, axis=-1)
         if rests.any() and np.any(np.isfinite(u) & (u != 0)):
             u[rests] = np.nan
             notes.append(
-                f"{rests.sum()} voxels do not move in field {f + 1}, but in others: they count as not measured at all "
-                "frequencies"
+                f"{rests.sum()} voxels do not move in field {f + 1} but move in other fields: they are treated as not "
+                "measured at all frequencies"
             )
         several = np.isfinite(u) & np.any(np.isfinite(u) & (u != 0), axis=-1, keepdims=True)
         zeros = (u == 0) & several
-        zeros &= zeros.sum(axis=(0, 1, 2)) < FEW * several.sum(axis=(0, 1, 2))  # more: a plane of symmetry
+        zeros &= zeros.sum(axis=(0, 1, 2)) < FEW * several.sum(axis=(0, 1, 2))  # many zeros: a plane of symmetry
         if zeros.any():
             notes.append(
                 f"field {f + 1} has {zeros.sum()} components that are exactly 0 in voxels that move: write NaN where a "
@@ -158,25 +160,26 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
     # A wave may move in one direction only, so a component that is zero everywhere is kept.
     resting = np.all(nothing, axis=(0, 1, 2, 3)) & np.any(U == 0, axis=(0, 1, 2, 3))
     for axis in np.array(list("xyz"))[resting]:
-        notes.append(f"component {axis} is zero everywhere: write NaN where it was not measured")
+        notes.append(f"component {axis} is zero everywhere: write NaN if this component was not measured")
     return notes
 
 
 def with_noise(field: WaveField, noise: float | None) -> WaveField:
-    """The field with this noise [m]. If it is None, the field keeps its noise, which must be above 0."""
+    """Return the field with this noise [m]. If `noise` is None, the estimated noise of the field is kept, which must be
+    above 0."""
     if noise is not None:
         return field._replace(noise=np.full(len(field.frequencies), noise))
     unknown = ~(field.noise > 0)
     if unknown.any():
         hertz = ", ".join(f"{f:g}" for f in field.frequencies[unknown])
         blank = not np.isfinite(field.displacement[unknown]).any()
-        remedy = "leave this field out: it holds no number" if blank else "give --noise, in metres"
-        raise InputError(f"{field.source}: its noise at {hertz} Hz cannot be estimated from the data: {remedy}")
+        remedy = "remove this field, which contains no numbers" if blank else "give --noise, in metres"
+        raise InputError(f"{field.source}: the noise at {hertz} Hz cannot be estimated from the data: {remedy}")
     return field
 
 
 def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
-    """Complex displacements (F, nx, ny, nz, 3) in the unit of the file, and notes."""
+    """Return the complex displacements (F, nx, ny, nz, 3) in the unit of the file, and notes."""
     told: list[str] = []
     if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, equally spaced
         u = _instants(name, "phases", found["phases"])
@@ -186,16 +189,17 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
     elif found.get("real") is not None and found.get("imag") is not None:
         parts = [_array_of_numbers(name, key, found[key]) for key in ("real", "imag")]
         if parts[0].shape != parts[1].shape:
-            raise InputError(f"{name}: real has shape {parts[0].shape} and imag {parts[1].shape}: give equal ones")
+            raise InputError(f"{name}: real has shape {parts[0].shape}, but imag has {parts[1].shape}: use one shape")
         U = parts[0] + 1j * parts[1]
     else:
         if _is_image(name):
-            raise InputError(f"{name}: its numbers are real, and taken for labels: give the waves as {_layout(name)}")
+            raise InputError(f"{name}: the numbers are real, so they are read as labels: give waves as {_layout(name)}")
         known = ", ".join(sorted(k for k, v in found.items() if v is not None and k[0] != "(")) or "nothing"
         if "labels" in found and "displacement" not in found:
-            known += " (real numbers are taken for labels)"
+            known += " (real numbers are read as labels)"
         raise InputError(
-            f"{name}: it holds {known}: store the waves as displacement (complex), or real and imag, or phases"
+            f"{name}: the file contains {known}, but no waves: store the waves as displacement (complex), as real and "
+            "imag, or as phases"
         )
     shape = U.shape
     if U.ndim == 4:
@@ -203,7 +207,7 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
     if U.ndim != 5 or U.shape[-1] not in (1, 3):
         raise InputError(f"{name}: displacement has shape {shape}: give {_layout(name)}")
     if not np.any(np.isfinite(U) & (U != 0)):
-        raise InputError(f"{name}: displacement is zero or not a number everywhere: look at the file")
+        raise InputError(f"{name}: displacement is zero or not a number everywhere: check the file")
     if not np.iscomplexobj(U) or not np.any(np.isfinite(U) & (U.imag != 0)):
         raise InputError(
             f"{name}: displacement has no imaginary part: give complex amplitudes, or phases over a period"
@@ -220,31 +224,31 @@ def _is_image(name: str) -> bool:
 
 
 def _layout(name: str) -> str:
-    """The array layout of the waves in a file, for messages."""
+    """Return the array layout of the waves in a file, for messages."""
     if _is_image(name):
-        return "complex numbers (nx, ny, nz, 3), with several frequencies (nx, ny, nz, F, 3)"
+        return "complex numbers (nx, ny, nz, 3), or (nx, ny, nz, F, 3) for several frequencies"
     return "(F, nx, ny, nz, 3), frequencies first, components last"
 
 
 def _instants(name: str, field: str, values: Numbers) -> np.ndarray:
-    """Motion (F, T, nx, ny, nz, 3) at T instants of one period."""
+    """Return the checked motion (F, T, nx, ny, nz, 3) at T instants of one period."""
     u = _array_of_numbers(name, field, values)
     if u.ndim not in (5, 6) or u.shape[-5] < 3 or u.shape[-1] not in (1, 3) or np.iscomplexobj(u):
         raise InputError(
-            f"{name}: {field} has shape {u.shape}: give real (F, T, nx, ny, nz, 3) with 3 instants or more"
+            f"{name}: {field} has shape {u.shape}: give real numbers (F, T, nx, ny, nz, 3) with 3 instants or more"
         )
     return u if u.ndim == 6 else u[None]
 
 
-#: If the instants miss a motion of a period by this factor less when the last instant repeats the first, a note is
-#: given.
+#: A note is given if T instants fit a period of T - 1 steps much better than a period of T steps. "Much better" means
+#: that the residual is smaller by this factor.
 _REPEATED = 0.5
 
 
 def _of_a_last_instant(u: np.ndarray) -> list[str]:
-    """A note if the last of the instants u (F, T, nx, ny, nz, 3) seems to be the end of the period."""
+    """Return a note if the last of the T instants u (F, T, nx, ny, nz, 3) seems to be the end of the period."""
     T = u.shape[1]
-    if T < 5:  # with 4 instants, a mean and one harmonic may pass near every value
+    if T < 5:  # with 4 instants, a mean and one harmonic may fit all values by chance
         return []
     values = u.reshape(len(u), T, -1)
     values = np.concatenate([one[:, np.isfinite(one).all(axis=0)] for one in values], axis=1)
@@ -257,8 +261,8 @@ def _of_a_last_instant(u: np.ndarray) -> list[str]:
     if not missed(T - 1) < _REPEATED * missed(T):
         return []
     return [
-        f"the {T} instants fit a period of {T - 1} steps better: if the last one is the end of the period, it repeats "
-        "the first one, so leave it out"
+        f"the {T} instants fit a period of {T - 1} steps better. If the last instant is the end of the period, it "
+        "repeats the first instant: leave the last instant out"
     ]
 
 
@@ -270,11 +274,11 @@ def _array_of_numbers(name: str, field: str, values: Numbers) -> np.ndarray:
 
 
 def _plain(name: str, field: str, values: object) -> np.ndarray:
-    """Real numbers as a flat array."""
+    """Return real numbers as a flat array."""
     try:
         return np.asarray(values, float).ravel()
     except (TypeError, ValueError):
-        raise InputError(f"{name}: {field} holds {str(values)[:40]!r}, no numbers: correct it") from None
+        raise InputError(f"{name}: {field} = {str(values)[:40]!r} does not contain numbers: correct it") from None
 
 
 def _factor(name: str, unit: str) -> float:
@@ -285,29 +289,31 @@ def _factor(name: str, unit: str) -> float:
 
 def _hertz(name: str, asked: list[float] | None, held: Any, number: int) -> np.ndarray:
     if asked is None and held is None:
-        raise InputError(f"{name}: has no frequencies: give --frequencies with {number} in Hz, e.g. --frequencies 60")
+        raise InputError(f"{name}: no frequencies in the file: give {number} in Hz, e.g. --frequencies 60")
     hertz = _plain(name, "frequencies", held if asked is None else asked)
     own = hertz if held is None else _plain(name, "frequencies", held)
     if asked is not None and (len(own) != len(hertz) or not np.allclose(hertz, own)):
-        raise InputError(f"{name}: has the frequencies {np.ravel(held).tolist()} Hz: leave out --frequencies")
+        raise InputError(f"{name}: the file states {np.ravel(held).tolist()} Hz: leave out --frequencies")
     if len(hertz) != number:
-        raise InputError(f"{name}: {len(hertz)} frequencies for {number} fields of displacements: give {number}")
+        raise InputError(
+            f"{name}: {len(hertz)} frequencies for {number} displacement fields: give {number} frequencies"
+        )
     if not np.all(np.isfinite(hertz) & (hertz > 0)):
         raise InputError(f"{name}: frequencies {hertz.tolist()} must be above 0 Hz: correct them")
     if len(np.unique(hertz)) < number:
-        raise InputError(f"{name}: frequencies {hertz.tolist()} are not all different: give each field its own")
+        raise InputError(f"{name}: frequencies {hertz.tolist()} are not all different: give one for each field")
     return hertz
 
 
 def _lengths(name: str, field: str, given: object, option: str) -> np.ndarray:
     if given is None:
-        raise InputError(f"{name}: has no {field}: give {option} with three lengths in metres, e.g. 0.002 0.002 0.002")
+        raise InputError(f"{name}: no {field} in the file: give {option} in metres, e.g. 0.002 0.002 0.002")
     values = _plain(name, field, given)
     values = np.repeat(values, 3) if len(values) == 1 else values
     if len(values) != 3 or not np.all(np.isfinite(values) & (values > 0)):
         raise InputError(f"{name}: {field} {values.tolist()} must be three lengths above 0 m: correct them")
     if np.any(values > 0.1):
-        raise InputError(f"{name}: {field} {values.tolist()} m is larger than an organ's voxel: give metres, not mm")
+        raise InputError(f"{name}: {field} {values.tolist()} m is too large for a voxel: give metres, not mm")
     return values
 
 
@@ -316,7 +322,7 @@ def _whole_numbers(name: str, field: str, values: object, shape: tuple[int, ...]
         return None
     a = np.asarray(values)
     if a.shape != shape:
-        raise InputError(f"{name}: {field} has shape {a.shape} and the voxels {shape}: give it on the same voxels")
+        raise InputError(f"{name}: {field} has shape {a.shape}, but the waves have {shape}: use the same voxels")
     if a.dtype.kind not in "biuf" or not np.all(np.isfinite(a)) or np.any(a != np.rint(a)):
         raise InputError(f"{name}: {field} must be whole numbers: correct it")
     return a.astype(int)
@@ -327,11 +333,12 @@ _FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 
 
 def noise_of(field: WaveField) -> np.ndarray:
-    """Standard deviation (F,) [m] of the noise in real and imaginary part of one component, estimated from the data.
+    """Estimate the standard deviation (F,) [m] of the noise in real and imaginary part of one component.
 
-    It is computed from fourth differences along the axis on which they are smallest. A few bad voxels do not change
-    their median. A smooth wave adds little: (k h)^4 / 8 of its motion, which is 0.12 % at 20 voxels per wavelength and
-    4 % at 8. The result is NaN if the mask has too few rows of five voxels.
+    The estimate is the scaled median of fourth differences along the axis with the smallest differences. A few bad
+    voxels do not change a median. A smooth wave contributes only (k h)^4 / 8 of its amplitude, with the wave number k
+    and the voxel spacing h: 0.12 % at 20 voxels per wavelength and 4 % at 8. The result is NaN if the mask has too few
+    rows of five voxels.
     """
     out = np.full(len(field.frequencies), np.nan)
     for f, U in enumerate(field.displacement):
@@ -347,14 +354,14 @@ def noise_of(field: WaveField) -> np.ndarray:
             if d.size >= 30:
                 parts = np.abs(np.concatenate([d.real, d.imag]))
                 own = np.median(parts) / 0.6745 / np.sqrt(np.sum(_FOURTH**2))
-                best = own if np.isnan(best) else min(best, own)  # the wave adds least along this axis
+                best = own if np.isnan(best) else min(best, own)  # the wave contributes least along this axis
         out[f] = best
     return out
 
 
 def coarsened(field: WaveField, stride: int) -> WaveField:
-    """The field of means over stride^3 voxels that are all in the mask. In a uniform organ, these means are a wave of
-    the same wavelength."""
+    """Return the field of means over blocks of stride^3 voxels. A block is in the new mask if all its voxels are in the
+    mask. In a uniform organ, the means form a wave of the same wavelength."""
     if stride == 1:
         return field
     n = np.array(field.mask.shape) // stride
@@ -378,8 +385,8 @@ def coarsened(field: WaveField, stride: int) -> WaveField:
 
 
 def _most_frequent(labels: np.ndarray, stride: int, blocks: tuple[int, ...]) -> np.ndarray:
-    """The most frequent label in each block. If two labels are equally frequent, the lower and the higher one are used
-    in turn."""
+    """Return the most frequent label in each block. If two labels are equally frequent, neighbouring blocks get the
+    lower and the higher label in turn."""
     known = np.unique(labels)
     turn = np.where(np.indices(blocks[::2]).sum(axis=0) % 2, 1.0, -1.0)
     counts = [

@@ -1,1 +1,1 @@
-"""Command lines of the simulator: one file for each sub-command, with `add` (its arguments) and `run`."""
+"""Command lines of the simulator. Each sub-command has one file with the functions `add` (arguments) and `run`."""

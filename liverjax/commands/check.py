@@ -1,4 +1,4 @@
-"""``liverjax check NAME | FILE.py:LAW``: the gradient check of a material law."""
+"""``liverjax check NAME | FILE.py:LAW``: check the derivatives of a material law."""
 
 import argparse
 import sys
@@ -8,15 +8,17 @@ from liverjax.core.files import writable
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
-    """Declare the command."""
-    command = parsers.add_parser("check", help="gradient-check a material law", description="Gradient-check a law.")
+    """Add the command to the parser."""
+    command = parsers.add_parser(
+        "check", help="check the derivatives of a material law", description="Gradient-check a law."
+    )
     command.add_argument("law", metavar="NAME|FILE.py:LAW", help=LAW)
     add_out(command)
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the table of a law's gradient check and draw its figure. Return 1 if a row failed."""
+    """Print the table of a law's gradient check and draw its figure. Return 1 if a row of the table failed."""
     import jax
 
     from liverjax.laws import figures, gradient_check

@@ -1,11 +1,11 @@
-"""``liverjax design PARAMETERS.csv NAME=LOW:HIGH …``: a table of parameters for a sweep."""
+"""``liverjax design PARAMETERS.csv NAME=LOW:HIGH …``: write a table of parameters for a sweep."""
 
 import argparse
 from pathlib import Path
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
-    """Declare the command."""
+    """Add the command to the parser."""
     command = parsers.add_parser("design", help="write a table of parameters", description="Write a table for a sweep.")
     command.add_argument("table", type=Path, metavar="PARAMETERS.csv")
     command.add_argument("range", nargs="+", metavar="NAME=LOW:HIGH", help="e.g. law.mu=500:1000")
@@ -18,7 +18,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the table."""
+    """Write the table of parameters and return 0."""
     from liverjax.jobs import design
 
     ranges = design.read_ranges(options.range)

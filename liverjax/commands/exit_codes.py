@@ -1,4 +1,4 @@
-"""The end of a command: its exit code, and one sentence on the error that stopped it."""
+"""Run a command and end it with an exit code. An error is reported in one sentence."""
 
 import argparse
 import errno
@@ -18,21 +18,22 @@ FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 
 def show_unknown_letters() -> None:
-    """Show "?" for characters that a terminal does not know, e.g. "±". Call this before the command line is parsed."""
+    """Show "?" for characters that the terminal cannot display, e.g. "±". Call this before the command line is
+    parsed."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
 
 
 def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace, resumable: bool = False) -> int:
-    """Run a command and return its exit code: 2 for unusable input and 130 for Ctrl-C.
+    """Run a command and return its exit code, or 2 for unusable input and 130 for Ctrl-C.
 
-    Compiled programs are kept on disk for the next command (see `liverjax.core.program_cache`). If the command has
-    `optional_files`, a note lists the ones that an earlier run has left in the folder.
+    Compiled programs are kept on disk for the next command (see `liverjax.core.program_cache`). If `options` has
+    `optional_files`, a note lists those files in the folder of results that come from an earlier run.
 
     Args:
         run: runs the command with its options and returns 0 or 1.
         options: the parsed command line.
-        resumable: whether a stopped run can continue with --resume.
+        resumable: whether an interrupted run can be continued with --resume.
     """
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
@@ -62,7 +63,7 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
 
 
 def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
-    """Print a note on optional files in the folder of results that are older than the `begin` of this run."""
+    """Print a note about optional files in the folder of results that are older than the `begin` of this run."""
     names = [name for name in getattr(options, "optional_files", ()) if _older(options.out / name, begin)]
     if names:
         verb = "is" if len(names) == 1 else "are"

@@ -1,12 +1,15 @@
-"""``liverjax fit …``: the commands of the package `fitting`, called in the same way as the other commands."""
+"""``liverjax fit …``: call the commands of the package `fitting` in the same way as the other commands."""
 
 import argparse
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
-    """Declare the command for --help; `fitting` declares and reads its arguments."""
+    """Add the command to --help. The arguments of the command are defined and read by `fitting`."""
     parsers.add_parser(
-        "fit", help="parameters from sweeps, tests in time, indentation, curves, displacements or waves", add_help=False
+        "fit",
+        help="identify parameters from frequency sweeps, relaxation and creep tests, indentation, curves, "
+        "displacements or waves",
+        add_help=False,
     )
 
 
@@ -15,9 +18,9 @@ def run(arguments: list[str], prog: str) -> int:
 
     Args:
         arguments: the arguments after `fit`.
-        prog: the command as the user called it; --help shows it.
+        prog: the command as the user typed it, which --help shows.
     """
-    # Imported here only: `fitting` uses `liverjax`, and nothing else in `liverjax` may import `fitting`.
+    # The only import of `fitting` in `liverjax`: `fitting` uses `liverjax`, not the other way round.
     from fitting.__main__ import main
 
     return main(arguments, prog)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
-    """Solve the scene's harmonic motion and write it. Return 1 if a frequency has no solution."""
+    """Compute the scene's harmonic motion and write the results. Return 1 if a frequency has no solution."""
     from liverjax.core.versions import versions
     from liverjax.jobs import waves
 
@@ -43,7 +43,7 @@ def _refuse_options(options: argparse.Namespace) -> None:
     given = {"fields": options.fields, "reactions": options.reactions, "png": options.png, "resume": options.resume}
     for name, value in given.items():
         if value:
-            raise InputError(f"--{name} is for runs in time, [solve] kind is 'harmonic': leave it out")
+            raise InputError(f"--{name} cannot be used with [solve] kind = 'harmonic': leave it out")
 
 
 def _tell(scene: "Scene", ran: "Waves") -> None:
@@ -53,14 +53,14 @@ def _tell(scene: "Scene", ran: "Waves") -> None:
     parts = None if ran.mesh_error is None else missing_parts(scene, ran)
     print(
         f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {len(u)} frequencies in "
-        f"{ran.seconds:.3g} s with compiling"
+        f"{ran.seconds:.3g} s including compilation"
     )
     for k, frequency in enumerate(np.asarray(ran.found.frequencies_Hz)):
         line = f"{frequency:g} Hz: at most {1e3 * u[k].max():.4g} mm, residual {float(ran.found.residual[k]):.1e}"
         if parts is not None:
             motion, force = (float(part[k]) for part in parts)
-            line += ", nothing moves" if np.isnan(motion) else f", the mesh leaves out about {motion:.2g} of the motion"
-            line += "" if np.isnan(force) else f" and {force:.2g} of the forces that hold it"
+            line += ", nothing moves" if np.isnan(motion) else f", mesh error about {motion:.2g} of the motion"
+            line += "" if np.isnan(force) else f" and {force:.2g} of the reaction forces"
         print(line)
     for sentence in ran.cautions:
         print(f"caution: {sentence}")

@@ -1,4 +1,4 @@
-"""``liverjax laws``: every law with its energy, parameters, units and bounds."""
+"""``liverjax laws``: print every law with its energy, parameters, units and bounds."""
 
 import argparse
 import dataclasses
@@ -10,14 +10,14 @@ from liverjax.laws.volumetric import VOLUMETRIC
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
-    """Declare the command."""
+    """Add the command to the parser."""
     parsers.add_parser("laws", help="the laws, their parameters, units and bounds").set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Print every law."""
-    print(f"every law with bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
-    print("every law of I1, I2 and J: continued_below = 0.1, finite energy below that J (default off)")
+    print(f"option of every law with bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
+    print("option of every law of I1, I2 and J: continued_below = 0.1, a finite energy below this J (default off)")
     for name, cls in laws.LAWS.items():
         energy = (cls.__doc__ or name).split("\n\n")[0].splitlines()
         print("\n".join([name, *(f"    {line.strip()}" for line in energy)]))

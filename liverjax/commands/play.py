@@ -1,4 +1,4 @@
-"""``liverjax play SCENE.toml``: show the body in a browser, where the mouse can pull it while it moves."""
+"""``liverjax play SCENE.toml``: show the moving body in a browser, where the user can pull it with the mouse."""
 
 import argparse
 import time
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
-    """Declare the command."""
+    """Add the command to the parser."""
     command = parsers.add_parser(
         "play",
-        help="pull a body by the mouse in a browser",
-        description="Serve a page on this machine that shows the body of a scene, moves it a step per picture, and "
-        "lets the mouse pull at it.",
+        help="pull a body with the mouse in a browser",
+        description="Serve a page on this machine that shows the body of a scene. One step is computed per picture, "
+        "and the mouse can pull the body.",
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
     command.add_argument(
@@ -25,15 +25,15 @@ def add(parsers: argparse._SubParsersAction) -> None:
     )
     command.add_argument("--no-browser", action="store_true", help="do not open the page")
     command.add_argument(
-        "--steps", type=int, metavar="N", help="no page: pull at the body for N steps and print steps per second"
+        "--steps", type=int, metavar="N", help="without a page, pull the body for N steps and print steps per second"
     )
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run until Ctrl-C, or for a number of steps."""
+    """Serve the page until Ctrl-C, or run a number of steps without a page."""
     if not 0 <= options.port < 65536:
-        raise InputError(f"--port {options.port} is no port: give 0 to 65535")
+        raise InputError(f"--port {options.port} is not a port: give 0 to 65535")
     if options.steps is not None and options.steps < 1:
         raise InputError(f"--steps {options.steps} must be above 0: give e.g. 100")
     from liverjax.play import pulling
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         server = PlayServer(playing, options.port)
     except OSError as error:
-        raise InputError(f"--port {options.port}: {error.strerror}: give another") from None
+        raise InputError(f"--port {options.port}: {error.strerror}: give another port") from None
     print(f"{server.address}  (Ctrl-C ends)", flush=True)
     if not options.no_browser:
         import webbrowser
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _without_page(playing: "Playing", steps: int) -> int:
-    """Pull the node that is farthest from the held nodes by a tenth of the size. Return 1 if a step failed."""
+    """Pull the node that is farthest from the fixed nodes by a tenth of the body's size. Return 1 if a step failed."""
     import numpy as np
 
     from liverjax.core import status
@@ -71,9 +71,7 @@ def _without_page(playing: "Playing", steps: int) -> int:
     centre = X[np.concatenate(held)].mean(axis=0) if held else X.mean(axis=0)
     nodes = np.setdiff1d(playing.nodes, np.concatenate(held)) if held else playing.nodes
     if not len(nodes):
-        raise InputError(
-            "[[fixed]] and [[displaced]] hold the whole surface: leave a node free, so that it can be pulled"
-        )
+        raise InputError("[[fixed]] and [[displaced]] contain the whole surface: leave a node free that can be pulled")
     node = int(nodes[np.argmax(np.linalg.norm(X[nodes] - centre, axis=1))])
     away = X[node] - centre
     to = X[node] + 0.1 * playing.size * away / max(float(np.linalg.norm(away)), 1e-300)
@@ -85,7 +83,7 @@ def _without_page(playing: "Playing", steps: int) -> int:
         failed += playing.code not in (status.CONVERGED, status.ONE_STEP)
     moved = float(np.linalg.norm(playing.positions[node] - X[node]))
     print(
-        f"{len(X)} nodes, {steps} steps, {1 / np.median(taken):.3g} a second (slowest {1e3 * max(taken):.3g} ms), node "
-        f"{node} moved {1e3 * moved:.3g} mm" + (f"; {failed} steps failed" if failed else "")
+        f"{len(X)} nodes, {steps} steps, {1 / np.median(taken):.3g} per second (slowest {1e3 * max(taken):.3g} ms), "
+        f"node {node} moved {1e3 * moved:.3g} mm" + (f"; {failed} steps failed" if failed else "")
     )
     return 1 if failed else 0

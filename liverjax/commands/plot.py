@@ -1,4 +1,5 @@
-"""``liverjax plot NAME | FILE.py:LAW …``: draw stress-stretch curves of laws; ``plot RESULT.h5``: a field of a run."""
+"""Draw stress-stretch curves of laws (``liverjax plot NAME | FILE.py:LAW …``), or a field of a run (``plot
+RESULT.h5``)."""
 
 import argparse
 from pathlib import Path
@@ -10,7 +11,7 @@ from liverjax.core.files import writable
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
-    """Declare the command."""
+    """Add the command to the parser."""
     command = parsers.add_parser(
         "plot",
         help="stress-stretch curves, or a field of a run",
@@ -20,21 +21,23 @@ def add(parsers: argparse._SubParsersAction) -> None:
         "law",
         nargs="+",
         metavar="NAME|FILE.py:LAW|RESULT.h5",
-        help=f"{LAW}; all for every shipped one; or a result of liverjax simulate",
+        help=f"{LAW}; all: every law of this package; or a result of liverjax simulate",
     )
-    command.add_argument("--field", metavar="NAME", help="of a result: cauchy_stress, …; default displacement")
+    command.add_argument("--field", metavar="NAME", help="field of a result, e.g. cauchy_stress; default displacement")
     command.add_argument("--step", type=int, metavar="N", help="step of a result, from 1; default the last")
-    command.add_argument("--stretch", nargs=2, type=float, metavar=("LOW", "HIGH"), help="of a law; default 0.6 1.6")
+    command.add_argument(
+        "--stretch", nargs=2, type=float, metavar=("LOW", "HIGH"), help="range for a law; default 0.6 1.6"
+    )
     add_out(command)
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Draw the curves of laws, or the field of a run."""
+    """Draw the curves of laws, or a field of a run."""
     results = [Path(name) for name in options.law if name.endswith(".h5")]
     for name in options.law:
         if name.endswith(".toml"):
-            raise InputError(f"{name} is a scene: run it by liverjax simulate, and draw its result.h5")
+            raise InputError(f"{name} is a scene: run it with liverjax simulate, and draw its result.h5")
         if Path(name).exists() and not name.endswith((".h5", ".py")) and name not in laws.LAWS:
             raise InputError(f"{name} is a file or a folder, and not a law: give the result.h5 of a run to draw it")
     for option, of_results in (("field", True), ("step", True), ("stretch", False)):
@@ -44,13 +47,13 @@ def run(options: argparse.Namespace) -> int:
             )
     if results:
         if len(options.law) > 1:
-            raise InputError(f"{results[0]} is a result: draw it alone")
+            raise InputError(f"{results[0]} is a result: give only this file")
         return _draw_field(results[0], options)
     from liverjax.laws import figures, gradient_check
 
     low, high = options.stretch or (0.6, 1.6)
     if not 0 < low < 1 < high <= 20:
-        raise InputError(f"--stretch {low:g} {high:g} is not a range about 1: give e.g. --stretch 0.6 1.6")
+        raise InputError(f"--stretch {low:g} {high:g} is not a range that contains 1: give e.g. --stretch 0.6 1.6")
     names = [n for name in options.law for n in (laws.LAWS if name == "all" else [name])]
     labels = [name.rpartition(":")[2] for name in names]
     named = {n if labels.count(k) > 1 else k: gradient_check.load(n) for k, n in zip(labels, names, strict=True)}

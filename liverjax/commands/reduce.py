@@ -1,34 +1,37 @@
-"""``liverjax reduce SCENE.toml ROWS.csv``: make a reduced model of a scene from full runs of a table's rows."""
+"""``liverjax reduce SCENE.toml ROWS.csv``: make a reduced model of a scene from full runs, one for each row of a
+table."""
 
 import argparse
 from pathlib import Path
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
-    """Declare the command."""
+    """Add the command to the parser."""
     command = parsers.add_parser(
         "reduce",
-        help="make a reduced model of a scene from runs of a table's rows",
+        help="make a reduced model of a scene from full runs with different parameters",
         description="Run a scene for every row of a table, and make a reduced model from these runs.",
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
-    command.add_argument("rows", type=Path, metavar="ROWS.csv", help="a header of dotted names, one row per run")
+    command.add_argument(
+        "rows", type=Path, metavar="ROWS.csv", help="table with a header of dotted names and one row per run"
+    )
     command.add_argument("--out", type=Path, default=Path("model.h5"), metavar="MODEL.h5", help="the model (model.h5)")
     command.add_argument(
-        "--tolerance", type=float, default=1e-4, metavar="X", help="part of the motions that may be left out (1e-4)"
+        "--tolerance", type=float, default=1e-4, metavar="X", help="fraction of the motions that may be left out (1e-4)"
     )
-    command.add_argument("--modes", type=int, default=40, metavar="N", help="the most modes (40)")
+    command.add_argument("--modes", type=int, default=40, metavar="N", help="maximum number of modes (40)")
     command.add_argument(
         "--runs",
         type=int,
         metavar="N",
-        help="full runs: two thirds are the first rows, then those of the largest stated error (all rows)",
+        help="number of full runs: two thirds are the first rows, the others have the largest stated errors (all rows)",
     )
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Make the model and write it."""
+    """Make the reduced model and write it to a file."""
     from liverjax.jobs import reduction
 
     model = reduction.make(options.scene, options.rows, options.out, options.tolerance, options.modes, options.runs)

@@ -17,28 +17,34 @@ if TYPE_CHECKING:
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
-    """Declare the command."""
+    """Add the command to the parser."""
     command = parsers.add_parser("simulate", help="run a scene file", description="Run a scene file.")
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
-    command.add_argument("--vtu", action="store_true", help="write a ParaView series as well")
-    command.add_argument("--png", action="store_true", help="draw the last state as well")
-    command.add_argument("--every", type=int, default=50, metavar="N", help="steps between two writes (50)")
-    command.add_argument("--resume", action="store_true", help="go on where a run was stopped")
-    command.add_argument("--fields", metavar="NAMES", help="fields to write, with commas: cauchy_stress,volume_ratio,…")
-    command.add_argument("--reactions", action="store_true", help="write the forces of held parts over time as CSV")
-    command.add_argument("--mesh-error", action="store_true", help="estimate the mesh's error in the result")
+    command.add_argument("--vtu", action="store_true", help="also write a series of files for ParaView")
+    command.add_argument("--png", action="store_true", help="also draw the last state")
+    command.add_argument(
+        "--every", type=int, default=50, metavar="N", help="number of steps between two writes of the results (50)"
+    )
+    command.add_argument("--resume", action="store_true", help="continue a run that was stopped")
+    command.add_argument(
+        "--fields", metavar="NAMES", help="fields to write, separated by commas: cauchy_stress,volume_ratio,…"
+    )
+    command.add_argument(
+        "--reactions", action="store_true", help="write the reaction forces at all steps as a CSV file"
+    )
+    command.add_argument("--mesh-error", action="store_true", help="estimate the error of the result due to the mesh")
     command.add_argument(
         "--about",
         type=Path,
         metavar="RESULT.h5",
-        help="for a harmonic scene: it moves about the last state of this run",
+        help="only for a harmonic scene: the body vibrates about the last state of this run",
     )
     add_out(command)
     command.set_defaults(run=run, optional_files=("reactions.csv", "result.png", "vtu"))
 
 
 def run(options: argparse.Namespace) -> int:
-    """Simulate the scene and write its results. Return 1 if a step failed; the steps before it are kept."""
+    """Simulate the scene and write its results. Return 1 if a step failed; the results before this step are kept."""
     import numpy as np
     from tqdm import tqdm
 
@@ -54,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     if scene.solve.kind == "harmonic":
         return harmonic.run(options, scene, text)
     if options.about:
-        raise InputError("--about is for [solve] kind = 'harmonic': leave it out")
+        raise InputError("--about is only for [solve] kind = 'harmonic': leave it out")
     given = scene.points_are
     if given == "loaded":
         scene = unloaded(scene).scene
@@ -69,7 +75,7 @@ def run(options: argparse.Namespace) -> int:
         if ran is None:
             ran = long_run.run(scene, text, target, options.every, options.resume, report)
     except OSError as error:
-        print(f"stopped: {target}: {error.strerror}; go on with --resume when there is space", file=sys.stderr)
+        print(f"stopped: {target}: {error.strerror}; free some space and go on with --resume", file=sys.stderr)
         return 1
     finally:
         bar.close()
@@ -97,7 +103,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[list[str], bool]:
-    """Names of fields, and whether reactions are written, from the command line and from [output]."""
+    """Return the names of the fields to write, and whether reactions are written, from the command line and from
+    [output]."""
     import tomllib
 
     from liverjax.jobs import fields
@@ -111,7 +118,8 @@ def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[
 
 
 def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:
-    """The run with a reduced model, or None if the full model has to run; and the scene without the reduced model."""
+    """Return the run with a reduced model, or None if the full model has to run. The second result is the scene without
+    the reduced model."""
     if not scene.solve.reduced:
         return None, scene
     from liverjax.core.struct import replace
@@ -134,7 +142,8 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
 
 
 def _sizes_of_places(scene: "Scene") -> list[str]:
-    """Sizes of the places of tractions and regions, in words. A place has only whole triangles and whole elements."""
+    """Return lines with the area of each traction and the volume of each region. The user can check them, because only
+    whole triangles and whole elements are selected."""
     import numpy as np
 
     from liverjax.mesh.surface import areas
@@ -151,7 +160,8 @@ def _sizes_of_places(scene: "Scene") -> list[str]:
 
 
 def _write_and_tell(given: tuple["Scene", str, list[str]], ran: "Ran", target: Path, found: dict) -> None:
-    """Write the results with the text of the scene and the cautions. Print the cautions and statistics of the run."""
+    """Write the results with the text of the scene and the cautions. Print the cautions and the statistics of the
+    run."""
     import numpy as np
 
     from liverjax.core.versions import versions
@@ -171,7 +181,7 @@ def _write_and_tell(given: tuple["Scene", str, list[str]], ran: "Ran", target: P
         f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {steps} steps: "
         f"{int(np.sum(s.iterations))} Newton and {int(np.sum(s.linear_iterations))} linear iterations, "
         f"largest residual {float(np.max(np.asarray(s.residual))):.1e} of the forces\n"
-        + (f"run {ran.run_time:.3g} s ({ran.steps / ran.run_time:.3g} steps a second), " if ran.steps else "")
+        + (f"run {ran.run_time:.3g} s ({ran.steps / ran.run_time:.3g} steps per second), " if ran.steps else "")
         + f"compile {ran.compile_time:.3g} s"
         + (f"; {steps - ran.steps} steps found on disk" if ran.steps < steps else "")
     )

@@ -7,35 +7,45 @@ from pathlib import Path
 
 from liverjax.core.errors import InputError
 
-#: The names of `liverjax.jobs.sweep.OUTPUTS`. With this copy --help need not load that module.
+#: The names in `liverjax.jobs.sweep.OUTPUTS`. Because of this copy, --help does not have to load that module.
 OUTPUTS = ("final_positions", "positions", "largest_displacement", "final_reactions", "largest_pressure")
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
-    """Declare the command."""
+    """Add the command to the parser."""
     command = parsers.add_parser(
         "sweep",
         help="run a scene for every row of a table",
-        description="Run a scene for every row of a table. A kill at any moment costs one chunk: --resume goes on.",
+        description="Run a scene for every row of a table. If the run is stopped, --resume continues it; at most one "
+        "chunk of rows is lost.",
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
     command.add_argument(
-        "parameters", type=Path, metavar="PARAMETERS.csv", help="a header of dotted names, one row per run"
+        "parameters",
+        type=Path,
+        metavar="PARAMETERS.csv",
+        help="table with a header of dotted names and one row per run",
     )
     command.add_argument("--out", type=Path, metavar="FILE.h5", help="the results (PARAMETERS.h5)")
-    command.add_argument("--resume", action="store_true", help="go on where a run was stopped")
+    command.add_argument("--resume", action="store_true", help="continue a run that was stopped")
     command.add_argument("--store", nargs="+", default=["final_positions"], metavar="WHAT", help="|".join(OUTPUTS))
-    command.add_argument("--probe", nargs="+", type=int, default=[], metavar="NODE", help="nodes to keep over time")
-    command.add_argument("--rows", nargs="+", type=int, default=[], metavar="N", help="only these rows, from 1")
-    command.add_argument("--chunk", type=int, default=16, metavar="N", help="rows between two writes (16)")
+    command.add_argument(
+        "--probe", nargs="+", type=int, default=[], metavar="NODE", help="nodes whose positions are stored at all steps"
+    )
+    command.add_argument(
+        "--rows", nargs="+", type=int, default=[], metavar="N", help="only these rows, numbered from 1"
+    )
+    command.add_argument(
+        "--chunk", type=int, default=16, metavar="N", help="number of rows between two writes of the results (16)"
+    )
     command.add_argument("--devices", type=int, metavar="N", help="spread the rows over N CPU devices (1)")
-    where = "one of several processes; without HOST:PORT N I as the cluster (SLURM) says"
+    where = "run as process I of N processes that meet at HOST:PORT; without values, the cluster (SLURM) gives them"
     command.add_argument("--distributed", nargs="*", metavar="HOST:PORT N I", help=where)
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the rows. Return 1 if a row failed or the disk is full. Finished rows are kept."""
+    """Run the scene for the rows of the table. Return 1 if a row failed or the disk is full. Finished rows are kept."""
     import jax
     from tqdm import tqdm
 
@@ -55,8 +65,7 @@ def run(options: argparse.Namespace) -> int:
     if solve.kind == "harmonic" or solve.reduced:
         own = "kind = 'harmonic'" if solve.kind == "harmonic" else f"reduced = {solve.reduced!r}"
         raise InputError(
-            f"{options.scene}: [solve] {own} is not for sweeps, which are full runs in time: take python -m liverjax "
-            "simulate for each row"
+            f"{options.scene}: [solve] {own} cannot be used in a sweep: use python -m liverjax simulate for each row"
         )
     out = options.out or options.parameters.with_suffix(".h5")
     bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # on a terminal only
@@ -78,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
     for said in (*cautions_of_mesh(table.scene.mesh), *_of_crushed(done.crushed)):
         print(f"caution: {said}", file=sys.stderr)
     if done.failed:
-        print(f"again: --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
+        print(f"to run them again: --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
     return 1 if done.failed else 0
 
 
@@ -89,27 +98,27 @@ def _of_crushed(rows: dict[int, float]) -> list[str]:
     named = ", ".join(map(str, list(rows)[:20])) + (", …" if len(rows) > 20 else "")
     how_many = f"{len(rows)} row{'s' if len(rows) > 1 else ''} ({named}; worst: row {worst}, J = {rows[worst]:.2g})"
     return [
-        f"elements end below a fifth or above five times their volume in {how_many}, which no tissue does: take a "
-        "stiffer bulk modulus or smaller loads"
+        f"elements end below a fifth or above five times their volume in {how_many}, which is not possible in tissue: "
+        "use a larger bulk modulus or smaller loads"
     ]
 
 
 def _is_address(text: str) -> bool:
-    """Whether the text is HOST:PORT: JAX ends with a segmentation fault at another port."""
+    """Return whether the text is HOST:PORT. With an invalid port JAX would end with a segmentation fault."""
     host, _, port = text.rpartition(":")
     return bool(host) and port.isdigit() and 1 <= int(port) <= 65535
 
 
 def _share(given: list[str]) -> tuple[int, int]:
-    """Index and number of the processes from JAX's distributed runtime.
+    """Return the index of this process and the number of processes, from JAX's distributed runtime.
 
-    `given` is HOST:PORT N I, or empty on a cluster.
+    `given`: HOST:PORT N I, or empty on a cluster.
     """
     import jax
 
     option = f"--distributed {' '.join(given)}"
     if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
-        raise InputError(f"{option}: give HOST:PORT, the number of processes and the number of this one, or nothing")
+        raise InputError(f"{option}: give HOST:PORT, the number of processes and the index of this one, or nothing")
     if given and not _is_address(given[0]):
         raise InputError(f"{option}: {given[0]} is not HOST:PORT with a port of 1 to 65535: give e.g. node1:12345")
     if given and int(given[1]) < 1:
@@ -122,11 +131,11 @@ def _share(given: list[str]) -> tuple[int, int]:
         else:
             jax.distributed.initialize()
         process = (jax.process_index(), jax.process_count())
-        # Rows need no communication. The runtime is left at once, so that a process that dies does not stop the others.
+        # Rows need no communication. The runtime is shut down at once, so a failed process does not stop the others.
         jax.distributed.shutdown()
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(
-            f"--distributed: the processes did not find each other ({reason}): give HOST:PORT N I"
+            f"--distributed: the processes could not be connected ({reason}): give HOST:PORT N I"
         ) from None
     return process

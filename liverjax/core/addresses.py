@@ -51,17 +51,17 @@ MOVED = {
 
 
 def keep_loaded(package: str) -> None:
-    """Make loaded modules importable under their old names, too (`from PACKAGE.MODULE import …`)."""
+    """Make loaded modules importable also under their old names (`from PACKAGE.MODULE import …`)."""
     for old, new in MOVED.items():
         if old.startswith(f"{package}.") and new in sys.modules:
             sys.modules.setdefault(old, sys.modules[new])
 
 
 def moved_module(package: str, name: str) -> ModuleType:
-    """The module that was at PACKAGE.NAME.
+    """Return the module with the old name PACKAGE.NAME.
 
     Raises:
-        AttributeError: there was no such module.
+        AttributeError: no module had this name.
     """
     if f"{package}.{name}" not in MOVED:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Check the numbers of a struct against the bounds of its fields, for numbers from files and from Python."""
+"""Check whether the numbers of a struct, from a file or from Python, are within the bounds of its fields."""
 
 import dataclasses
 import math
@@ -12,29 +12,29 @@ from liverjax.core.errors import InputError
 
 #: Fields of regions that may be dictionaries of numbers; they are checked together with the numbers of the scene.
 _DICTIONARIES = ("law", "viscosity", "porosity")
-#: Maximum count of numbers in a message. If there are more, it names only the first wrong one and its place.
+#: Maximum count of numbers in a message. If there are more, the message shows only the first wrong one and its index.
 _FEW = 8
-#: Maximum whole number: compiled programs store 32-bit integers.
+#: Maximum whole number, since compiled programs store 32-bit integers.
 _LARGEST = 2**31 - 1
 
 
 def check_fields(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
-    """Refuse a struct with a value that is out of bounds, not finite or not a number. Host side; nothing is compiled.
+    """Raise `InputError` if a value of a struct is out of bounds, not finite or not a number. Nothing is compiled.
 
     Args:
-        thing: any struct; structs inside it are checked, too. Values that are None or traced are skipped.
+        thing: any struct; structs inside it are also checked. Values that are None or traced are skipped.
         name: name of the struct. It is put before the names of its fields: ``law`` gives ``law.mu``.
         leave: fields to skip, because they are checked elsewhere.
 
     Raises:
-        InputError: one sentence with dotted name, value, bound and remedy.
+        InputError: the message contains the dotted name, the value, the bound and a remedy.
     """
     for dotted, metadata, value in _fields(thing, name, leave):
         check_bound(dotted, metadata, value)
 
 
 def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str, Mapping, object]]:
-    """Dotted name, metadata and value of every field that has a bound or a unit."""
+    """Yield the dotted name, metadata and value of every field that has a bound or a unit."""
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
         if value is None or field.name in leave or (isinstance(value, dict) and field.name in _DICTIONARIES):
@@ -52,15 +52,15 @@ def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str
 
 
 def check_bound(where: str, metadata: Mapping, value: object) -> None:
-    """Refuse a value that the field's `metadata` does not allow. The message begins with `where`.
+    """Raise `InputError` if the field's `metadata` does not allow the value. The message begins with `where`.
 
     Args:
         where: name of the value, for the message.
         metadata: metadata of the field, from `param` or `static` of `liverjax.core.struct`.
-        value: a number, an array, or a sequence of numbers or arrays; traced values pass.
+        value: a number, an array, or a sequence of numbers or arrays. Traced values are not checked.
 
     Raises:
-        InputError: not a number, not finite, out of bounds, or not one of the words that a static field allows.
+        InputError: the value is not a number, not finite, out of bounds, or not one of the words of a static field.
     """
     lower = metadata.get("lower")
     if metadata.get("static"):
@@ -75,13 +75,13 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
             raise InputError(f"{where} must be at most {_LARGEST}: give a smaller number")
         return
     if type(value) is int and not finite(value):
-        raise InputError(f"{where} is a whole number with hundreds of digits: give a smaller one")
-    if type(value) is float or type(value) is int:  # most values: this branch is quick, since every run checks them
+        raise InputError(f"{where} is a whole number with hundreds of digits: give a smaller number")
+    if type(value) is float or type(value) is int:  # the most frequent case is fast, since every run checks all values
         leaves, numbers = [value], None
         least = most = value
     else:
         leaves = jax.tree.leaves(value, is_leaf=lambda v: v is None or isinstance(v, dict))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):  # under jit or grad the value is not known
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):  # under jit or grad the value is unknown
             return
         numbers = _numbers_of(where, metadata, value, leaves)
         if not numbers.size:
@@ -94,7 +94,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
 
 
 def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -> None:
-    """Raise an error with the first bound that one of the numbers (n,) violates."""
+    """Raise an error that names the first bound which one of the numbers (n,) violates."""
     unit, typical = metadata.get("unit", "1"), metadata.get("typical")
     if not np.isfinite(numbers).all():
         raise InputError(
@@ -115,7 +115,7 @@ def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -
 
 
 def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> np.ndarray:
-    """The numbers of all leaves (n,)."""
+    """Return the numbers of all leaves as one array (n,)."""
     try:
         if any(isinstance(leaf, (str, bytes, bool, dict)) for leaf in leaves):
             raise TypeError
@@ -126,12 +126,12 @@ def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> n
 
 
 def _in(unit: str) -> str:
-    """ " in " and the unit; an empty text for a number without a unit."""
+    """Return " in " and the unit, or an empty text for a number without a unit."""
     return "" if unit == "1" else f" in {unit}"
 
 
 def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> str:
-    """Name and value; if there are many numbers, only the first wrong one."""
+    """Return name and value as text. If there are many numbers, show only the first wrong number."""
     if numbers.size > _FEW:
         first = int(np.argmax(wrong))
         return f"{where}, number {first + 1} of {numbers.size}, = {numbers[first]:g}"
@@ -141,10 +141,10 @@ def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> st
 
 
 def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
-    """Refuse an array with a shape that is not in `allowed`. None passes.
+    """Raise `InputError` if the shape of an array is not in `allowed`. None is allowed.
 
     Raises:
-        InputError: another shape.
+        InputError: the array has another shape.
     """
     if value is not None and np.shape(value) not in allowed:
         words = " or ".join("one number" if shape == () else f"shape {shape}" for shape in allowed)
@@ -152,7 +152,7 @@ def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
 
 
 def finite(value: float) -> bool:
-    """Whether a number is finite as a float. It may be a whole number with any number of digits."""
+    """Return whether a number is finite as a float. Whole numbers may have any number of digits."""
     try:
         return math.isfinite(value)
     except OverflowError:
@@ -160,9 +160,9 @@ def finite(value: float) -> bool:
 
 
 def array_of(value: object) -> np.ndarray | None:
-    """The float array of a number or of lists of numbers from a scene file; None if this is not possible.
+    """Convert a number or lists of numbers from a scene file to a float array.
 
-    Not possible are texts, booleans, numbers that are not finite, and lists of unequal length.
+    Returns None for texts, booleans, numbers that are not finite, and lists of unequal length.
     """
     if not _is_numbers(value):
         return None
@@ -181,16 +181,16 @@ def _is_numbers(value: object) -> bool:
         return finite(value)
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError):  # a traced value is no number of a file
+    except (TypeError, ValueError):  # a traced value cannot come from a file
         return False
     return array.dtype.kind in "fiu" and bool(np.all(np.isfinite(array)))
 
 
 def check_one(where: str, value: object) -> None:
-    """Refuse a value of a scene file that is not one finite number.
+    """Raise `InputError` if a value of a scene file is not one finite number.
 
     Raises:
-        InputError: one sentence that begins with `where`.
+        InputError: the message begins with `where`.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not finite(value):
-        raise InputError(f"{where} = {value!r} is not a number: give one")
+        raise InputError(f"{where} = {value!r} is not a number: give a number")

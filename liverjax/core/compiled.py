@@ -1,10 +1,8 @@
-"""A function that is compiled for given arguments.
+"""Compile a function for given arguments, and keep the compiled program on disk.
 
-A program that is kept on disk is found without tracing the function.
-
-JAX's cache saves only the compilation: it must trace a program to find it, which takes seconds for a large program.
-Here the key is made of the structure and the shapes of the arguments. The files are in the folder of
-`liverjax.core.program_cache`.
+A program on disk is found without tracing the function. JAX's own cache saves only the compilation: JAX must trace a
+function to find its program, which takes seconds for a large program. Here the key of a program is computed from the
+structure and the shapes of the arguments. The files are in the folder of `liverjax.core.program_cache`.
 """
 
 import dataclasses
@@ -31,19 +29,19 @@ from liverjax.core.files import whole
 OWN = ("liverjax.", "fitting.")
 
 
-#: Options for a program that takes longer to compile than to run. XLA's newer kernels run up to twice as fast, but the
-#: compilation takes 1.5 times as long. In jax 0.11 and later there are only the newer kernels.
+#: Options for a program that takes longer to compile than to run. XLA's newer kernels run up to twice as fast, but take
+#: 1.5 times as long to compile. In jax 0.11 and later there are only the newer kernels.
 _QUICK: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 
 
 class _Unknown(Exception):
-    """Something that the key cannot describe, for example a law of a user, or a function inside another one."""
+    """Raised for things that the key cannot describe, for example a user's law, or a function inside another one."""
 
 
 def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False) -> Callable[..., Any]:
-    """Compile `function` for arguments like these, on one device.
+    """Compile `function` for arguments with these types and shapes, on one device.
 
-    A call with such arguments then only runs the program.
+    A call of the result with such arguments only runs the program.
 
     Args:
         function: a function at the top level of a module, or `functools.partial` of such a function. The keywords of
@@ -89,13 +87,13 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple, options: d
         content = zlib.compress(pickle.dumps((*serialize_executable.serialize(program), example)), 1)
         with whole(file, f".{os.getpid()}.part") as beside:
             beside.write_bytes(content)
-    except Exception:  # e.g. callbacks, a full disk, another JAX: it is not saved, but can run
+    except Exception:  # e.g. callbacks, a full disk, another JAX: the program runs, but is not saved
         pass
     return partial(_called, program, shape[0])
 
 
 def _found(file: Path) -> Callable[..., Any] | None:
-    """The program in a file; `None` if there is no program that can be read."""
+    """Read the program in a file. Returns None if no program can be read."""
     if not file.exists():
         return None
     try:
@@ -106,7 +104,7 @@ def _found(file: Path) -> Callable[..., Any] | None:
         kept, given, taken, example = pickle.loads(zlib.decompress(file.read_bytes()))
         program = serialize_executable.deserialize_and_load(kept, given, taken, execution_devices=jax.devices()[:1])
         return partial(_called, program, jax.tree.structure(example))
-    except Exception:  # broken, or from another release: it is compiled and written again
+    except Exception:  # a broken file, or another release: the program is compiled and written again
         return None
 
 
@@ -119,7 +117,7 @@ def _function_name(function: Callable[..., Any]) -> str:
 
 
 def _top(function: Any) -> str:
-    """Name of a function at the top level of a module. A function inside another one raises `_Unknown`."""
+    """Return the name of a function at the top level of a module. A function inside another one raises `_Unknown`."""
     module, name = function.__module__, function.__qualname__
     if not module.startswith(OWN) or not name.isidentifier():
         raise _Unknown
@@ -127,7 +125,7 @@ def _top(function: Any) -> str:
 
 
 def _key(function: Callable[..., Any], arguments: tuple, options: dict | None = None) -> str:
-    """Digest of everything that the program depends on, except the sources."""
+    """Return the digest of everything that the program depends on, except the sources."""
     fixed = function.keywords if isinstance(function, partial) else {}
     if isinstance(function, partial) and function.args:
         raise _Unknown
@@ -143,7 +141,7 @@ def _key(function: Callable[..., Any], arguments: tuple, options: dict | None = 
 
 
 def _said(thing: Any, static: bool = False) -> Any:
-    """What a program depends on, for the key: types, static values, and the shapes of all other numbers."""
+    """Describe an argument for the key: types, static values, and the shapes of all other numbers."""
     if thing is None or isinstance(thing, (str, bool)):
         return repr(thing)
     if isinstance(thing, FunctionType) and static:

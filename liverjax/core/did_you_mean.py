@@ -1,4 +1,4 @@
-"""Check words from users, and make the hint at the end of a message about an unknown word."""
+"""Check words from users, and write the hint at the end of a message about an unknown word."""
 
 import difflib
 from collections.abc import Iterable
@@ -7,7 +7,9 @@ from liverjax.core.errors import InputError
 
 
 def hint(word: str, known: Iterable[str], before: str = "") -> str:
-    """The end of a message on an unknown word: the most similar known word, or all known words if none is similar.
+    """Return the end of a message about an unknown word.
+
+    It contains the most similar known word, or all known words if none is similar.
 
     `before` is written before each known word, for example "law.".
     """
@@ -18,7 +20,7 @@ def hint(word: str, known: Iterable[str], before: str = "") -> str:
 
 
 def as_word(value: object, where: str) -> str:
-    """Return the value if it is text; call this before a word is looked up.
+    """Return the value if it is text. This check is needed before the word is looked up.
 
     Args:
         value: a value of a scene file.

@@ -1,5 +1,5 @@
-"""The exception for unusable input: unusable input causes no other."""
+"""The exception for unusable input. Unusable input raises no other exception."""
 
 
 class InputError(ValueError):
-    """Unusable input. The message is one sentence with file or field, value and remedy. Commands exit with code 2."""
+    """Raised for unusable input. The message gives file or field, value and remedy. Commands exit with code 2."""

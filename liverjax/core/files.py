@@ -1,4 +1,4 @@
-"""Folders for results, which are tested before anything is computed; files that are written completely or not at all.
+"""Test folders for results before a computation, and write files completely or not at all.
 
 A progress file contains marks (digests) of its problem, so that a run continues only from a file of the same problem.
 """
@@ -24,7 +24,7 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
         raise InputError(f"--out {out} is a file: name a folder for the results")
     for name in files:
         if (out / name).is_dir():
-            raise InputError(f"--out {out}: {name} in it is a folder; name another folder for the results")
+            raise InputError(f"--out {out} contains a folder {name}: name another folder for the results")
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out):
@@ -35,7 +35,7 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
 
 @contextmanager
 def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
-    """Give a temporary path beside `file` to write to; at the end it is renamed to `file`.
+    """Yield a temporary path next to `file`. At the end, the file at this path is renamed to `file`.
 
     If the process is killed or an error occurs, `file` does not change. After an error the temporary file is removed.
 
@@ -53,7 +53,7 @@ def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
 
 
 def mark_of(*arrays: object) -> str:
-    """A text that is equal only for equal arrays (SHA-256 of type, shape and bytes)."""
+    """Return a text that is equal only for equal arrays (SHA-256 of type, shape and bytes)."""
     found = hashlib.sha256()
     for a in map(np.asarray, arrays):
         found.update(f"{a.dtype} {a.shape}".encode() + np.ascontiguousarray(a).tobytes())
@@ -61,7 +61,7 @@ def mark_of(*arrays: object) -> str:
 
 
 def refuse_other(file: Path, held: Mapping[str, object], marks: Mapping[str, object]) -> None:
-    """Raise `InputError` if the marks `held` in `file` differ from `marks`. The message names the different marks."""
+    """Raise `InputError` if the marks `held` in `file` differ from `marks`. The message lists the different marks."""
     other = [name for name, own in marks.items() if held.get(name) != own]
     if other:
         raise InputError(

@@ -1,6 +1,7 @@
-"""Tables in time: numbers at increasing times. Between two times a table is linear; before and after, it is constant.
+"""Histories of loads and motions: tables of numbers at increasing times.
 
-A table with one number for each time gives factors of its load. A table with three numbers gives the vector itself.
+A history is linear between two times, and constant before the first and after the last time. One number per time is a
+factor that multiplies the load. Three numbers per time are the vector itself.
 """
 
 from pathlib import Path
@@ -18,12 +19,12 @@ _FACTOR, _VECTOR = ("time", "factor"), ("time", "x", "y", "z")
 
 
 def read_history(value: object, name: str, forms: tuple[int, ...] = (1, 3)) -> tuple[jax.Array, jax.Array]:
-    """Times (T,) [s], and factors (T,) or vectors (T, 3), from a scene file's `history`.
+    """Return times (T,) [s], and factors (T,) or vectors (T, 3), from the `history` in a scene file.
 
     Args:
         value: rows `[[t, factor], …]` or `[[t, x, y, z], …]`; or a CSV file with columns time,factor or time,x,y,z.
         name: name of the load or motion with this history, for messages.
-        forms: the allowed counts of numbers for each time.
+        forms: allowed counts of numbers per time.
 
     Raises:
         InputError: a file that cannot be read, wrong columns, numbers that are not finite, times that do not increase.
@@ -42,7 +43,7 @@ def read_history(value: object, name: str, forms: tuple[int, ...] = (1, 3)) -> t
         if data.ndim != 2 or data.shape[1] - 1 not in forms:
             raise InputError(f"{where} is not a table of numbers: write {wanted}, or name a CSV file")
     if not len(data) or not np.all(np.isfinite(data)) or not np.all(np.diff(data[:, 0]) > 0):
-        raise InputError(f"{where} must hold finite numbers at increasing times: sort and fill it")
+        raise InputError(f"{where} must have finite numbers at increasing times: sort and complete its rows")
     numbers = data[:, 1] if data.shape[1] == 2 else data[:, 1:]
     return jnp.asarray(data[:, 0]), jnp.asarray(numbers)
 
@@ -74,31 +75,31 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
 
 
 def check_times(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> None:
-    """Refuse a history made in Python that cannot be used; traced numbers pass.
+    """Raise `InputError` if a history made in Python cannot be used. The values of traced times are not checked.
 
     Raises:
         InputError: times without a history or a history without times, shapes that do not match, times that do not
             increase.
     """
     if (times is None) != (history is None):
-        raise InputError(f"{name} needs both times and history, or none of them: give both, or leave both out")
+        raise InputError(f"{name} needs both times and history, or none of them: give both, or remove both")
     if history is None:
         return
     count = np.shape(times)
     allowed = [count if n == 1 else (*count, n) for n in forms]
     if len(count) != 1 or np.shape(history) not in allowed:
         shapes = " or ".join(map(str, allowed))
-        raise InputError(f"{name} history has shape {np.shape(history)}, its times {count}: give {shapes}")
+        raise InputError(f"{name} history has shape {np.shape(history)}, its times have {count}: give {shapes}")
     if isinstance(times, jax.core.Tracer):
         return
     falls = np.flatnonzero(~(np.diff(np.asarray(times)) > 0))
     if not count[0] or falls.size:
         found = f"{times[falls[0] + 1]:g} s after {times[falls[0]]:g} s" if count[0] else "none"
-        raise InputError(f"{name} history must have increasing times, it has {found}: sort them")
+        raise InputError(f"{name} history must have increasing times, but has {found}: sort them")
 
 
 def entry_at(time: Number, times: Any, history: Numbers) -> jax.Array:
-    """The factor (), or the vector (3,), at a time [s]."""
+    """Interpolate the factor (), or the vector (3,), at a time [s]."""
     values = jnp.asarray(history)
     if values.ndim == 1:
         return jnp.interp(time, times, values)
@@ -106,9 +107,9 @@ def entry_at(time: Number, times: Any, history: Numbers) -> jax.Array:
 
 
 def value_at(value: object, time: Number, times: Any, history: Any) -> Any:
-    """A value at a time [s]: it is multiplied by the factor, or replaced by the vector.
+    """Return a value at a time [s]: the value times the factor of its history, or the vector of its history.
 
-    Without a history it is constant.
+    Without a history, the value is constant.
     """
     if history is None:
         return value

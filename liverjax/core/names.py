@@ -1,4 +1,4 @@
-"""Dotted names as in scene files, for example `law.1.mu`: each name leads to a value."""
+"""Find and replace values by their dotted names as in scene files, for example `law.1.mu`."""
 
 import dataclasses
 import itertools
@@ -14,17 +14,17 @@ from liverjax.core.struct import replace
 
 
 class PathStep(NamedTuple):
-    """One step on the path to a number: from `owner` to its content at `key`."""
+    """One step on the path to a value: from `owner` to its content at `key`."""
 
     owner: Any  # a struct, tuple, dictionary or array
-    key: Any  # field, place or entry
+    key: Any  # name of a field, index, or key of a dictionary
 
     def inside(self) -> Any:
-        """The content of the owner at the key."""
+        """Return the content of the owner at the key."""
         return getattr(self.owner, self.key) if dataclasses.is_dataclass(self.owner) else self.owner[self.key]
 
     def with_inside(self, value: Any) -> Any:
-        """The owner with `value` at the key."""
+        """Return a copy of the owner with `value` at the key."""
         owner, key = self
         if dataclasses.is_dataclass(owner) and not isinstance(owner, type):
             return replace(owner, **{key: value})
@@ -37,33 +37,34 @@ class PathStep(NamedTuple):
 
 
 def get(thing: Any, name: str, refusal: str) -> Any:
-    """Return the value at a dotted name. `walk` explains arguments and errors."""
+    """Return the value at a dotted name. See `walk` for the arguments and errors."""
     return walk(thing, name, refusal)[-1].inside()
 
 
 def put(thing: Any, name: str, value: object, refusal: str) -> Any:
-    """Copy `thing` with `value` (it may be traced) at a dotted name. `walk` explains arguments and errors."""
+    """Return a copy of `thing` with `value` at a dotted name. The value may be traced. See `walk` for the arguments."""
     for step in reversed(walk(thing, name, refusal)):
         value = step.with_inside(value)
     return value
 
 
 def metadata(thing: Any, name: str, refusal: str) -> dict[str, object]:
-    """Unit and bounds of the field at a dotted name. `walk` explains arguments and errors."""
+    """Return unit and bounds of the field at a dotted name. See `walk` for the arguments and errors."""
     last = next(step for step in reversed(walk(thing, name, refusal)) if dataclasses.is_dataclass(step.owner))
     return dict(last.owner.__dataclass_fields__[last.key].metadata)
 
 
 def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
-    """All steps from `thing` to the value at a dotted name.
+    """Return all steps from `thing` to the value at a dotted name.
 
     Args:
         thing: a struct. Static fields, and fields that are None, cannot be named.
-        name: fields, places in tuples and arrays, entries of dictionaries; fields declared `unnamed` are left out.
-        refusal: the beginning of the sentence that refuses a name.
+        name: names of fields, indices of tuples and arrays, keys of dictionaries. Fields declared `unnamed` are left
+            out of the name.
+        refusal: beginning of the error message.
 
     Raises:
-        InputError: a name that leads nowhere, with a hint.
+        InputError: there is no value with this name. The message suggests a similar name.
     """
     steps: list[PathStep] = []
     path, inside = name.split("."), thing
@@ -82,14 +83,14 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
 
 
 def _names_that_end_in(thing: object, name: str) -> list[str]:
-    """At most three dotted names of numbers that end in `name`. Capital letters and a unit in brackets are ignored."""
+    """Return at most three dotted names of numbers that end in `name`. Case and a unit in brackets are ignored."""
     end = name.partition("[")[0].strip().lower()
     every = _names_of_numbers(thing) if end else ()
     return list(itertools.islice((own for own in every if f".{own}".lower().endswith(f".{end}")), 3))
 
 
 def _names_of_numbers(struct: object, before: str = "") -> Iterator[str]:
-    """Dotted names of all fields with numbers in a struct and in the structs inside it."""
+    """Yield the dotted names of all fields with numbers in a struct and in the structs inside it."""
     for field in dataclasses.fields(struct) if dataclasses.is_dataclass(struct) else ():
         value = getattr(struct, field.name)
         own = before if field.metadata.get("unnamed") else f"{before}{field.name}."
@@ -104,7 +105,10 @@ def _names_of_numbers(struct: object, before: str = "") -> Iterator[str]:
 
 
 def _keys(thing: Any, path: list[str], refusal: str, before: str) -> tuple[list, list[str]]:
-    """The keys for the first words of a path, and the remaining words. `before`: the part of the name up to there."""
+    """Return the keys for the first words of a path, and the remaining words.
+
+    `before` is the part of the dotted name before the path.
+    """
     word, rest = path[0], path[1:]
     if dataclasses.is_dataclass(thing):
         return _keys_of_struct(thing, path, refusal, before)
@@ -138,9 +142,9 @@ def _keys_of_struct(thing: Any, path: list[str], refusal: str, before: str) -> t
 
 
 def _is_place(word: str) -> bool:
-    """Whether a word is an index as Python writes it: 2, but not 02, which would be a second name for 2."""
+    """Return whether a word is an index as Python writes it: 2, but not 02, which would be a second name for 2."""
     return word.isascii() and word.isdigit() and str(int(word)) == word
 
 
 def _nowhere(word: str, places: int) -> str:
-    return f"{word!r} leads nowhere" + (f": it has places 0 to {places - 1}" if places else "")
+    return f"{word!r} leads nowhere" + (f": use an index from 0 to {places - 1}" if places else "")

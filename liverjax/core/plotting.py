@@ -1,21 +1,21 @@
-"""Pictures: colours, and Matplotlib for drawing to files."""
+"""Colours of figures, and Matplotlib for drawing to files."""
 
 import os
 import threading
 from pathlib import Path
 from typing import Any
 
-#: The colours of Okabe and Ito: people with any kind of colour vision can distinguish them.
+#: The colours of Okabe and Ito, which people with any kind of colour vision can distinguish.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 
 def pyplot() -> Any:
-    """Matplotlib's `pyplot`, set to work without a screen.
+    """Return Matplotlib's `pyplot`, set to work without a screen.
 
-    It is imported only if needed, because the import is slow.
+    Matplotlib is imported only if needed, because the import is slow.
     """
-    os.environ["MPLBACKEND"] = "Agg"  # with an unknown name there the import would fail
+    os.environ["MPLBACKEND"] = "Agg"  # an unknown backend in this variable would stop the import
     import matplotlib
 
     matplotlib.use("Agg")
@@ -25,7 +25,7 @@ def pyplot() -> Any:
 
 
 def import_meanwhile() -> None:
-    """Start to import pyplot in a thread. It takes a second, during which a computation outside of Python can run."""
+    """Import pyplot in a thread. The import takes a second; meanwhile, a computation outside of Python can run."""
     threading.Thread(target=pyplot, daemon=True).start()
 
 

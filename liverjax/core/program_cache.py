@@ -1,7 +1,8 @@
-"""Compiled programs on disk, so that a machine compiles each program only once: JAX's cache in a separate folder.
+"""Keep compiled programs on disk, so that a machine compiles each program only once.
 
-The folder is in the user's cache directory. Its name depends on the releases, the sources and the processor, so no
-other release, checkout or machine uses its programs. `LIVERJAX_CACHE` can name another folder; "off" means no cache.
+This is JAX's cache in a separate folder of the user's cache directory. The name of the folder depends on the releases,
+the sources and the processor, so no other release, checkout or machine uses its programs. The environment variable
+`LIVERJAX_CACHE` can name another folder; "off" means no cache.
 """
 
 import hashlib
@@ -15,10 +16,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 SWITCH = "LIVERJAX_CACHE"
-#: Maximum size on disk [bytes]. Above it, the next command removes the programs that were not used for the longest
-#: time. A program takes 10 kB to 1 MB.
+#: Maximum size of all programs on disk [bytes]. If they are larger, the next command removes the programs that were not
+#: used for the longest time. A program takes 10 kB to 1 MB.
 LIMIT = 500_000_000
-#: A program is not kept if it compiles faster than this [s]. To find a program takes a few milliseconds.
+#: A program is not kept if its compilation takes less than this time [s]. Finding a program takes a few milliseconds.
 WORTH_KEEPING = 0.05
 
 
@@ -26,17 +27,17 @@ _in_use: list[Path] = []
 
 
 def folder() -> Path | None:
-    """The folder in which programs are kept now; `None` outside of `kept_on_disk`, or without a cache."""
+    """Return the folder in which programs are kept now. Returns None outside of `kept_on_disk`, or without a cache."""
     return _in_use[-1] if _in_use else None
 
 
 @contextmanager
 def kept_on_disk() -> Iterator[Path | None]:
-    """Read and write compiled programs on disk inside this context. It gives the folder, or `None` without a cache.
+    """Read and write compiled programs on disk inside this context. It yields the folder, or None without a cache.
 
-    There is no cache if `LIVERJAX_CACHE` is "off" or if the folder cannot be written. There is none either if the user
-    has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`): then JAX uses that folder. Entries that cannot be
-    read are compiled again.
+    There is no cache if `LIVERJAX_CACHE` is "off" or if the folder cannot be written. If the user has set a folder for
+    JAX's cache (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder, and there is no cache here. Programs that cannot
+    be read are compiled again.
     """
     chosen = _folder()
     with warnings.catch_warnings():
@@ -67,15 +68,15 @@ def _switch_on(folder: Path) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
     # JAX sets TF_CPP_MIN_LOG_LEVEL to 1 if it is not set.
     if "JAX_LOGGING_LEVEL" not in os.environ and os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
-        # For every CPU program that it reads, XLA writes an error: it treats two of its tuning flags as missing
+        # XLA writes an error for every CPU program that it reads, because it treats two of its tuning flags as missing
         # features of the processor. The folder is only for this processor, so the error has no meaning here.
         jax.config.update("jax_logging_level", "CRITICAL")
 
 
 def _folder() -> Path | None:
-    """The folder for these releases, these sources and this processor.
+    """Return the folder for these releases, these sources and this processor.
 
-    It is made if missing; `None` without a cache.
+    The folder is made if it does not exist. Returns None without a cache.
     """
     chosen = os.environ.get(SWITCH, "")
     if chosen.lower() == "off" or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
@@ -99,11 +100,11 @@ def _user_cache() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches"
     given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return given if given.is_absolute() else Path.home() / ".cache"  # by the rules of XDG relative paths are ignored
+    return given if given.is_absolute() else Path.home() / ".cache"  # XDG's rules ignore relative paths
 
 
 def _name() -> str:
-    """Name of the folder: the releases, and a digest of sources and processor."""
+    """Return the name of the folder: the releases, and a digest of sources and processor."""
     import liverjax
 
     package = Path(liverjax.__file__).parent
@@ -114,7 +115,7 @@ def _name() -> str:
 
 
 def _processor() -> str:
-    """Kind and features of the processor: a program that is compiled for one processor may not run on another."""
+    """Return kind and features of the processor. A program compiled for one processor may not run on another."""
     said = f"{platform.system()} {platform.machine()} {platform.processor()}\n"
     try:
         first = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0]
@@ -125,7 +126,7 @@ def _processor() -> str:
 
 
 def _forgotten(folder: Path, message: str) -> bool:
-    """Whether a warning is about the cache. A broken entry in the warning is removed, since JAX would keep it."""
+    """Return whether a warning is about the cache. If it names a broken entry, remove it, since JAX would keep it."""
     if "persistent compilation cache" not in message:
         return False
     if "reading" in message:
@@ -136,7 +137,7 @@ def _forgotten(folder: Path, message: str) -> bool:
 
 
 def bound(root: Path, limit: int = LIMIT) -> None:
-    """Remove the programs with the oldest last use, until all releases together take less than `limit` bytes."""
+    """Remove the least recently used programs, until all releases together take at most `limit` bytes."""
     entries = []
     for entry in root.glob("*/*-cache"):
         try:

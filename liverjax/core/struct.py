@@ -13,9 +13,9 @@ T = TypeVar("T")
 Number = float | np.ndarray | jax.Array
 #: Numbers as a user writes them: one number, a sequence of numbers, or an array.
 Numbers = Number | Sequence[float] | Sequence[Sequence[float]]
-#: An array of NumPy (on the host) or of JAX.
+#: An array of NumPy or of JAX.
 Array = np.ndarray | jax.Array
-#: Numbers of nodes, elements or triangles.
+#: Index numbers of nodes, elements or triangles.
 Indices = Array
 #: A table of a TOML file, or the content of a JSON file. The values are checked when they are read.
 Content = dict[str, Any]
@@ -24,11 +24,11 @@ Content = dict[str, Any]
 def static(
     default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None, words: Sequence[str] = ()
 ) -> Any:
-    """A field that is part of the structure, for example a tag or a count.
+    """Declare a field that is part of the structure, for example a tag or a count.
 
-    It has no gradient, and a change compiles again.
+    The field has no gradient, and a new value compiles a new program.
 
-    With `lower` its value must be a whole number, `lower` or more. With `words` its value must be one of these words
+    With `lower`, the value must be a whole number, `lower` or more. With `words`, the value must be one of these words
     (see `liverjax.core.bounds`).
     """
     metadata = {"static": True, "about": about, "lower": lower, "words": tuple(words)}
@@ -41,7 +41,7 @@ class Limits(TypedDict, total=False):
     lower: float  # inclusive
     upper: float  # inclusive
     above: float  # strict
-    nonzero: bool  # 0 is refused
+    nonzero: bool  # 0 is not allowed
 
 
 def param(
@@ -53,7 +53,7 @@ def param(
     default: Any = dataclasses.MISSING,
     **limits: Unpack[Limits],
 ) -> Any:
-    """A numeric field, a leaf of the pytree.
+    """Declare a numeric field, which is a leaf of the pytree.
 
     Args:
         unit: SI unit, ``"1"`` for a pure number. Fields in ``Pa`` scale together in `liverjax.laws.scaled`.
@@ -62,8 +62,8 @@ def param(
         typical: value for a soft tissue with a shear modulus of about 1 kPa. It is used if only the name of a law is
             given.
         default: as in `dataclasses.field`.
-        limits: ``lower`` and ``upper``, inclusive bounds; ``above``, a strict lower bound; ``nonzero=True``, 0 is
-            refused.
+        limits: ``lower`` and ``upper`` are inclusive bounds; ``above`` is a strict lower bound; ``nonzero=True`` means
+            that 0 is not allowed.
     """
     unknown = limits.keys() - Limits.__annotations__.keys()
     if unknown:
@@ -79,12 +79,12 @@ def param(
 
 
 def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.MISSING) -> Any:
-    """A field that contains structs. Its name is left out of their dotted names: `law.mu`, not `law.law.mu`.
+    """Declare a field that contains structs. Dotted names leave out its name: `law.mu`, not `law.law.mu`.
 
     Args:
-        about: one line on the field.
-        places: name of a method that returns, for a word, indices in this field: `support.0` is at the first index of
-            ``named("support")``.
+        about: one line about the field.
+        places: name of a method that returns the indices in this field for a word. For example, `support.0` is at the
+            first index of ``named("support")``.
         default: as in `dataclasses.field`.
     """
     return dataclasses.field(default=default, metadata={"about": about, "unnamed": places or True})

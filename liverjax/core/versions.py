@@ -5,7 +5,7 @@ from importlib.metadata import version
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, liverjax, jax, jaxlib, numpy and scipy."""
+    """Return the versions of Python, liverjax, jax, jaxlib, numpy and scipy."""
     import liverjax
 
     own = {"python": platform.python_version(), "liverjax": liverjax.__version__}

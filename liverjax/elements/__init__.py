@@ -1,1 +1,1 @@
-"""Force and stiffness of elements: MJED, references for it, and a stiffness without negative eigenvalues."""
+"""Force and stiffness of elements: MJED, reference methods, and a stiffness without negative eigenvalues."""

@@ -10,18 +10,18 @@ from liverjax.tensors.matrices import Matrix, Vector, cofactor, deformation_grad
 
 
 def volume_gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
-    """dJ/dx_a = cof(F) D_a of the four corners at every integration point."""
+    """Derivatives dJ/dx_a = cof(F) D_a (shape vectors D_a) for the four corners a at every integration point."""
     cof = cofactor(F)
     g = [matvec(cof, tuple(mesh.gradients[a])) for a in range(3)]
     return [tuple(-(x + y + z) for x, y, z in zip(*g, strict=True)), *g]
 
 
 def volume_ratios(mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """J of every element at positions x (V, 3) [m]: (1, E), or in quadratic elements (Q + 4, E), at points and
-    vertices.
+    """Volume ratios J of every element at positions x (V, 3) [m].
 
-    A quadratic element can be inverted between its integration points although it is not inverted at these points. It
-    is inverted first at the vertices.
+    The shape is (1, E) for linear elements. For quadratic elements it is (Q + 4, E): Q integration points, 4 vertices.
+    A quadratic element can be inverted between its integration points although it is not inverted at these points.
+    Inversion begins at the vertices, so J is also computed there.
     """
     J = determinant(deformation_gradient(mesh, x))
     if mesh.order == 1:

@@ -1,15 +1,16 @@
-"""MJED: force and stiffness of tetrahedra from hand-derived terms, for all terms of the energy at once.
+"""MJED (Multiplicative Jacobian Energy Decomposition): force and stiffness of tetrahedra from hand-derived formulas.
 
-It follows the chapter's section 4.1.2, with J as an additional invariant. Scalars are summed before the assembly:
+The formulas follow section 4.1.2 of the chapter, with J as one of the invariants I_a. W_a and W_ab are the first and
+second derivatives of the energy W with respect to I_a, I_b. They are summed over all terms of W before the assembly:
 
     f_i  = V0 sum_a W_a v_a,i                                             v_a,i = dI_a/dx_i
     K_ij = V0 [ sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j ]
 
-So the cost does not grow with the number of terms g^k h^k. No matrix is inverted. In all functions the force is the
-gradient of the energy, f = + dW/dx; the nodal force in the chapter is -dW/dx.
+So the cost does not grow with the number of terms g^k(I1, I2) h^k(J) of W. No matrix is inverted. In all functions the
+force is the gradient of the energy, f = + dW/dx; the nodal force in the chapter is -dW/dx.
 
-A linear element has one integration point. At each point of a quadratic element the terms are the same, for the corners
-that `liverjax.mesh.shape_functions` describes.
+A linear element has one integration point. At each point of a quadratic element the formulas are the same, with the
+corners that `liverjax.mesh.shape_functions` describes.
 """
 
 from functools import partial
@@ -30,7 +31,7 @@ from liverjax.tensors.matrices import Matrix, deformation_gradient, dot, stored,
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Blocks that are computed. The other blocks follow from them.
+#: Corner pairs of the blocks that are computed. The other blocks follow from these.
 _PAIRS = ((1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 
 
@@ -41,7 +42,7 @@ def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
-    """Nodal forces (V, 3) [N] from first Piola-Kirchhoff stresses P [Pa]: the sum of V0 P D_a over the points."""
+    """Nodal forces (V, 3) [N] due to first Piola-Kirchhoff stresses P [Pa]: sums of V0 P D_a over the points."""
     D, V0 = mesh.gradients, mesh.weights
     forces: Any = [[V0 * dot(P[i], tuple(D[a])) for i in range(3)] for a in range(3)]
     if mesh.order > 1:
@@ -51,7 +52,7 @@ def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
 
 @jax.jit
 def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Gradient of the total energy with respect to the positions, (V, 3) [N]: + dW/dx.
+    """Gradient (V, 3) [N] of the total energy with respect to the positions: + dW/dx.
 
     Args:
         mesh: `TetMesh`.
@@ -62,7 +63,7 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def linear_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
-    """Derivative of `internal_force` at the reference shape along a motion (V, 3) [m]: (V, 3) [N].
+    """Derivative (V, 3) [N] of `internal_force` at the reference shape in the direction of a motion (V, 3) [m].
 
     The deformation gradient and the sum at nodes are linear, so only the stress has to be differentiated.
     """
@@ -76,7 +77,7 @@ def element_stiffness(
 ) -> dict[tuple[int, int], Matrix]:
     """Blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3 at every point: 45 different entries per point.
 
-    `terms` is "contracted", or "chapter" for the chapter's six terms per product (`liverjax.laws.terms.chapter_terms`).
+    `terms` is "contracted", or "chapter": six terms for each product g h of W (`liverjax.laws.terms.chapter_terms`).
     The other blocks follow from the symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
     """
     F, pairs = stored(deformation_gradient(mesh, x)), tuple((a - 1, b - 1) for a, b in _PAIRS)
@@ -95,7 +96,7 @@ def element_stiffness(
 
 
 def all_blocks(blocks: dict[tuple[int, int], Matrix]) -> list[list[Matrix]]:
-    """The 4 x 4 blocks of every element, from the six blocks of `element_stiffness`."""
+    """Return all 4 x 4 blocks of every element, from the six blocks of `element_stiffness`."""
 
     def negative_sum(*matrices: Matrix) -> Matrix:
         return tuple(tuple(-(a + b + c) for a, b, c in zip(*rows, strict=True)) for rows in zip(*matrices, strict=True))
@@ -114,7 +115,7 @@ _ENTRIES = [(a, b, r, c) for a, b in _PAIRS for r in range(3) for c in range(r i
 
 
 def _expansion() -> np.ndarray:
-    """Matrix (45, 144) that makes the element matrix from its 45 different entries."""
+    """Matrix (45, 144) that expands the 45 different entries of an element matrix to all 144 entries."""
     basis = dict(zip(_ENTRIES, np.eye(45), strict=True))
     blocks = {
         (a, b): tuple(
@@ -133,16 +134,16 @@ _EXPANSION = _expansion()
 def element_matrices(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> jax.Array:
-    """Element stiffness matrices (E, 9 n^2) [N/m] of n nodes, degree of freedom 3 * local node + component."""
+    """Stiffness matrices (E, 9 n^2) [N/m] of elements with n nodes. Degree of freedom: 3 * local node + component."""
     K = element_stiffness(mesh, law, x, regularised, terms)
     entries = [K[a, b][r][c] for a, b, r, c in _ENTRIES]
-    # A product with a constant matrix gives all 144 entries. Stacking them one by one triples the time to compile.
+    # A product with a constant matrix gives all 144 entries. Stacking the entries one by one triples the compile time.
     corners = jnp.stack(jnp.broadcast_arrays(*entries), axis=-1) @ jnp.asarray(_EXPANSION, x.dtype)
     return corners if mesh.order == 1 else of_nodes(mesh.order, corners)
 
 
 def of_nodes(order: int, corners: jax.Array) -> jax.Array:
-    """Element matrices (E, 9 n^2) of n nodes, from the matrices (Q, E, 144) of the corners of every point."""
+    """Matrices (E, 9 n^2) of elements with n nodes, from the matrices (Q, E, 144) of the corners at every point."""
     Q, E = corners.shape[:2]
     c = jnp.asarray(basis(order).c, corners.dtype)
     K = jnp.einsum("akq,qekilj,blq->eaibj", c, corners.reshape(Q, E, 4, 3, 4, 3), c)
@@ -150,7 +151,7 @@ def of_nodes(order: int, corners: jax.Array) -> jax.Array:
 
 
 def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
-    """Global matrix (3V, 3V) of element matrices (E, 9 n^2) of n nodes, degree of freedom 3 * node + component."""
+    """Assemble element matrices (E, 9 n^2) to a matrix (3V, 3V). Degree of freedom: 3 * node + component."""
     import scipy.sparse  # imported here, since it takes a fifth of the package's import time
 
     nodes = mesh.element_nodes_on_host.T
@@ -163,13 +164,13 @@ def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
 def stiffness_matrix(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> "scipy.sparse.csr_array":
-    """Second derivative of the total energy, scipy.sparse (3V, 3V) [N/m], degree of freedom 3 * node + component.
+    """Second derivative of the total energy, a sparse matrix (3V, 3V) [N/m]. Degree of freedom: 3 * node + component.
 
     Args:
         mesh, law, x: as in `internal_force`.
         regularised: use the regularisation of section 4.1.2 iii, with an unchanged trace. It changes the path of
-            Newton's iteration, but not its root.
-        terms: "contracted", or "chapter" for the chapter's six terms per product g(I1, I2) h(J). Both agree up to
-            roundoff.
+            Newton's iterations, but not their solution.
+        terms: "contracted", or "chapter" for the six terms per product g(I1, I2) h(J) of the chapter. Both give
+            the same matrix up to roundoff.
     """
     return sparse(mesh, np.asarray(element_matrices(mesh, law, x, regularised, terms)))

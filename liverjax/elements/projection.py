@@ -1,4 +1,4 @@
-"""Element stiffness without negative eigenvalues, from the singular values of F: no LAPACK call, no inverse.
+"""Element stiffness without negative eigenvalues, from the singular values of F, without LAPACK or an inverse.
 
 Let F = U diag(s) V^T. In the axes of U and V, the second derivative of an isotropic energy has two kinds of blocks: one
 3 x 3 matrix for the three stretches, and one 2 x 2 matrix [[a, b], [b, a]] for each pair of axes. The eigenvalues of
@@ -6,9 +6,9 @@ the 2 x 2 matrix are a - b (twist) and a + b (flip) (Smith, De Goes, Kim 2019, A
 distortion energies). Negative eigenvalues are replaced by their absolute values (Chen et al. 2024). Then the blocks are
 rotated back.
 
-Fibres, energies of Green's strain and the memory of viscosity have other axes. For Green's strain and viscosity the
-geometric stiffness uses the projected S. The negative part of the stiffness of a fibre is left out. Then no part has a
-negative eigenvalue, so their sum has none.
+The terms of fibres, of Green's strain and of the viscous memory have other axes. For Green's strain and viscosity, the
+geometric stiffness uses the stress S, with its eigenvalues replaced by their absolute values. The negative part of the
+stiffness of a fibre is left out. Then no term has a negative eigenvalue, and the sum of the terms has none.
 """
 
 from typing import Any, NamedTuple
@@ -43,7 +43,7 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 class Frame(NamedTuple):
-    """F = U diag(s) V^T with rotations U and V. The last and smallest s is negative if F is inverted."""
+    """Decomposition F = U diag(s) V^T with rotations U and V. The last, smallest s is negative if det F < 0."""
 
     U: Matrix
     s: Vector
@@ -53,7 +53,7 @@ class Frame(NamedTuple):
 def frame(F: Matrix) -> Frame:
     """Signed singular values of a tuple matrix F, the largest first, and their axes.
 
-    Axes of values that are 0 are arbitrary.
+    The axes of singular values 0 are arbitrary.
     """
     _, axes = principal(F)
     n = list(transpose(axes))
@@ -91,14 +91,14 @@ def blocks(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """Blocks as from `invariant_terms.blocks`, but such that the element matrix has no negative eigenvalue.
+    """Stiffness blocks as in `invariant_terms.blocks`, but the element matrix has no negative eigenvalue.
 
     Args:
-        parts: pairs (weight, law) that add up.
+        parts: pairs (weight, law); the energy is the weighted sum.
         S: constant second Piola-Kirchhoff stress that is added, or None.
-        F: tuple matrix.
+        F: deformation gradient, a tuple matrix.
         D: shape vectors of the nodes.
-        pairs: which blocks, as indices into D.
+        pairs: node pairs of the blocks, as indices into D.
         volume: derivatives of a volumetric energy that is added, or None.
     """
     if any(law.subsets is not None for _, law in parts):
@@ -136,7 +136,7 @@ def blocks(
 def _by_subset(
     parts: list[tuple[Number, Law]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple, volume: Scalars | None
 ) -> list[Matrix]:
-    """`blocks` for laws of several kinds, each in the elements of its region."""
+    """Compute `blocks` for laws of several kinds, each only in the elements of its region."""
     groups = next(law.subsets for _, law in parts if law.subsets is not None)
 
     def own(k: int) -> list[Matrix]:
@@ -155,7 +155,7 @@ def regularised(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """`blocks` with the chapter's regularisation instead of the projection. Eigenvalues may still be negative."""
+    """Stiffness blocks with the regularisation of the chapter. Eigenvalues may still be negative (see `blocks`)."""
     result = [_diagonal_matrix(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
 
     def with_more(weight: Number, state: invariant_terms.State | invariant_terms.Pieces) -> list[Matrix]:
@@ -178,7 +178,10 @@ def _diagonal_matrix(value: Any) -> Matrix:
 
 
 def _fibre(W4: Number, W44: Number, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """2 W_4 (a.D_i)(a.D_j) Id + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa, with only the positive part of each eigenvalue."""
+    """Fibre stiffness 2 W_4 (a.D_i)(a.D_j) Id + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa; negative eigenvalues are set to 0.
+
+    W_4 and W_44 are derivatives with respect to I4, and a is the fibre direction.
+    """
     Fa = matvec(F, a)
     across = jnp.maximum(2 * W4, 0.0)
     along = jnp.maximum(2 * W4 + 4 * W44 * dot(Fa, Fa), 0.0)
@@ -189,7 +192,7 @@ def _fibre(W4: Number, W44: Number, a: Vector, F: Matrix, D: list[Vector], pairs
 
 
 def projected(A: Matrix) -> Matrix:
-    """The symmetric tuple matrix with its eigenvalues replaced by their absolute values."""
+    """Replace the eigenvalues of a symmetric tuple matrix by their absolute values."""
     axes = symmetric_axes(A)
     n = transpose(axes)
     return _from_axes([abs(dot(a, matvec(A, a))) for a in n], n)

@@ -1,7 +1,6 @@
-"""References: force and stiffness by automatic differentiation of the energy, and by standard finite elements.
+"""Reference methods: force and stiffness by automatic differentiation of the energy, and by standard finite elements.
 
-They do not use the hand-derived terms: everything here starts only from `law.strain_energy`. Speed does not matter
-here.
+These methods do not use the hand-derived formulas. They start only from `law.strain_energy`, and speed does not matter.
 """
 
 from typing import TYPE_CHECKING
@@ -40,7 +39,7 @@ def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 @jax.jit
 def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Gradient of the total energy by reverse mode, (V, 3) [N]."""
+    """Gradient (V, 3) [N] of the total energy, by reverse-mode differentiation."""
     return jax.grad(energy, argnums=2)(mesh, law, x)
 
 
@@ -55,13 +54,13 @@ def _hessians(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.sparse.csr_array":
-    """Hessian of the total energy by forward over reverse mode, element by element, (3V, 3V) [N/m]."""
+    """Hessian (3V, 3V) [N/m] of the total energy, by forward-over-reverse differentiation of each element."""
     return sparse(mesh, np.asarray(_hessians(mesh, law, x)))
 
 
 @jax.jit
 def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Standard finite elements: B^T S with S = 2 dW/dC, (V, 3) [N]."""
+    """Nodal forces (V, 3) [N] of standard finite elements: B^T S with S = 2 dW/dC (B: `_strain_displacement`)."""
     F, law = _gradient(mesh, x), mesh.at_points(law)
     S = _second_piola(law, F)
     B = _strain_displacement(F, _all_shape_vectors(mesh))
@@ -88,12 +87,12 @@ def _standard_entries(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.sparse.csr_array":
-    """Standard finite elements: B^T D B plus the geometric term, (3V, 3V) [N/m] (Zienkiewicz and Taylor 2000)."""
+    """Stiffness (3V, 3V) [N/m] of standard finite elements, B^T D B + geometric part (Zienkiewicz and Taylor 2000)."""
     return sparse(mesh, np.asarray(_standard_entries(mesh, law, x)))
 
 
 def _all_shape_vectors(mesh: TetMesh) -> jax.Array:
-    """Gradients of the shape functions: (E, 4, 3) in linear elements, else (Q, E, n, 3)."""
+    """Gradients of the shape functions: (E, 4, 3) for linear elements, otherwise (Q, E, n, 3)."""
     D = jnp.transpose(mesh.shape_vectors, (2, 0, 1))
     D = jnp.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
     return D if mesh.order == 1 else jnp.einsum("akq,ekj->qeaj", jnp.asarray(basis(mesh.order).c, D.dtype), D)
@@ -105,7 +104,7 @@ def _gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
 
 
 def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:
-    """W as a function of C, with the Cholesky factor as F: then F^T F = C and J > 0, also for laws with fibres."""
+    """Energy W as a function of C. The Cholesky factor serves as F: F^T F = C and J > 0. Fibres are also possible."""
     return law.energy(jnp.swapaxes(jnp.linalg.cholesky(0.5 * (C + jnp.swapaxes(C, -1, -2))), -1, -2))
 
 
@@ -122,7 +121,7 @@ def _voigt(S: jax.Array) -> jax.Array:
 
 
 def _strain_displacement(F: jax.Array, D: jax.Array) -> jax.Array:
-    """B (..., E, 6, n, 3): derivative of Green's strain (shears doubled) with respect to the position of each node."""
+    """Matrix B (..., E, 6, n, 3): derivative of Green's strain (shears doubled) with respect to the node positions."""
     rows = []
     for i, j in _VOIGT:
         term = jnp.einsum("...k,...a->...ak", F[..., :, i], D[..., :, j])

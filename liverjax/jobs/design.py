@@ -1,4 +1,4 @@
-"""Tables of parameters for a sweep: a grid, a Latin hypercube, a Sobol sequence."""
+"""Make tables of parameters for a sweep: a grid, a Latin hypercube or a Sobol sequence."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ _BEGINNINGS = tuple(f"# {kind}".encode() for kind in KINDS)
 
 
 def number_of(text: str) -> float:
-    """The number in a cell of a table. Other than in Python, underscores and digits of other scripts are not allowed.
+    """Convert a cell of a table to a number. Unlike in Python, underscores and non-ASCII digits are not allowed.
 
     Raises:
         ValueError: the text is not such a number.
@@ -24,10 +24,10 @@ def number_of(text: str) -> float:
 
 
 def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
-    """``law.mu=500:1000`` as {name: (low, high)}.
+    """Convert texts such as ``law.mu=500:1000`` to {name: (low, high)}.
 
     Raises:
-        InputError: a text that is not a range of numbers, a range with low >= high, a name that occurs twice.
+        InputError: a text is not a range of numbers, a range has low >= high, or a name occurs twice.
     """
     ranges: dict[str, tuple[float, float]] = {}
     for text in given:
@@ -39,24 +39,24 @@ def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
             raise InputError(f"{text!r} does not rise: write name=low:high, e.g. law.mu=500:1000")
         if not name.strip():
-            raise InputError(f"{text!r} names no number: write name=low:high, e.g. law.mu=500:1000")
+            raise InputError(f"{text!r} contains no name: write name=low:high, e.g. law.mu=500:1000")
         if name in ranges:
-            raise InputError(f"{name} has two ranges: leave one out")
+            raise InputError(f"{name} has two ranges: remove one of them")
         ranges[name] = (low, high)
     return ranges
 
 
 def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol", seed: int = 0) -> np.ndarray:
-    """Rows (N, P) in the box of the ranges.
+    """Return a table (N, P) of parameter sets within the ranges, with one set per row.
 
     Args:
-        ranges: low and high of every parameter.
-        rows: number of rows. A grid has at most this number, with the same number of values of each parameter.
-        kind: "grid", "latin" (hypercube) or "sobol" (balanced if `rows` is a power of 2), from SciPy.
-        seed: seed of "latin" and "sobol".
+        ranges: lower and upper bound of every parameter.
+        rows: number of rows. A grid has the same number of values of each parameter, and at most this number of rows.
+        kind: "grid", "latin" (hypercube) or "sobol" (balanced if `rows` is a power of 2). The last two use SciPy.
+        seed: random seed of "latin" and "sobol".
 
     Raises:
-        InputError: an unknown kind, no rows, too few rows for two values of each parameter of a grid.
+        InputError: an unknown kind, no rows, or a grid with too few rows for two values of each parameter.
     """
     from scipy.stats import qmc
 
@@ -64,7 +64,7 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
         raise InputError(f"--kind {kind} is not known: use {', '.join(KINDS)}")
     if rows < 1 or not ranges:
         raise InputError(
-            f"--rows {rows} with {len(ranges)} parameters makes no table: give one row and one parameter or more"
+            f"--rows {rows} with {len(ranges)} parameters makes no table: give at least one row and one parameter"
         )
     low, high = np.array(list(ranges.values())).T
     if kind == "grid":
@@ -92,7 +92,7 @@ def write_table(file: Path, names: list[str], rows: np.ndarray, note: str) -> No
     text = f"# {note}\n" + "".join(",".join(line) + "\n" for line in lines)
     try:
         if file.is_file() and file.stat().st_size and not file.read_bytes().startswith(_BEGINNINGS):
-            raise InputError(f"{file} is there and is no table of design: name another file, or remove it")
+            raise InputError(f"{file} exists and is not a table of design: name another file, or remove it")
         if file.exists() and not file.is_file():  # e.g. the terminal, a pipe
             file.write_text(text, encoding="utf-8")
             return

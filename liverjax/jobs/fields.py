@@ -1,7 +1,7 @@
 """Fields of a finished run: stress, strain, stretches, volume ratio, energy, velocity of the fluid.
 
-The equations of every step are evaluated again at the positions of the run. So memories (viscosity, fluid) are the same
-as in the run. Nothing is solved again.
+The equations of every step are evaluated again at the positions of the run. So the history variables (viscous stress,
+fluid) are the same as in the run. Nothing is solved again.
 """
 
 from typing import Any
@@ -33,22 +33,22 @@ FIELDS = {
 
 
 def check(names: list[str], scene: Scene) -> None:
-    """Refuse fields that are not known, or that the scene does not have.
+    """Raise `InputError` if a field is unknown, or if the scene does not have it.
 
     Raises:
-        InputError: one sentence.
+        InputError: the message names the field.
     """
     for name in names:
         if name not in FIELDS:
             raise InputError(f"[output] fields: {name!r} is not known: {hint(name, FIELDS)}")
     if "fluid_velocity" in names and scene.porosity is None:
-        raise InputError("[output] fields: fluid_velocity needs [porosity]: leave it out")
+        raise InputError("[output] fields: fluid_velocity needs [porosity]; remove fluid_velocity")
 
 
 def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarray]:
-    """Fields (T, E, …) of a finished run: means over each element.
+    """Return fields (T, E, …) of a finished run, as means over each element.
 
-    The fields are cauchy_stress (3, 3) [Pa] with the pressure of a fluid, green_strain (3, 3), principal_stretches (3,)
+    The fields are cauchy_stress (3, 3) [Pa] including the fluid pressure, green_strain (3, 3), principal_stretches (3,)
     with the largest first, volume_ratio J, energy [Pa] of the law per reference volume, and fluid_velocity (3,) [m/s]
     relative to the body.
 
@@ -58,7 +58,7 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
         names: some of `FIELDS`.
 
     Raises:
-        InputError: see `check`.
+        InputError: a field is unknown, or the scene does not have it.
     """
     check(names, scene)
     scene, names = prepared(scene), list(dict.fromkeys(names))
@@ -76,11 +76,14 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
 
 @jax.jit
 def _put_again(scene: Scene, sizes: Sizes, state: State, given: Any) -> tuple[State, tuple]:
-    """The state after a step that ended at x; stress, F, energy and the fluid's velocity at the points (…, Q, E)."""
+    """Return the state after a step that ended at positions x, and values at the integration points (…, Q, E).
+
+    These are first Piola-Kirchhoff stress, deformation gradient F, energy density and fluid velocity.
+    """
     k, x, pressure = given
     mesh, e = scene.mesh, equations(scene, state, k, sizes)
     F = deformation_gradient(mesh, x)
-    if e.mixed is not None:  # the result has no such pressures, but they follow from the volumes
+    if e.mixed is not None:  # mixed pressures are not in the result, but follow from the volumes
         pressure = e.mixed.settled(mesh, determinant(F))
     P = _whole_stress(e, F, pressure)
     law = law_at_rest(scene)
@@ -116,7 +119,7 @@ def _velocity(scene: Scene, F: Matrix, pressure: jax.Array) -> jax.Array:
 
 
 def _means(P: np.ndarray, F: np.ndarray, energy: np.ndarray, velocity: np.ndarray, names: list[str]) -> dict:
-    """Fields of the elements (E, …) from values at integration points."""
+    """Return the fields of the elements (E, …) from values at the integration points."""
     turned, J = np.swapaxes(F, -1, -2), np.linalg.det(F)
     make = {
         "cauchy_stress": lambda: P @ turned / J[..., None, None],
@@ -127,12 +130,12 @@ def _means(P: np.ndarray, F: np.ndarray, energy: np.ndarray, velocity: np.ndarra
         "fluid_velocity": lambda: np.moveaxis(velocity, 0, -1),
     }
     found = {name: make[name]() for name in names}
-    # Points of a quadratic element have the same weight.
+    # All integration points of a quadratic element have the same weight.
     return {name: value if J.ndim == 1 else value.mean(axis=0) for name, value in found.items()}
 
 
 def at_vertices(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
-    """Fields at the vertices (T, V, …): means of the surrounding elements (T, E, …), weighted by volume."""
+    """Return fields at the vertices (T, V, …): means of the surrounding elements (T, E, …), weighted by volume."""
     tets, volumes = np.asarray(mesh.tetrahedra), np.asarray(mesh.volumes)
     total = np.zeros((len(values), mesh.number_of_vertices, *values.shape[2:]))
     weight = np.zeros(mesh.number_of_vertices)

@@ -1,7 +1,8 @@
-"""A run in parts of some steps: finished parts stay on disk, and a killed run can continue from there.
+"""Run a scene in parts of some steps. Finished parts stay on disk, so that a killed run can continue from there.
 
-A folder next to the output has one file per part, with its rows and the state after its last step. Every part begins
-with a new tangent, also if the run was not stopped before it. So a resumed run gives exactly the same numbers.
+A folder next to the output has one file per part, with the results of its steps and the state after its last step.
+Every part begins with a new tangent matrix, even if the run was not stopped before this part. So a resumed run gives
+exactly the same numbers.
 """
 
 import time
@@ -29,7 +30,7 @@ _ROWS = ("times", "positions", "reactions", "pressure", "status")
 
 
 class Ran(NamedTuple):
-    """A finished run and its computing time. Parts from disk count as 0 s."""
+    """A finished run and its computing time. Parts that were read from disk count as 0 s."""
 
     result: Result  # numpy arrays
     steps: int  # steps that were computed now
@@ -39,11 +40,11 @@ class Ran(NamedTuple):
 
 
 def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
-    """Refuse to overwrite a stopped run, unless it is resumed; refuse to resume the result of another scene.
+    """Raise `InputError` if a run would overwrite a stopped run, or would resume the result of another scene.
 
     Raises:
-        InputError: there are parts on disk and `resume` is false; or `resume` is true and there is a finished result of
-            a scene file with another text.
+        InputError: there are parts on disk and `resume` is false; or `resume` is true and `out` is a finished result of
+            a scene file with another content.
     """
     folder = resumable_parts.beside(out)
     if folder.exists() and not resume:
@@ -55,7 +56,7 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
         except (OSError, tomllib.TOMLDecodeError):  # not a result of a scene
             return
         if before != tomllib.loads(text):  # comments may differ
-            raise InputError(f"{out} is the result of another scene: name another --out, or leave --resume out")
+            raise InputError(f"{out} is the result of another scene: name another --out, or remove --resume")
 
 
 def run(
@@ -74,8 +75,8 @@ def run(
         out: file of the results. The caller writes it, and then removes `resumable_parts.beside(out)`.
         every: number of steps per part.
         resume: whether to continue from the parts on disk.
-        report: function that is called with the number of every finished step, also of steps from disk. The calls come
-            at the end of each part: JAX cannot keep a program on disk that calls back while it runs.
+        report: function that is called with the number of every finished step, including steps from disk. It is called
+            at the end of each part, because JAX cannot keep a program on disk that calls Python while it runs.
 
     Raises:
         InputError: parts on disk without `resume`, parts of another scene, or parts in use by another process.
@@ -90,7 +91,7 @@ def run(
         return _run_parts(scene, steps, None, report)
     resumable_parts.make_folder(folder)
     with resumable_parts.locked(folder / "lock_0"):
-        # The text names files (mesh, history) with content that may change, so all numbers are compared, too.
+        # The text names files (mesh, history) with content that may change, so all numbers are also compared.
         numbers = resumable_parts.digest(*jax.tree.leaves(scene))
         resumable_parts.same(
             {"scene": text, "numbers": numbers, "every": every, "versions": versions()}, folder / "run.json"
@@ -126,7 +127,7 @@ def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[
     return Ran(whole, computed, run_time, compile_time)
 
 
-#: A run with this number of integration points times steps takes about a second.
+#: A run takes about a second if the number of integration points times the number of steps has this value.
 _SHORT = 100_000
 
 

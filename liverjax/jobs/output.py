@@ -1,4 +1,4 @@
-"""Results on disk: HDF5, a ParaView series, a picture."""
+"""Write results to disk: HDF5, a series for ParaView, a picture."""
 
 import json
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 #: Parts of a result with one number per step.
 BY_STEP = ("status", "iterations", "linear_iterations", "cuts", "residual")
-#: Maximum bytes of an attribute: HDF5 allows 64 kB, including its name and shape.
+#: Maximum size of an attribute [bytes]. HDF5 allows 64 kB, including name and shape of the attribute.
 _MOST_IN_ATTRIBUTE = 65_000
 
 
@@ -34,11 +34,11 @@ def write_hdf5(
     fields: dict[str, np.ndarray] | None = None,
     beside: Mapping[str, tuple[np.ndarray, str]] | None = None,
 ) -> None:
-    """Write a run to HDF5: arrays as datasets; status, iterations and `attributes` as attributes.
+    """Write a run to an HDF5 file. Arrays become datasets; status, iterations and `attributes` become attributes.
 
-    The datasets are rows, mesh, `fields` (T, E, …) and `beside` (values and unit). An array with one number per step
-    becomes a dataset if it is too long for an attribute: `read_by_step` reads both. The nodes of quadratic tetrahedra
-    (E, 10) are in the order of VTK.
+    The datasets are the results of all steps, the mesh, `fields` (T, E, …) and `beside` (values and unit). An array
+    with one number per step becomes a dataset if it is too long for an attribute; `read_by_step` reads both forms. The
+    nodes of quadratic tetrahedra (E, 10) are in the order of VTK.
     """
     import h5py
 
@@ -77,12 +77,12 @@ def write_hdf5(
 
 
 def read_by_step(file: "h5py.File", name: str) -> np.ndarray:
-    """The numbers (T,) in a result.h5 with a name of `BY_STEP`. They are an attribute, or a dataset in long runs."""
+    """Read the numbers (T,) with a name of `BY_STEP` from result.h5: an attribute, or in long runs a dataset."""
     return np.asarray(file.attrs[name] if name in file.attrs else file[name][()])
 
 
 def write_reactions(file: Path, scene: Scene, result: Result) -> None:
-    """Write the forces of the held and moved parts over time as CSV."""
+    """Write the forces of the fixed, moved and supported parts over time to a CSV file."""
     names, rows = reaction_table(scene, result)
     lines = [",".join(names), *(",".join(f"{number:.10g}" for number in row) for row in rows)]
     with whole(file) as new:
@@ -112,7 +112,7 @@ def write_vtu(folder: Path, scene: Scene, result: Result, fields: dict[str, np.n
 
 
 def picture(file: Path, scene: Scene, result: Result) -> None:
-    """Draw the body's surface before (grey) and after, coloured by displacement."""
+    """Draw the surface of the body before the run (grey) and after it (coloured by displacement)."""
     before, after = np.asarray(scene.mesh.points), np.asarray(result.positions[-1])
     worst = float(np.asarray(result.statistics.residual).max())
     title = f"step {len(result.times)}, largest residual {worst:.1e} of the forces"

@@ -1,4 +1,4 @@
-"""Pictures of a body's surface, coloured by a field."""
+"""Draw pictures of the surface of a body, coloured by a field."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -13,12 +13,12 @@ from liverjax.mesh.tetrahedra import tet_mesh
 
 
 class Surface(NamedTuple):
-    """The surface to draw."""
+    """The surface to draw, with the text of the picture."""
 
     before: np.ndarray  # (V, 3) [m]
     after: np.ndarray  # (V, 3) [m]
     triangles: np.ndarray  # (m, 3)
-    values: np.ndarray  # (V,) colours
+    values: np.ndarray  # (V,) values that the colours show
     label: str
     title: str
 
@@ -35,7 +35,7 @@ DRAWN = {
 
 
 def draw_surface(file: Path, surface: Surface) -> None:
-    """Draw the surface before (grey) and after (coloured) into a PNG file."""
+    """Draw the surface before (grey) and after the run (coloured) to a PNG file."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     before, after, triangles = surface.before, surface.after, surface.triangles
@@ -59,12 +59,12 @@ def draw_surface(file: Path, surface: Surface) -> None:
 
 
 def of_result(file: Path, name: str, step: int | None = None) -> Surface:
-    """The surface of a result.h5 with a field, `displacement` or `pressure`.
+    """Read the surface from result.h5, with a field, `displacement` or `pressure` as its colour.
 
     Args:
         file: result.h5 of `liverjax simulate`.
         name: name of a field in the file.
-        step: number of the step, from 1; None: the last step.
+        step: number of the step, from 1. None means the last step.
 
     Raises:
         InputError: the file, the field or the step does not exist.
@@ -72,7 +72,7 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
     import h5py
 
     if not file.is_file():
-        raise InputError(f"{file}: there is no such file: give the result.h5 of liverjax simulate")
+        raise InputError(f"{file} does not exist: give the result.h5 of liverjax simulate")
     try:
         with h5py.File(file) as data:
             if "sweep" in data.attrs:
@@ -80,13 +80,13 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
             if "modes" in data:
                 raise InputError(f"{file} holds a reduced model: run it, and draw the result.h5 of that run")
             if "frequencies_Hz" in data:
-                raise InputError(f"{file} holds harmonic motion: write it for ParaView by simulate --vtu")
+                raise InputError(f"{file} holds harmonic motion: write it for ParaView with simulate --vtu")
             tets, before, after = data["tetrahedra"][()][:, :4], data["reference"][()], data["positions"]
             steps, fields = len(after), list(data.get("fields/vertices", ()))
             known = ["displacement", *(["pressure"] if "pressure" in data else []), *fields]
             if name not in known:
                 raise InputError(
-                    f"{file} has no field {name!r}: {hint(name, known)}; it has {', '.join(known)}; liverjax "
+                    f"{file} has no field {name!r}: {hint(name, known)}. The file has {', '.join(known)}; liverjax "
                     "simulate --fields writes more fields"
                 )
             step = steps if step is None else step
@@ -108,7 +108,7 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
 
 
 def _drawn_number(name: str, values: np.ndarray) -> np.ndarray:
-    """One number per vertex (V,) from a field (V, …)."""
+    """Return one number per vertex (V,) from a field (V, …)."""
     if name == "cauchy_stress":
         deviator = values - np.trace(values, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
         return np.sqrt(1.5 * np.sum(deviator**2, axis=(1, 2)))

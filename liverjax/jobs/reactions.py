@@ -1,4 +1,4 @@
-"""Forces on the body over time, for each part that holds it: the table of `reactions.csv`."""
+"""Support forces on the body over time, for each fixed, moved or supported part: the table of `reactions.csv`."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ from liverjax.simulation.run import Result, prepared
 
 
 def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]:
-    """Column names and rows of a table: time, and the force of each part that holds the body.
+    """Return column names and rows of a table with time, and the force of each support on the body.
 
-    Obstacles also have their displacement and the maximum depth of the surface in them.
+    For obstacles, the table also contains their displacement, and the maximum penetration depth of the surface.
     """
     names, columns = ["time"], [np.asarray(result.times)]
 
@@ -42,11 +42,11 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
 
 
 def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
-    """Name -> force (T, 3) [N] of every fixed, displaced and sliding part, from the forces at the nodes (T, V, 3).
+    """Return {name: force (T, 3) [N]} of every fixed, displaced and sliding part, from the nodal forces (T, V, 3).
 
-    A part has the force along the axes that it holds; a sliding part has the force along its normal. If two parts hold
-    the same axis of a node, its force counts only for the first part. So the sum over the parts is the force on the
-    body.
+    The force of a part acts along the axes that the part constrains; the force of a sliding part acts along its normal.
+    If two parts constrain the same axis of a node, the force along this axis counts only for the first part. So the sum
+    over all parts is the total force on the body.
     """
     taken, found = np.zeros(reactions.shape[1:], bool), {}
 
@@ -69,7 +69,7 @@ def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
         if physics.axis:
             found[f"support.{k}"] = along(nodes, [AXES.index(physics.axis)])
             continue
-        # An oblique normal counts only at nodes where it acts: at other nodes all of its axes are already held.
+        # Where other parts already constrain all axes of an oblique normal, the sliding support carries no force.
         normal = np.asarray(physics.normal)
         loose = nodes[~held[nodes][:, np.abs(normal) > 1e-12].all(axis=1)]
         found[f"support.{k}"] = (reactions[:, loose] @ normal).sum(axis=1)[:, None] * normal
@@ -77,11 +77,11 @@ def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:
-    """Name -> force (T, 3) [N] on the body, for supports with springs and for ligaments that end outside of the body.
+    """Return {name: force (T, 3) [N] on the body} of elastic supports, and of ligaments that end outside of the body.
 
     Args:
         scene: the scene that was run.
-        result: `Result` of `liverjax.simulate`, all steps stored.
+        result: `Result` of `liverjax.simulate` with all steps.
     """
 
     def holds(physics: Physics) -> bool:

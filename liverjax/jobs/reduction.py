@@ -1,4 +1,4 @@
-"""Reduced models of scene files: make a model from a table of rows, and use it for a run if its error is small."""
+"""Reduced models of scene files: make a model from training runs, and use the model for a run if its error is small."""
 
 import time
 from pathlib import Path
@@ -25,24 +25,24 @@ from liverjax.solvers.problem import StepStatistics
 
 
 def learnt(model: ReducedModel) -> str:
-    """A sentence on the learnt correction of a model."""
+    """Describe the learnt correction of a model in one sentence."""
     if model.correction is None:
-        return "no correction: too few rows, or none made the errors smaller"
+        return "no correction: too few training runs, or no correction reduced the errors"
     left = np.asarray(model.correction.left)
-    return f"corrected; runs left out are off by {np.median(left):.2g} of their motion (largest {left.max():.2g})"
+    return f"corrected; runs left out have errors of {np.median(left):.2g} of their motion (largest {left.max():.2g})"
 
 
 class Tried(NamedTuple):
     """A run of a scene with its reduced model."""
 
     ran: Ran | None  # None: the estimated error is above the tolerance, or a step failed
-    sentence: str  # on the outcome
+    sentence: str  # a description of the outcome
 
 
 def make(
     scene_file: Path, rows_file: Path, out: Path, tolerance: float, modes: int, runs: int | None = None
 ) -> ReducedModel:
-    """Run the rows of a table with the full model, and write the reduced model that is made from these runs.
+    """Run the full model for each row of a table, and write the reduced model that is made from these runs.
 
     Raises:
         InputError: an unusable scene, table, tolerance or output.
@@ -64,10 +64,10 @@ def make(
 
 
 def tried(scene: Scene) -> Tried:
-    """The run of a scene that names a reduced model in [solve], with its estimated error.
+    """Run a scene with the reduced model that its [solve] names, and estimate the error.
 
     Raises:
-        InputError: no such model, or a model of another scene.
+        InputError: the model does not exist, or belongs to another scene.
     """
     solve = scene.solve
     model, plain = load_reduced(solve.reduced), replace(scene, solve=replace(solve, reduced=""))
@@ -94,7 +94,7 @@ def tried(scene: Scene) -> Tried:
         small, beside["reduced_pressure_error"] = small and off.max() <= solve.reduced_tolerance * whole, (off, "Pa")
     if np.any(np.asarray(first.status)) or not small:
         limit = f"{float(np.asarray(solve.reduced_tolerance)):.2%}"
-        return Tried(None, f"{said}: above {limit}, or a step failed, so the full model runs")
+        return Tried(None, f"{said}: the error is above {limit}, or a step failed, so the full model runs")
     ran = Ran(_as_result(found, x, P), len(found.times), run_time, compile_time, beside)
     return Tried(ran, said)
 

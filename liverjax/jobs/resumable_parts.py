@@ -1,4 +1,4 @@
-"""Results in parts, for runs that can resume after a kill: each finished part is a separate file next to the output."""
+"""Write results in parts, so that a killed run can resume. Each finished part is a separate file next to the output."""
 
 import fcntl
 import hashlib
@@ -18,12 +18,12 @@ from liverjax.core.struct import Number
 
 
 def beside(out: Path) -> Path:
-    """The folder with the parts of `out`."""
+    """Return the folder with the parts of `out`."""
     return out.with_name(out.name + ".parts")
 
 
 def part(folder: Path, k: int) -> Path:
-    """File of part k, from 0."""
+    """Return the file of part k, counted from 0."""
     return folder / f"part_{k:06d}.h5"
 
 
@@ -33,7 +33,7 @@ def write(file: Path, content: dict[str, np.ndarray]) -> None:
     Raises:
         OSError: the disk is full.
     """
-    # Made in memory first: on a full disk HDF5 ends the process, but a plain write raises OSError.
+    # The file is made in memory first: on a full disk HDF5 ends the process, but a plain write raises OSError.
     memory = io.BytesIO()
     with h5py.File(memory, "w") as datasets:
         for name, value in content.items():
@@ -45,7 +45,7 @@ def write(file: Path, content: dict[str, np.ndarray]) -> None:
 
 
 def finished(file: Path) -> bool:
-    """Whether the part exists. A part that cannot be read is removed, so that it is computed again."""
+    """Return whether the part exists. A part that cannot be read is removed, so that it is computed again."""
     if not file.exists():
         return False
     try:
@@ -57,10 +57,10 @@ def finished(file: Path) -> bool:
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder and test whether it can be written.
+    """Make the folder, and test whether files can be written to it.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -68,12 +68,12 @@ def make_folder(folder: Path) -> None:
         probe.write_text("")
         probe.unlink()
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}: name an --out that can be written") from None
+        raise InputError(f"{folder}: {error.strerror}; name an --out that can be written") from None
 
 
 @contextmanager
 def locked(file: Path) -> Iterator[None]:
-    """Hold a lock, which is released when the process ends.
+    """Hold a lock inside this context. The lock is also released when the process ends.
 
     Raises:
         InputError: another process holds the lock.
@@ -89,7 +89,7 @@ def locked(file: Path) -> Iterator[None]:
 
 
 def same(identity: Mapping[str, object], file: Path) -> None:
-    """Store the input that determines the results. Refuse to continue if the parts on disk were made with other input.
+    """Store the input that determines the results, or compare it with the stored input of the parts on disk.
 
     Raises:
         InputError: the parts next to `file` were made with other input.
@@ -103,7 +103,7 @@ def same(identity: Mapping[str, object], file: Path) -> None:
         if identity.get(key) != value:
             raise InputError(
                 f"{file.parent} holds parts of another {file.stem} (not the same {key}): name another --out, or remove "
-                "it"
+                "this folder"
             )
 
 
@@ -115,7 +115,7 @@ def remove(folder: Path) -> None:
 
 
 def digest(*arrays: Number) -> str:
-    """SHA-256 of the bytes of some arrays."""
+    """Return the SHA-256 digest of the bytes of some arrays."""
     sha = hashlib.sha256()
     for a in arrays:
         sha.update(np.ascontiguousarray(a).tobytes())

@@ -1,9 +1,9 @@
-"""Sweeps: one scene and many rows of parameters. A kill at any moment cannot damage the results.
+"""Sweeps: run one scene with many parameter sets. Results stay valid if the process is killed at any moment.
 
-Rows are run in chunks. A finished chunk is a separate file in FILE.h5.parts. It is written under a temporary name and
-then renamed. When all chunks are finished, they are joined to FILE.h5. So finished chunks are kept if a run is stopped,
-and `--resume` computes the others. Several processes may work on one sweep: each of n processes takes every n-th chunk,
-and the last one joins the parts.
+The table has one parameter set per row. The sets are run in chunks. A finished chunk is a separate file in
+FILE.h5.parts, which is written under a temporary name and then renamed. When all chunks are finished, they are joined
+to FILE.h5. So finished chunks are kept if a run is stopped, and `--resume` computes the others. Several processes may
+work on one sweep: each of n processes computes every n-th chunk, and the process that finishes last joins the parts.
 """
 
 import csv
@@ -41,7 +41,7 @@ from liverjax.simulation.automatic import with_solver
 from liverjax.simulation.batch import simulate_batch
 from liverjax.simulation.cautions import LEAST_J, MOST_J
 
-#: Name of an output that may be stored for every row -> function of result and reference positions (V, 3).
+#: Name of an output that may be stored for every run -> function of result and reference positions (V, 3) [m].
 OUTPUTS: dict[str, Callable] = {
     "final_positions": lambda result, reference: result.positions[-1],
     "positions": lambda result, reference: result.positions,
@@ -59,8 +59,8 @@ class Sweep(NamedTuple):
 
     scene: Scene
     names: tuple[str, ...]
-    rows: np.ndarray  # (N, P) numbers
-    numbers: np.ndarray  # (N,) numbers of the rows in the file, from 1
+    rows: np.ndarray  # (N, P) parameter sets
+    numbers: np.ndarray  # (N,) row numbers of the sets in the file, from 1
     outputs: tuple[str, ...]
     probes: tuple[int, ...]  # nodes with positions that are stored over time
     chunk: int
@@ -71,9 +71,9 @@ class Done(NamedTuple):
     """The outcome of a sweep."""
 
     file: Path | None  # None: other processes still have chunks to compute
-    failed: dict[int, int]  # number of the row -> status code
-    computed: int  # number of rows that this process computed now
-    crushed: dict[int, float]  # number of a converged row -> its J outside of the range of tissues
+    failed: dict[int, int]  # row number -> status code
+    computed: int  # number of runs that this process computed now
+    crushed: dict[int, float]  # row number of a converged run -> its volume ratio J outside of the range of tissues
 
 
 def read_sweep(
@@ -84,16 +84,16 @@ def read_sweep(
     chunk: int = 16,
     only: tuple[int, ...] = (),
 ) -> Sweep:
-    """A sweep from a scene file and a table with a header of dotted names. All rows are checked before any compilation.
+    """Read a sweep from a scene file and a table with a header of dotted names. All rows are checked before any run.
 
     Raises:
-        InputError: an unusable scene or table, a name that the scene does not have, a value out of its bounds.
+        InputError: an unusable scene or table, a name that the scene does not have, or a value out of bounds.
     """
     scene = load_scene(scene_file)
     names, rows = read_table(parameters)
     for name in names:
         if np.shape(numbers_at(scene, name)):
-            raise InputError(f"parameter {name!r} is a list in the scene file: name one number of it")
+            raise InputError(f"parameter {name!r} is a list in the scene file: name one number of the list")
     parts = {".".join(name.split(".")[:2]) for name in names}
     held = holding(scene, parts)
     for k, row in enumerate(rows.tolist()):
@@ -111,7 +111,7 @@ def read_sweep(
         if name not in OUTPUTS:
             raise InputError(f"--store {name} is not known: use {', '.join(OUTPUTS)}")
         if name == "largest_pressure" and scene.porosity is None:
-            raise InputError("--store largest_pressure needs [porosity] in the scene: leave it out")
+            raise InputError("--store largest_pressure needs [porosity] in the scene: remove it from --store")
     for node in probes:
         if not 0 <= node < scene.mesh.number_of_nodes:
             raise InputError(f"--probe {node} is not a node of the mesh: give 0 to {scene.mesh.number_of_nodes - 1}")
@@ -139,11 +139,11 @@ def read_sweep(
 
 
 def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    """Header and numbers (N, P) of a CSV file; # begins a comment.
+    """Read the header and the numbers (N, P) of a CSV file. Lines that begin with # are comments.
 
     Raises:
-        InputError: an unreadable or empty file, a name that occurs twice, a row of another length, a value that is not
-            a finite number.
+        InputError: an unreadable or empty file, a name that occurs twice, a row with another length than the header, or
+            a value that is not a finite number.
     """
     try:
         text = file.read_text(encoding="utf-8-sig")
@@ -159,7 +159,7 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
         raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row per run")
     names = tuple(table[0])
     if "" in names:
-        raise InputError(f"{file}: column {names.index('') + 1} has no name: give it one, or remove its comma")
+        raise InputError(f"{file}: column {names.index('') + 1} has no name: give it a name, or remove its comma")
     if len(set(names)) < len(names):
         raise InputError(f"{file} names {max(names, key=names.count)} twice: leave one column out")
     rows = []
@@ -172,7 +172,7 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
             except ValueError:
                 finite = False
             if not finite:
-                raise InputError(f"{file}: row {k + 1}, {name} = {cell!r} is not a finite number: mend it")
+                raise InputError(f"{file}: row {k + 1}, {name} = {cell!r} is not a finite number: correct it")
         rows.append([number_of(cell) for cell in row])
     return names, np.array(rows)
 
@@ -187,14 +187,14 @@ def run(
     process: tuple[int, int] = (0, 1),
     report: Callable[[int], None] = lambda rows: None,
 ) -> Done:
-    """Run the rows of a sweep that are not finished, and write the results to `out`.
+    """Run the unfinished parameter sets of a sweep, and write the results to `out`.
 
     Args:
         sweep: `Sweep`.
-        out: file for the results; its parts are next to it until all are finished.
+        out: file for the results. The parts stay next to it until all are finished.
         resume: whether to continue from the parts on disk.
         process: index of this process, and number of processes that share the work.
-        report: function that is called after each chunk with its number of rows.
+        report: function that is called after each chunk with the number of runs in it.
 
     Raises:
         InputError: results that exist already, that belong to another sweep, or that another process uses.
@@ -247,7 +247,7 @@ def _rows(outputs: tuple, probes: tuple, scene: Scene, values: dict[str, jax.Arr
 
 
 def _volume_ratios(scene: Scene, values: dict[str, jax.Array], reference: jax.Array | None, x: jax.Array) -> jax.Array:
-    """Minimum and maximum J (2,) at positions x (V, 3) [m] of a row."""
+    """Return the minimum and maximum volume ratio J (2,) of a run at positions x (V, 3) [m]."""
     mesh = with_parameters(scene, values).mesh
     J = volume_ratios(mesh if reference is None else with_points(mesh, reference), x.astype(mesh.points.dtype))
     return jnp.stack([jnp.min(J), jnp.max(J)])
@@ -255,7 +255,7 @@ def _volume_ratios(scene: Scene, values: dict[str, jax.Array], reference: jax.Ar
 
 def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
     chosen = _of(sweep, k)
-    # The last chunk is filled with copies of its last row, so that all chunks share one program.
+    # The last chunk is filled with copies of its last row, so that all chunks use the same compiled program.
     filled = np.minimum(chosen.start + np.arange(sweep.chunk), chosen[-1])
     values = {name: sweep.rows[filled, j] for j, name in enumerate(sweep.names)}
     result = program(sweep.scene, values)
@@ -264,19 +264,19 @@ def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
 
 def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
     if not resume:
-        raise InputError(f"{out} is there already: name another --out, or remove it")
+        raise InputError(f"{out} exists already: name another --out, or remove it")
     try:
         with h5py.File(out) as file:
             if json.loads(file.attrs["sweep"]) != json.loads(json.dumps(sweep.identity)):
                 raise InputError(f"{out} belongs to another sweep: name another --out, or remove it")
             codes, J = file["status"][:], file["volume_ratios"][:]
     except (OSError, KeyError):
-        raise InputError(f"{out} holds no sweep: name another --out, or remove it") from None
+        raise InputError(f"{out} is not the result of a sweep: name another --out, or remove it") from None
     return Done(out, _failures(sweep, codes), 0, _crushed(sweep, codes, J))
 
 
 def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
-    """Join all parts to one file if all are finished: this is done by the last process."""
+    """Join all parts to one file if all are finished. The process that finishes last does this."""
     files = [resumable_parts.part(folder, k) for k in _chunks(sweep)]
     try:
         with resumable_parts.locked(folder / "lock_join"):
@@ -296,7 +296,7 @@ _HEADERS = 100_000
 
 
 def _join(sweep: Sweep, out: Path, files: list[Path]) -> tuple[np.ndarray, np.ndarray]:
-    """Write the complete file. Return the codes of all rows and their `volume_ratios`."""
+    """Write the complete file. Return the status codes and `volume_ratios` of all runs."""
     mesh = sweep.scene.mesh
     needed = (
         sum(f.stat().st_size for f in files) + mesh.points.nbytes + meshio_cells(mesh)[1].nbytes + sweep.rows.nbytes
@@ -316,7 +316,7 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> tuple[np.ndarray, np.nd
         joined["parameters"].attrs["names"] = list(sweep.names)
         if sweep.probes:
             joined["probe_nodes"] = np.array(sweep.probes, dtype=int)
-        if "reference" not in joined:  # with a loaded mesh every row has another one
+        if "reference" not in joined:  # with a loaded mesh every run has a different reference
             joined["reference"] = np.asarray(sweep.scene.mesh.points)
         joined["reference"].attrs["unit"] = "m"
         joined["tetrahedra"] = meshio_cells(sweep.scene.mesh)[1]
@@ -330,7 +330,7 @@ def _failures(sweep: Sweep, codes: np.ndarray) -> dict[int, int]:
 
 
 def _crushed(sweep: Sweep, codes: np.ndarray, J: np.ndarray) -> dict[int, float]:
-    """Number of a row -> J at its end that is below `LEAST_J` or above `MOST_J`; only for converged rows."""
+    """Return {row number: final J} of the converged runs with a volume ratio J below `LEAST_J` or above `MOST_J`."""
     J = np.where(J[:, :1] < LEAST_J, J[:, :1], J[:, 1:])[:, 0]
     beyond = ((J < LEAST_J) | (J > MOST_J)) & np.all(codes == status.CONVERGED, axis=1)
     return {int(sweep.numbers[k]): float(J[k]) for k in np.flatnonzero(beyond)}

@@ -29,12 +29,12 @@ from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.mesh_error import HarmonicError, harmonic_errors
 from liverjax.waves.rest import under_its_weight
 
-#: Without a caution, the reactions of the relaxed body may differ from the run's reactions by this fraction.
+#: A warning is given if the reactions of the relaxed body and of the run differ by more than this fraction.
 _RESTED = 0.05
 
 
 class Waves(NamedTuple):
-    """Amplitudes of a scene, and the time of the solve."""
+    """Amplitudes of the harmonic motion of a scene, and the computing time [s]."""
 
     found: Harmonic
     mesh_error: HarmonicError | None
@@ -43,16 +43,16 @@ class Waves(NamedTuple):
 
 
 def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
-    """The motion of a scene of kind harmonic.
+    """Compute the motion of a scene of kind harmonic.
 
     Args:
         scene: `Scene`.
-        about: result.h5 of a run of the same mesh; the body moves about the last state of this run. None: about the
-            state of rest under gravity and pre-tension, or about the reference shape.
-        mesh_error: whether to estimate the error of the mesh.
+        about: result.h5 of a run of the same mesh. The body vibrates about the last state of this run. With None, it
+            vibrates about the state of rest under gravity and pre-tension, or about the reference shape.
+        mesh_error: whether to estimate the discretisation error of the mesh.
 
     Raises:
-        InputError: as `harmonic`; a file that is not a result of this mesh.
+        InputError: `harmonic` cannot solve the scene, or the file is not a result of this mesh.
     """
     x, reactions = (under_its_weight(scene), None) if about is None else _last_state(about, scene)
     begin = time.perf_counter()
@@ -66,7 +66,7 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 
 
 def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
-    """Positions and reactions (V, 3) of the last step in the file."""
+    """Read positions [m] and reactions [N] (V, 3) of the last step in the file."""
     import h5py
 
     try:
@@ -77,23 +77,23 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
         raise InputError(f"--about {file} holds no positions: give result.h5 of a run of this scene") from error
     if x.shape != scene.mesh.points.shape:
         raise InputError(
-            f"--about {file} has {len(x)} nodes, the scene {scene.mesh.number_of_nodes}: give a run of this mesh"
+            f"--about {file} has {len(x)} nodes, the scene has {scene.mesh.number_of_nodes}: give a run of this mesh"
         )
     if code not in (status.CONVERGED, status.ONE_STEP):
-        raise InputError(f"--about {file}: its last step is {status.NAMES[code]}: give a run that ended in balance")
+        raise InputError(f"--about {file}: its last step is {status.NAMES[code]}; give a run that ended in equilibrium")
     return jnp.asarray(x), reactions
 
 
 def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> list[str]:
-    """A sentence if the run's reactions (V, 3) [N] differ from those of the relaxed body at x: then its stress differs.
+    """Return a warning if the reactions (V, 3) [N] of the run differ from those of the relaxed body at positions x.
 
-    A sponge is not compared.
+    Then the stress of the run also differs from the relaxed stress. A porous body is not compared.
     """
     pulled = np.linalg.norm(reactions, axis=1)
     if scene.porosity is not None or not pulled.any():
         return []
     at = pulled > 0.01 * pulled.max()
-    # Membranes, ligaments and springs also pull at held nodes. Obstacles do not, and sliding supports only hold.
+    # Membranes, ligaments and springs also pull at fixed nodes. Obstacles and sliding supports do not.
     pulling = tuple(own for own in scene.physics if not isinstance(own, Obstacle | SlidingSupport))
     still = resting(replace(by_element(scene), traction=(), fixed=(), displaced=(), physics=pulling))
     still = replace(still, solve=Solve(volumetric=scene.solve.volumetric))
@@ -102,15 +102,16 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
     if apart <= _RESTED:
         return []
     return [
-        f"the relaxed body has other forces in the state of {name} than the run had there ({100 * apart:.2g} % apart), "
-        "and moves with these: let the run rest for much longer than its relaxation times, and use one material in both"
+        f"the relaxed body has other forces in the state of {name} than the run ({100 * apart:.2g} % difference), and "
+        "the harmonic motion uses the relaxed body: let the run rest for much longer than its relaxation times, and "
+        "use the same material in both"
     ]
 
 
 def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
-    """Relative mesh errors of the motion, (F,) [1], and of the largest force of a part that holds the body, (F,) [1].
+    """Return the relative mesh errors (F,) of the motion, and of the largest support force, at each frequency.
 
-    They are NaN where nothing moves or pulls. The mesh error must have been estimated.
+    They are NaN at frequencies without motion or without force. The mesh error must have been estimated before.
     """
     error, found = waves.mesh_error, waves.found
     if error is None:
@@ -127,7 +128,7 @@ def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str, object]) -> None:
-    """Write frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), the mesh and `attributes`."""
+    """Write frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), mesh and `attributes`."""
     import h5py
 
     arrays = {name: (getattr(waves.found, name), unit) for name, unit in _UNITS.items()}

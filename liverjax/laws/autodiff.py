@@ -1,4 +1,4 @@
-"""Stress and tangent of a law by automatic differentiation of its energy: the reference for the hand-derived terms."""
+"""Stress and tangent of a law by automatic differentiation of its energy, as a reference for the hand-derived terms."""
 
 from collections.abc import Callable
 
@@ -9,17 +9,17 @@ from liverjax.laws.base import Law
 
 
 def first_piola(law: Law, F: jax.Array) -> jax.Array:
-    """dW/dF [Pa] at one (3, 3) or many (..., 3, 3) deformation gradients, by reverse mode."""
+    """Return dW/dF [Pa] at one (3, 3) or many (..., 3, 3) deformation gradients, by reverse mode."""
     return jax.grad(lambda F: jnp.sum(law.energy(F)))(F)
 
 
 def tangent(law: Law, F: jax.Array) -> jax.Array:
-    """d2W/dF dF [Pa], (..., 3, 3, 3, 3), at deformation gradients (..., 3, 3), by forward over reverse mode."""
+    """Return d2W/dF dF [Pa], (..., 3, 3, 3, 3), at deformation gradients (..., 3, 3), by forward over reverse mode."""
     return derivative(lambda F: first_piola(law, F), F)
 
 
 def derivative(function: Callable[[jax.Array], jax.Array], A: jax.Array) -> jax.Array:
-    """Derivative of an element-wise function of matrices A (…, n, m), by forward mode.
+    """Differentiate an element-wise function of matrices A (…, n, m), by forward mode.
 
     The result has the shape of the function's values, followed by (n, m). Each direction is applied to all elements at
     the same time, so that a law may have one parameter value for each element.

@@ -1,18 +1,17 @@
 """The base class of material laws: a strain energy and its derivatives.
 
-A law is a frozen pytree made with `liverjax.core.struct.struct`. It defines one or more of these energies, which add
-up:
+A law is a frozen pytree made with `liverjax.core.struct.struct`. Its energy is the sum of one or more of these:
 
-* `isochoric_energy(Ibar1, Ibar2)` of J^(-2/3) I1 and J^(-4/3) I2;
-* `stretch_energy(X_1, …)` of X_k = sum_m (J^(-1/3) lambda_m)^alpha_k - 3; `exponents()` gives the alpha_k;
-* `green_energy(E)` of Green's strain in the axes `fibre`, `sheet` and their normal. Without these fields the axes are
-  the coordinate axes;
-* the volumetric energy U(J): fields `bulk` and `volumetric`.
+* `isochoric_energy(Ibar1, Ibar2)`, a function of Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2;
+* `stretch_energy(X_1, …)`, a function of X_k = sum_m (J^(-1/3) lambda_m)^alpha_k - 3; `exponents()` gives all alpha_k;
+* `green_energy(E)`, a function of Green's strain in the axes `fibre`, `sheet` and their normal. Without these fields
+  the axes are the coordinate axes;
+* the volumetric energy U(J), defined by the fields `bulk` and `volumetric`.
 
-Or it overrides `strain_energy(I)`, the complete energy, as a function of the invariants that its `invariants` names
-(I1, I2, I4, J; I4 = a . C a needs a field `fibre`). Only the named invariants are computed. Derivatives are computed by
-scalar automatic differentiation, unless the law defines `isochoric_derivatives`, `stretch_derivatives`,
-`green_derivatives` or `energy_derivatives`.
+Alternatively, a law overrides `strain_energy(I)`, the complete energy. This is a function of the invariants that the
+law lists in `invariants` (I1, I2, I4, J; I4 = a . C a needs a field `fibre`). Only the listed invariants are computed.
+Derivatives are computed by scalar automatic differentiation, unless the law defines `isochoric_derivatives`,
+`stretch_derivatives`, `green_derivatives` or `energy_derivatives`.
 """
 
 from collections.abc import Callable
@@ -35,7 +34,7 @@ from liverjax.tensors.matrices import (
 
 
 class Law(Energies):
-    """A hyperelastic law: energy per reference volume [Pa]. The module's docstring says which methods to override."""
+    """A hyperelastic law: energy per reference volume [Pa]. The module's docstring lists the methods to override."""
 
     def shear_modulus(self) -> Any:
         """Ground-state shear modulus [Pa]."""
@@ -52,11 +51,11 @@ class Law(Energies):
         self.check_directions()
 
     def check_directions(self) -> None:
-        """Raise `InputError` if a fibre has length 0. Traced fibres pass."""
+        """Raise `InputError` if a fibre has length 0. Traced fibres are not checked."""
         if self.fibre is None or any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(self.fibre)):
             return
         if not np.all(np.linalg.norm(np.asarray(self.fibre, float), axis=-1) > 0):
-            raise InputError(f"law {type(self).__name__}: a fibre has no length: give a direction that is not zero")
+            raise InputError(f"law {type(self).__name__}: a fibre has length 0: give a direction that is not zero")
 
     # -- parts of a law -----------------------------------------------------------------------------------------------
 
@@ -65,38 +64,38 @@ class Law(Energies):
         return change(self)
 
     def isochoric_part(self) -> Any:
-        """The law without U(J); `None` if its energy has no isochoric part or no such split."""
+        """Return the law without U(J). Returns None if the energy cannot be split or has no isochoric part."""
         if self.isochoric_energy is None and self.stretch_energy is None:
             return None
         return self if self.bulk is None else replace(self, bulk=None)
 
     def volumetric_part(self) -> Any:
-        """U(J) as a separate law; `None` if the law has no U(J)."""
+        """Return U(J) as a separate law. Returns None if the law has no U(J)."""
         return None if self.bulk is None else Volumetric(bulk=self.bulk, volumetric=self.volumetric)
 
     def without_volume(self) -> Any:
-        """The law without each U(J) that is a separate term of its energy; `None` if nothing is left."""
+        """Return the law without each U(J) that is a separate term of its energy. Returns None if nothing is left."""
         split = self.isochoric_part()
         if split is not None:
             return split
         apart = self.bulk is not None and type(self).strain_energy is Law.strain_energy
         return replace(self, bulk=None) if apart else self
 
-    # -- what follows from them --------------------------------------------------------------------------------------
+    # -- energy, stress and tangent ----------------------------------------------------------------------------------
 
     def energy(self, F: jax.Array) -> jax.Array:
         """Strain energy density [Pa], shape (...), of deformation gradients (..., 3, 3)."""
         return self.strain_energy(self.measures(unpack(_floating(F))))
 
     def first_piola(self, F: jax.Array) -> jax.Array:
-        """First Piola-Kirchhoff stress dW/dF [Pa], shape (..., 3, 3), by the hand-derived MJED terms."""
+        """First Piola-Kirchhoff stress dW/dF [Pa], shape (..., 3, 3), from hand-derived terms."""
         return pack(invariant_terms.first_piola(self, unpack(_floating(F))))
 
     def tangent(self, F: jax.Array) -> jax.Array:
-        """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3): the hand-derived MJED blocks for unit vectors D."""
+        """Tangent d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), from the hand-derived stiffness blocks for unit vectors."""
         A = invariant_terms.tangent(invariant_terms.state(self, unpack(_floating(F))))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
-        # pack gives (..., i, k); stacking L last then J second: (..., i, J, k, L).
+        # pack gives (..., i, k). Stacking L as last axis, and then J as second axis, gives (..., i, J, k, L).
         return jnp.stack([r[0] for r in rows], axis=-3)
 
     def __add__(self, other: "Law") -> "Sum":
@@ -105,40 +104,40 @@ class Law(Energies):
         return Sum(laws=self.summands() + other.summands())
 
     def __radd__(self, other: Number) -> "Law":
-        """0 + law is the law, so that Python's `sum` can add a list of laws."""
+        """Return the law for 0 + law, so that Python's `sum` can add a list of laws."""
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
 def _floating(F: Number) -> jax.Array:
-    """`F` as an array of floating-point numbers. Integers are converted to the default precision."""
+    """Return `F` as an array of floating-point numbers. Integers are converted to the default precision."""
     F = jnp.asarray(F)
     return F if jnp.issubdtype(F.dtype, jnp.floating) else F.astype(float)
 
 
 @struct
 class Sum(Law):
-    """Several laws acting in parallel: energies add."""
+    """Several laws acting in parallel. The energy is the sum of their energies."""
 
     laws: tuple = unnamed("laws that add up")
 
     def summands(self):
-        """The laws."""
+        """Return the laws of the sum."""
         return self.laws
 
     def isochoric_part(self):
-        """The sum of the isochoric parts.
+        """Return the sum of the isochoric parts.
 
-        Laws that are only volumetric are left out; `None` if another law has no such part.
+        Laws that are only volumetric are left out. Returns None if another law has no isochoric part.
         """
         parts = [law.isochoric_part() for law in self.laws if not isinstance(law, Volumetric)]
         return None if any(part is None for part in parts) else _added(parts)
 
     def volumetric_part(self):
-        """The sum of the laws' volumetric parts; `None` if no law has one."""
+        """Return the sum of the laws' volumetric parts. Returns None if no law has a volumetric part."""
         return _added([part for part in (law.volumetric_part() for law in self.laws) if part is not None])
 
     def without_volume(self):
-        """The sum of the laws, each without its U(J)."""
+        """Return the sum of the laws, each without its U(J)."""
         return _added([part for part in (law.without_volume() for law in self.laws) if part is not None])
 
     def check(self):
@@ -147,17 +146,17 @@ class Sum(Law):
             law.check()
 
     def measures(self, F):
-        """One set of invariants for each law of the sum. Invariants that laws share are computed once."""
+        """Return one set of invariants for each law of the sum. Invariants that laws share are computed once."""
         return tuple(law.measures(F) for law in self.laws)
 
     def strain_energy(self, I):
-        """Sum of the energies."""
+        """Return the sum of the laws' energies [Pa]."""
         return sum(law.strain_energy(i) for law, i in zip(self.laws, I, strict=True))
 
     def energy_derivatives(self, I):
-        """Sum of the scalar derivatives.
+        """Return the sum of the laws' derivatives with respect to the invariants.
 
-        It is formed before the assembly, so a second law only adds scalar operations.
+        The sum is formed before the assembly, so a second law only adds scalar operations.
         """
         first, second = {}, {}
         fibres = fibre_invariants(self.laws)
@@ -188,19 +187,19 @@ class Volumetric(Law):
 
     bulk: Number = param("Pa", "bulk modulus K", lower=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
-    below: float | None = static(default=None, about="J below which U is replaced by its Taylor parabola at that J")
+    below: float | None = static(default=None, about="J below which U is replaced by its second-order Taylor series")
     invariants: ClassVar = ("J",)
 
     def volumetric_part(self):
-        """The law itself."""
+        """Return the law itself."""
         return self
 
     def without_volume(self):
-        """None, since nothing is left."""
+        """Return None, since nothing is left."""
         return None
 
     def strain_energy(self, I):
-        """U(J)."""
+        """Volumetric energy U(J) [Pa]."""
         if self.below is None:
             return volumetric(self.volumetric, self.bulk, I.J)[0]
         above = jnp.maximum(I.J, self.below)
@@ -208,35 +207,35 @@ class Volumetric(Law):
         return U + (U1 + 0.5 * U2 * (I.J - above)) * (I.J - above)
 
     def energy_derivatives(self, I):
-        """U' and U''."""
+        """First and second derivative of U with respect to J."""
         above = I.J if self.below is None else jnp.maximum(I.J, self.below)
         _, U1, U2 = volumetric(self.volumetric, self.bulk, above)
         return {"J": U1 if self.below is None else U1 + U2 * (I.J - above)}, {("J", "J"): U2}
 
     def shear_modulus(self):
-        """Zero: U(J) does not resist shear."""
+        """Return zero, since U(J) does not resist shear."""
         return 0.0
 
     def bulk_modulus(self):
-        """K [Pa]: every form of U has the curvature K at rest."""
+        """Bulk modulus K [Pa]: at rest, the second derivative of every form of U is K."""
         return self.bulk
 
 
 def _added(parts: list) -> Any:
-    """The sum of the laws; `None` if there are none."""
+    """Return the sum of the laws. Returns None if the list is empty."""
     return sum(parts) if parts else None
 
 
 def summands(law: Law) -> tuple[Law, ...]:
-    """See `Law.summands`."""
+    """Return the laws whose sum is `law`."""
     return law.summands()
 
 
 def isochoric_part(law: Law) -> Any:
-    """See `Law.isochoric_part`."""
+    """Return the law without U(J). Returns None if the energy cannot be split or has no isochoric part."""
     return law.isochoric_part()
 
 
 def volumetric_part(law: Law) -> Any:
-    """See `Law.volumetric_part`."""
+    """Return U(J) as a separate law. Returns None if the law has no U(J)."""
     return law.volumetric_part()

@@ -21,18 +21,18 @@ class ByRegion(Law):
     """
 
     laws: tuple[Law, ...] = unnamed("one law for each subset")
-    subsets: Subsets = param("1", "which elements each law has")  # type: ignore[assignment]
+    subsets: Subsets = param("1", "the elements of each law")  # type: ignore[assignment]
 
     def pieces(self) -> tuple[Law, ...]:
-        """The laws, with the parameters of the whole body."""
+        """Return the laws, with parameters for the elements of the whole body."""
         return self.laws
 
     def piece(self, k: int) -> Law:
-        """Law k with the parameters of its elements."""
+        """Return law k with the parameters of its elements."""
         return in_subset(self.subsets, k, self.laws[k])
 
     def each(self, change: Callable[[Law], Law]) -> "ByRegion":
-        """A copy with `change` applied to every law."""
+        """Return a copy with `change` applied to every law."""
         return ByRegion(laws=tuple(change(law) for law in self.laws), subsets=self.subsets)
 
     def check(self) -> None:
@@ -41,19 +41,19 @@ class ByRegion(Law):
             law.check()
 
     def isochoric_part(self) -> Any:
-        """The isochoric part of each law; None if a law has no isochoric part."""
+        """Return the isochoric part of each law. Returns None if a law has no isochoric part."""
         if any(law.isochoric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.isochoric_part())
 
     def volumetric_part(self) -> Any:
-        """The volumetric part of each law; None if no law has a volumetric part."""
+        """Return the volumetric part of each law. Returns None if no law has a volumetric part."""
         if all(law.volumetric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.volumetric_part() or Volumetric(bulk=0.0))
 
     def measures(self, F: Matrix) -> tuple:  # type: ignore[override]
-        """The invariants of each law in the elements of its subset."""
+        """Return the invariants of each law in the elements of its subset."""
         return tuple(self.piece(k).measures(in_subset(self.subsets, k, F)) for k in range(len(self.laws)))
 
     def strain_energy(self, I: tuple) -> jax.Array:  # type: ignore[override]
@@ -62,7 +62,7 @@ class ByRegion(Law):
 
     def energy_derivatives(self, I: Any) -> Any:
         """Raise an error: laws of several kinds have no common invariants."""
-        raise InputError("laws of several kinds have no derivatives in common: use those of each law")
+        raise InputError("laws of several kinds have no common derivatives: use the derivatives of each law")
 
     def shear_modulus(self) -> jax.Array:
         """Ground-state shear modulus (E,) [Pa]."""

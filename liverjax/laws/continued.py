@@ -1,4 +1,4 @@
-"""A law that is continued below a chosen J, so that flat and inverted elements have a finite energy."""
+"""A law that is continued smoothly below a chosen J, so that flat and inverted elements have a finite energy."""
 
 import jax
 import jax.numpy as jnp
@@ -11,49 +11,49 @@ from liverjax.tensors.matrices import determinant
 
 @struct
 class Continued(Law):
-    """A law of I1, I2 and J. It is unchanged above J = c; below c its energy continues smoothly in value and slope.
+    """A law of I1, I2 and J that is unchanged above J = c. Energy and stress are continuous at c.
 
-    Below c an isochoric energy is evaluated at c^2/(2c - J) instead of J. This value is positive, so the isochoric
-    invariants exist. A volumetric energy is replaced by its Taylor parabola at c. The energy increases towards
-    inversion.
+    Below c, an isochoric energy is evaluated at c^2/(2c - J) instead of J. This value is positive, so the isochoric
+    invariants exist. A volumetric energy is replaced by its second-order Taylor series at c. The energy increases
+    towards inversion.
     """
 
     law: Law = unnamed("the law that is continued")
     below: float = static(default=0.1, about="c, the J below which the law is continued")
 
     @property
-    def invariants(self) -> tuple:  # type: ignore[override]  # of the law inside
-        """The invariants of the law, and J."""
+    def invariants(self) -> tuple:  # type: ignore[override]  # the invariants of the original law
+        """Names of the invariants of the original law, and J."""
         return self.law.invariants if "J" in self.law.invariants else (*self.law.invariants, "J")
 
     def isochoric_part(self) -> Law | None:
-        """The law without its volumetric energy; None if its energy cannot be split."""
+        """Return the law without its volumetric energy. Returns None if its energy cannot be split."""
         part = self.law.isochoric_part()
         return None if part is None else Continued(law=part, below=self.below)
 
     def volumetric_part(self) -> Law | None:
-        """The volumetric energy of the law inside, continued; None if it has none."""
+        """Return the continued volumetric energy. Returns None if the original law has no volumetric energy."""
         part = self.law.volumetric_part()
         return None if part is None else Volumetric(bulk=part.bulk, volumetric=part.volumetric, below=self.below)
 
     def without_volume(self) -> Law | None:
-        """The law inside without its volumetric energy, continued."""
+        """Return the original law without its volumetric energy, continued."""
         part = self.law.without_volume()
         return self if part is self.law else None if part is None else Continued(law=part, below=self.below)
 
     def measures(self, F):
-        """Invariants of the law with J replaced, and J itself."""
+        """Return the invariants of the original law with J replaced, and J itself."""
         J = determinant(F)
         return self._whole().measures(F)._replace(J=self._replaced(J)[0]), J
 
     def strain_energy(self, I):
-        """Energy of the law at the replaced J, plus the volumetric energy at J."""
+        """Energy [Pa] of the original law at the replaced J, plus the continued volumetric energy at J."""
         I, J = I
         W, volume = self._whole().strain_energy(I), self.volumetric_part()
         return W if volume is None else W + volume.strain_energy(I._replace(J=J))
 
     def energy_derivatives(self, I):
-        """Derivatives by the chain rule."""
+        """Return the first and second derivatives of the energy, by the chain rule."""
         I, J = I
         _, slope, curvature = self._replaced(J)
         first, second = self._whole().energy_derivatives(I)
@@ -70,20 +70,20 @@ class Continued(Law):
         return first, second
 
     def shear_modulus(self):
-        """Ground-state shear modulus [Pa] of the law inside."""
+        """Ground-state shear modulus [Pa] of the original law."""
         return self.law.shear_modulus()
 
     def bulk_modulus(self):
-        """Ground-state bulk modulus [Pa] of the law inside."""
+        """Ground-state bulk modulus [Pa] of the original law."""
         return self.law.bulk_modulus()
 
     def _whole(self) -> Law:
-        """The law without its volumetric part."""
+        """Return the original law without its volumetric part."""
         part = self.law.isochoric_part()
         return self.law if part is None else part
 
     def _replaced(self, J: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The replaced volume ratio (c^2/(2c - J) below c, J above c), and its first and second derivative."""
+        """Return the replaced J (c^2/(2c - J) below c, J above c), and its first and second derivative."""
         c, lower = self.below, self.below > J
         inverse = 1 / (2 * c - jnp.minimum(J, c))
         squared = c * c * inverse * inverse
@@ -95,14 +95,15 @@ class Continued(Law):
 
 
 def continued(law: Law, below: float) -> Law:
-    """The law with finite energy and forces for every J. It is unchanged above J = `below`; see `Continued`.
+    """Return the law with finite energy and forces for every J. It is unchanged above J = `below` (see `Continued`).
 
     Args:
         law: a law of I1, I2 and J, or a sum of such laws.
         below: c, between 0 and 1, e.g. 0.1.
 
     Raises:
-        InputError: c out of bounds; an energy of stretches, of fibres or of Green's strain (which is always finite).
+        InputError: c is out of bounds; or the law has an energy of stretches, fibres or Green's strain (which is always
+            finite).
     """
     if isinstance(below, bool) or not isinstance(below, (int, float)) or not 0 < below < 1:
         raise InputError(f"law continued_below = {below!r} must lie between 0 and 1: give e.g. 0.1")
@@ -112,7 +113,7 @@ def continued(law: Law, below: float) -> Law:
             if getattr(part, attribute) is not None:
                 raise InputError(
                     f"law continued_below is for energies of I1, I2 and J, not for {type(part).__name__} of {kind}: "
-                    "leave it out"
+                    "remove continued_below"
                 )
     first, *others = (Continued(law=part, below=float(below)) for part in law.summands())
     return sum(others, first)

@@ -1,4 +1,4 @@
-"""Scalar derivatives of a law's energy with respect to its invariants, by the chain rule and by forward mode."""
+"""Derivatives of a law's energy with respect to its invariants, by the chain rule and by automatic differentiation."""
 
 from typing import Any
 
@@ -20,16 +20,16 @@ def accumulate(total: dict, key: object, value: object) -> None:
 
 
 def reduced(I: Invariants) -> tuple[Any, Any]:
-    """Isochoric invariants Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2.
+    """Return the isochoric invariants Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2.
 
-    They are NaN for J < 0, where they do not exist.
+    These do not exist for J < 0 and are NaN there.
     """
     m = I.J ** (-2 / 3)
     return (None if I.I1 is None else m * I.I1), (None if I.I2 is None else m * m * I.I2)
 
 
 def split_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
-    """Derivatives of w(Ibar1, Ibar2) with respect to I1, I2 and J (chapter, section 4.1.2, contracted)."""
+    """Return the derivatives of w(Ibar1, Ibar2) with respect to I1, I2 and J (book chapter, section 4.1.2)."""
     m = I.J ** (-2 / 3)
     inverse_J = 1 / I.J
     Ibar = {"I1": m * I.I1} if "I1" in law.invariants else {}
@@ -61,7 +61,7 @@ def _isochoric_derivatives(law: Any, Ibar: dict) -> tuple[First, Second]:
 
 
 def autodiff_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
-    """The scalar derivatives of `law.strain_energy` by forward mode, for a law that defines only its energy."""
+    """Return the derivatives of `law.strain_energy` by forward mode, for a law that defines only its energy."""
     values = {n: getattr(I, n) for n in ORDER if n in law.invariants}
     return _scalar_derivatives(lambda **v: law.strain_energy(I._replace(**v)), values)
 

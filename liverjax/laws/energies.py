@@ -1,7 +1,7 @@
-"""What a law defines: its energies and their derivatives with respect to scalar invariants.
+"""The energies that a law defines, and their derivatives with respect to scalar invariants.
 
-The terms of stress and stiffness (`liverjax.laws.terms`) use these. `liverjax.laws.base.Law` adds what follows from
-them, for example the stress.
+The terms of stress and stiffness (`liverjax.laws.terms`) use these derivatives. `liverjax.laws.base.Law` adds the
+quantities that follow from the energies, for example the stress.
 """
 
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ from liverjax.tensors.principal import power_sum, stretches
 
 
 class Energies:
-    """The energies of a law per reference volume [Pa]. `liverjax.laws.base` says which methods to override."""
+    """The energies of a law per reference volume [Pa]. `liverjax.laws.base` lists the methods to override."""
 
     invariants: ClassVar[tuple[str, ...]] = ("I1", "J")
     #: Every law is a struct, so `dataclasses.replace` works on it.
@@ -27,18 +27,18 @@ class Energies:
     isochoric_derivatives: Any = None
     stretch_derivatives: Any = None
     green_derivatives: Any = None
-    #: The powers of a `stretch_energy`.
+    #: Method that returns the exponents alpha_k of a `stretch_energy`.
     exponents: Any
     #: Fields of the volumetric energy U(J), and fields for directions; None: the law has no such energy or direction.
     bulk: Number | None = None
     volumetric: str
     fibre: Numbers | None = None
     sheet: Numbers
-    #: Which elements have which law (`liverjax.tensors.subsets.Subsets`); None: one law everywhere.
+    #: Elements of each law (`liverjax.tensors.subsets.Subsets`); None: the whole body has one law.
     subsets: Any = None
 
     def strain_energy(self, I: Invariants) -> Any:
-        """Energy density [Pa] at the invariants that the law names."""
+        """Return the energy density [Pa] at the invariants that the law lists."""
         W = 0.0
         if self.isochoric_energy is not None:
             W = W + self.isochoric_energy(*reduced(I))
@@ -50,7 +50,7 @@ class Energies:
         return W if U is None else W + U.strain_energy(I)
 
     def energy_derivatives(self, I: Invariants) -> tuple[First, Second]:
-        """dW/dI_a and d2W/dI_a dI_b for scalar invariants. A missing key means 0 and needs no computation."""
+        """Return dW/dI_a and d2W/dI_a dI_b for scalar invariants. A missing key means 0 and needs no computation."""
         if type(self).strain_energy is not Energies.strain_energy:
             return autodiff_derivatives(self, I)
         first, second = split_derivatives(self, I) if self.isochoric_energy is not None else ({}, {})
@@ -62,27 +62,27 @@ class Energies:
         return first, second
 
     def volumetric_part(self) -> "Energies | None":
-        """U(J) as a separate law; `None` if the law has no U(J)."""
+        """Return U(J) as a separate law. Returns None if the law has no U(J)."""
         return None
 
     # -- parts of a law -----------------------------------------------------------------------------------------------
 
     def summands(self) -> tuple[Any, ...]:
-        """The laws whose sum is this law: the law itself, unless it is a sum."""
+        """Return the laws whose sum is this law. A law that is not a sum returns itself."""
         return (self,)
 
     def pieces(self) -> tuple[Any, ...]:
-        """The laws of the parts of the body: the law itself, unless regions have laws of other kinds."""
+        """Return the laws of the parts of the body. This is the law itself, unless regions have laws of other kinds."""
         return (self,)
 
     def piece(self, k: int) -> Any:
-        """The law of part k of the body, with the parameters of the elements of this part."""
+        """Return the law of part k of the body, with the parameters of the elements in this part."""
         return self
 
-    # -- its arguments -------------------------------------------------------------------------------------------------
+    # -- arguments of the energies -------------------------------------------------------------------------------------
 
     def measures(self, F: Matrix) -> Invariants:
-        """The arguments of `strain_energy` at the tuple matrix F."""
+        """Return the arguments of `strain_energy` at the deformation gradient F, a matrix of nested tuples."""
         I = invariants(self.invariants, F)
         if "I4" in self.invariants:
             Fa = matvec(F, components(self.fibre, F[0][0]))
@@ -94,12 +94,12 @@ class Energies:
         return I if self.bulk is None else I._replace(J=determinant(F))
 
     def material_axes(self, like: Number) -> Matrix:
-        """Columns fibre, sheet and normal, in the precision of `like`. Without a fibre they are the coordinate axes."""
+        """Return columns fibre, sheet and normal in the precision of `like`; without a fibre, the coordinate axes."""
         return orthogonal_axes(self.fibre, None if self.fibre is None else self.sheet, like)
 
 
 def fibre_invariants(laws: tuple) -> dict[str, Energies]:
-    """Name of each invariant a . C a in a sum of laws -> law with this fibre a; fibres of laws may differ."""
+    """Return {name of an invariant a . C a: law with the fibre a} for a sum of laws. Fibres of laws may differ."""
     if len(laws) == 1:
         return {"I4": laws[0]} if "I4" in laws[0].invariants else {}
     return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}

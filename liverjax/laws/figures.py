@@ -1,4 +1,4 @@
-"""Figures of laws: stress over stretch, and the gradient check."""
+"""Draw figures of laws: stress over stretch, and the gradient check."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
             style = ("-", "--", ":")[k // len(COLOURS) % 3]
             axis.plot(driven, stress, style, color=COLOURS[k % len(COLOURS)], label=name)
             ends.append((np.nanmin(stress), np.nanmax(stress)))
-        low, high = 3 * np.nanmedian(ends, axis=0)  # an exponential law must not hide the others
+        low, high = 3 * np.nanmedian(ends, axis=0)  # large stresses of an exponential law must not hide other curves
         if low < high:  # false for NaN
             axis.set_ylim(max(low, axis.get_ylim()[0]), min(high, axis.get_ylim()[1]))
         axis.set(title=test.replace("_", " "), xlabel="amount of shear" if what == "shear" else "stretch")

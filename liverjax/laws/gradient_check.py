@@ -18,19 +18,20 @@ from liverjax.laws import Law, autodiff, homogeneous
 
 #: Steps of the difference quotients, relative to F.
 STEPS = 10.0 ** -np.arange(1.0, 10.5, 0.5)
-#: Limit for difference quotients. Their error is at least about eps^(2/3) of their terms; the factor allows large
-#: terms.
+#: Limit for the relative error of difference quotients. Roundoff and truncation give at least about eps^(2/3) of the
+#: largest term. The factor 1000 allows for large terms that cancel.
 DIFFERENCE_LIMIT = 1e3 * np.finfo(float).eps ** (2 / 3)
-#: Limit for exact results. It allows roundoff in sums of some hundred terms, and cancellation in deviatoric parts.
+#: Limit for the relative error of exact results. It allows roundoff in sums of some hundred terms, and cancellation in
+#: deviatoric parts.
 EXACT_LIMIT = 1e-10
-#: Ranges of stretch for the comparisons. The narrower ranges are for laws that lock, for example Gent's law.
+#: Ranges of stretch for the comparisons. The narrower ranges are for laws with a limiting stretch, e.g. Gent's law.
 _MODERATE, _NARROWER = (0.7, 1.4), ((0.85, 1.18), (0.95, 1.05), (0.99, 1.01))
 #: Both arrays have the same length, so that they share one compiled program.
 STRETCHES, SHEARS = np.linspace(0.2, 4.0, 381), np.linspace(0.0, 3.8, 381)
 
 
 class Row(NamedTuple):
-    """One row of the table; `passed` is None for a row that only informs."""
+    """One row of the table. `passed` is None for a row that gives information but tests nothing."""
 
     name: str
     found: str
@@ -57,14 +58,14 @@ def load(name: str) -> Law:
     """Load an included law by its name, or the law FILE.py:LAW of a Python file. A class gets its typical parameters.
 
     Raises:
-        InputError: no such law or file, a file that does not run, a parameter without a typical value.
+        InputError: the law or file does not exist, the file does not run, or a parameter has no typical value.
     """
     if ":" not in name and not name.endswith(".py"):
         return laws.typical(name)
     file, _, attribute = name.rpartition(":") if ":" in name else (name, "", "")
     if not Path(file).is_file():
         raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
-    # `dataclasses` look the module up, so it is registered; under a private name, since the file may be called jax.py.
+    # `dataclasses` needs the registered module. The name is private, since the file may be called jax.py.
     spec = importlib.util.spec_from_file_location(f"_law_file_{Path(file).stem}", file)
     if spec is None:
         raise InputError(f"{file} is not a Python file: give FILE.py:LAW")
@@ -75,19 +76,21 @@ def load(name: str) -> Law:
         loader: Any = spec.loader
         loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise InputError(f"{file} does not run ({_reason(error)}): mend it first") from None
+        raise InputError(f"{file} does not run ({_reason(error)}): correct it first") from None
     finally:
         sys.path.pop(0)
     found: Any = getattr(module, attribute, None) if attribute else None
     if found is None:
         own = {n: v if inspect.isclass(v) else type(v) for n, v in vars(module).items() if _is_law(v)}
         offered = [n for n, c in own.items() if c.__module__ == module.__name__ or not inspect.isclass(vars(module)[n])]
-        wrong = f"{file} has no {attribute}" if attribute else f"{name} names a file, and no law in it"
+        wrong = f"{file} has no {attribute}" if attribute else f"{name} names a file, but no law in it"
         raise InputError(
             f"{wrong}: {'use ' + ' or '.join(f'{file}:{n}' for n in offered) if offered else 'define a law'}"
         )
     if not _is_law(found):
-        raise InputError(f"{name} is not a law: derive it from liverjax.Law and decorate it with liverjax.core.struct")
+        raise InputError(
+            f"{name} is not a law: derive its class from liverjax.Law and decorate the class with liverjax.struct"
+        )
     law = _typical_law(found, name) if inspect.isclass(found) else found
     _try(law, name)
     _try_parts(law, name)
@@ -95,12 +98,12 @@ def load(name: str) -> Law:
 
 
 def _reason(error: BaseException) -> str:
-    """Kind and first line of an exception, at most 150 characters."""
+    """Return kind and message of an exception in one line of at most 150 characters."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:150]
 
 
 def _try(law: Law, name: str) -> None:
-    """Evaluate the law once. Every error is reported as one sentence."""
+    """Evaluate the law once. Every error is raised as `InputError`."""
     for shape in ((), (2,)):
         F = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 0.9, 1.05])), (*shape, 3, 3))
         for what, expected in (("energy", shape), ("first_piola", (*shape, 3, 3)), ("tangent", (*shape, 3, 3, 3, 3))):
@@ -108,16 +111,18 @@ def _try(law: Law, name: str) -> None:
                 found = jax.eval_shape(lambda law, F, what=what: getattr(law, what)(F), law, F).shape
             except Exception as error:
                 raise InputError(
-                    f"{name}: its {what} cannot be evaluated ({_reason(error)}): mend the law, name every invariant "
-                    "it uses in `invariants`, give one direction for fibres, and decide by its parameters with "
-                    "jnp.where"
+                    f"{name}: its {what} cannot be evaluated ({_reason(error)}): correct the law, list every invariant "
+                    "that it uses in `invariants`, give one direction for fibres, and write conditions on parameters "
+                    "with jnp.where"
                 ) from None
             if found != expected:
-                raise InputError(f"{name}: its {what} of F {F.shape} has shape {found}, not {expected}: mend the law")
+                raise InputError(
+                    f"{name}: its {what} of F {F.shape} has shape {found}, not {expected}: correct the law"
+                )
 
 
 def _try_parts(law: Law, name: str) -> None:
-    """Make the parts of the law once. Every error is reported as one sentence."""
+    """Make the isochoric and volumetric parts of the law once. Every error is raised as `InputError`."""
     for what in ("isochoric_part", "volumetric_part"):
         try:
             part = getattr(law, what)()
@@ -126,8 +131,8 @@ def _try_parts(law: Law, name: str) -> None:
         except Exception as error:
             raise InputError(
                 f"{name}: its {what} cannot be evaluated ({_reason(error)}): a field bulk needs a field volumetric "
-                "(volumetric: str = lj.static('quadratic')), and a strain_energy of your own must do with bulk = None, "
-                "or define both parts"
+                "(volumetric: str = lj.static('quadratic')); a law with its own strain_energy must work with bulk = "
+                "None, or define both parts"
             ) from None
 
 
@@ -151,7 +156,7 @@ def _typical_law(cls: type, name: str) -> Law:
 
 
 def check(law: Law) -> Check:
-    """Run all checks, one per row. A wrong law raises no error: its rows fail."""
+    """Run all checks, one per row. A wrong law raises no error, but some of its rows fail."""
     programs = [jax.jit(lambda law, F, what=what: getattr(law, what)(F)) for what in _PROGRAMS]
     energy, stress, tangent = (partial(program, law) for program in programs)
     more, stable = _stability(law, tangent)
@@ -176,9 +181,10 @@ def check(law: Law) -> Check:
 
 
 def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarray, Row]:
-    """Deformation gradients, directions, and a row that names their range of stretches.
+    """Return deformation gradients, directions, and a row with their range of stretches.
 
-    The range is moderate, or if the law is not finite there, the widest narrower range with finite values.
+    The range is `_MODERATE`. If the law is not finite there, it is the widest of the narrower ranges with finite
+    values.
     """
     for low, high in (_MODERATE, *_NARROWER):
         F, D = _samples(low, high)
@@ -188,18 +194,27 @@ def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarr
         return *_samples(), Row("finite at moderate stretches", "NaN or infinite", "0.7 to 1.4", False)
     if (low, high) == _MODERATE:
         return F, D, Row("finite at moderate stretches", "yes", "0.7 to 1.4", True)
-    return F, D, Row("finite at moderate stretches", f"only from {low:g} to {high:g}", "does the law lock there?", None)
+    return (
+        F,
+        D,
+        Row(
+            "finite at moderate stretches",
+            f"only from {low:g} to {high:g}",
+            "does the law have a limiting stretch?",
+            None,
+        ),
+    )
 
 
 def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], programs: Sequence[Callable]) -> list[Row]:
-    """Rows that compare stress and tangent with automatic differentiation.
+    """Return rows that compare stress and tangent with automatic differentiation.
 
     There are three comparisons: at moderate stretches, over the stable range, and with other parameters, none of which
-    is 0. The first comparison that fails is shown.
+    is 0. The row shows the first comparison that fails.
     """
     low, high = max(stable[0], 0.5), min(stable[1], 2.0)
     sets = [("", law, F)]
-    if low < high:  # if only rest is stable, the stress is roundoff
+    if low < high:  # if only the rest state is stable, the stress is roundoff
         sets.append((f", stretches {low:.2g} to {high:.2g}", law, _samples(low, high)[0]))
     sets.append((", parameters times 0.8 (0: 0.1)", _with_other_parameters(law), F))
     rows = []
@@ -208,7 +223,7 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
         exact, found = jax.jit(oracle), []
         for where, own, at in sets:
             ours, theirs = (_as_numbers(partial(f, own), at).reshape(len(at), -1) for f in (program, exact))
-            # Outside the moderate stretches a law may lock, so values that are not finite are ignored there.
+            # A law may have a limiting stretch. So beyond moderate stretches, values that are not finite are ignored.
             known = (np.isfinite(ours) & np.isfinite(theirs)).all(axis=1) | (where == "")
             if np.any(known):
                 found.append(_exact(f"{name} by hand against autodiff{where}", ours[known], theirs[known]))
@@ -217,12 +232,12 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
 
 
 def _with_other_parameters(law: Law) -> Law:
-    """The law with other parameters, none of which is 0."""
+    """Return the law with other parameters, none of which is 0."""
     return jax.tree.map(lambda v: jnp.where(jnp.asarray(v) == 0, 0.1, 0.8 * jnp.asarray(v)), law)
 
 
 def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]:
-    """A row on whether the energy is the sum of its two parts. Viscosity and mixed elements use only the parts."""
+    """Check whether the energy is the sum of its two parts. Viscosity and mixed elements use only the parts."""
     isochoric, volumetric = law.isochoric_part(), law.volumetric_part()
     if isochoric is None or volumetric is None:
         return []
@@ -231,7 +246,7 @@ def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]
 
 
 def _idle_parameters_row(law: Law, programs: Sequence[Callable], F: np.ndarray) -> list[Row]:
-    """A row with the parameters that change neither energy nor stress; no row if there is none."""
+    """Return a row with the parameters that change neither energy nor stress, or no row without such parameters."""
     law = _with_other_parameters(law)
     leaves, structure = jax.tree_util.tree_flatten_with_path(law)
     before, idle = [_as_numbers(partial(f, law), F) for f in programs], []
@@ -252,8 +267,8 @@ def _as_numbers(function: Callable, F: np.ndarray) -> np.ndarray:
     return np.asarray(function(jnp.asarray(F)), float)
 
 
-#: To find a stiffness that jumps at rest, it is computed at this distance from rest. Without a jump it changes by less
-#: than `JUMP`.
+#: To find a jump of the stiffness at rest, the stiffness is computed at the distance `NEAR` from rest. Without a jump,
+#: its relative change is less than `JUMP`.
 NEAR, JUMP = 1e-7, 1e-4
 
 
@@ -263,17 +278,17 @@ def _rotation(seed: int) -> np.ndarray:
 
 
 def _samples(low: float = _MODERATE[0], high: float = _MODERATE[1]) -> tuple[np.ndarray, np.ndarray]:
-    """Deformation gradients with stretches between `low` and `high`, and directions of unit length."""
+    """Return deformation gradients with stretches between `low` and `high`, and directions of unit length."""
     rng = np.random.default_rng(2)
     stretches = rng.uniform(low, high, (12, 3))
-    stretches[:3, 1] = stretches[:3, 0]  # two equal
+    stretches[:3, 1] = stretches[:3, 0]  # two equal stretches
     F = np.stack([_rotation(k) @ np.diag(s) @ _rotation(k + 100) for k, s in enumerate(stretches)])
     D = rng.standard_normal((12, 3, 3))
     return F, D / np.linalg.norm(D, axis=(1, 2))[:, None, None]
 
 
 def _difference(function: Callable, F: np.ndarray, D: np.ndarray, h: float, exact: np.ndarray) -> float:
-    """Maximum relative error of the central difference with step h."""
+    """Return the maximum relative error of the central difference with step h."""
     quotient = (_as_numbers(function, F + h * D) - _as_numbers(function, F - h * D)) / (2 * h)
     return float(np.abs(quotient - exact).max() / max(np.abs(exact).max(), 1e-300))
 
@@ -297,9 +312,9 @@ def _exact(name: str, ours: np.ndarray, theirs: np.ndarray, size: float | None =
 
 
 def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> list[Row]:
-    """Rows on energy, stress and moduli of the undeformed state.
+    """Return rows about energy, stress and moduli of the undeformed state.
 
-    The moduli are Voigt means. For an isotropic law they are the moduli in every direction.
+    The moduli are Voigt means. For an isotropic law, the moduli are the same in every direction.
     """
     W, P, A = (_as_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
     if not np.isfinite(A).all():
@@ -307,21 +322,21 @@ def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable)
     scale = np.abs(A).max()
     rows = []
     for name, value in (("energy at rest", np.abs(W)), ("stress at rest", np.abs(P).max())):
-        # A law without stiffness at rest (for example of slack fibres) is compared with 1 Pa.
+        # If a law has no stiffness at rest (for example slack fibres), the value is compared with 1 Pa.
         error = value / (scale if scale > 0 else 1.0)
         found = f"{error:.1e} of the tangent" if scale > 0 else f"{value:.1e} Pa"
         rows.append(Row(name, found, f"< {EXACT_LIMIT:.0e}", bool(error < EXACT_LIMIT)))
     moduli, near = _mean_moduli(A[None])[:, 0], _mean_moduli(_as_numbers(tangent, _near_rest()))
     jumps = np.ptp(near, axis=1).max() > JUMP * np.abs(near).max()
     if jumps:
-        rows.append(Row("stiffness at rest jumps", "differs by the direction", "fibres that go slack?", None))
+        rows.append(Row("stiffness at rest jumps", "depends on the direction", "fibres that go slack?", None))
     names = (("shear modulus", "shear_modulus"), ("bulk modulus", "bulk_modulus"))
     for (name, method), value, around in zip(names, moduli, near, strict=True):
         low, high = (around.min(), around.max()) if jumps else (value, value)
         found = f"{low:.6g} to {high:.6g} Pa" if jumps else f"{value:.6g} Pa"
         try:
             stated = float(getattr(law, method)())
-        except Exception:  # not stated, or stated by a function that does not run
+        except Exception:  # the law does not define the method, or the method fails
             rows.append(Row(f"ground-state {name}", found, "not stated", None))
             continue
         allowed = (JUMP if jumps else 1e-9) * np.abs(moduli).sum()
@@ -331,21 +346,21 @@ def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable)
 
 
 def _mean_moduli(A: np.ndarray) -> np.ndarray:
-    """Voigt means of shear and bulk modulus (2, n) [Pa] of tangents (n, 3, 3, 3, 3)."""
+    """Return the Voigt means of shear and bulk modulus (2, n) [Pa], from tangents (n, 3, 3, 3, 3)."""
     normal, coupled = np.einsum("niiii->n", A), A[:, 0, 0, 1, 1] + A[:, 0, 0, 2, 2] + A[:, 1, 1, 2, 2]
     sheared = A[:, 0, 1, 0, 1] + A[:, 0, 2, 0, 2] + A[:, 1, 2, 1, 2]
     return np.stack([(normal - coupled) / 15 + sheared / 5, (normal + 2 * coupled) / 9])
 
 
 def _near_rest() -> np.ndarray:
-    """Deformation gradients (n, 3, 3) very close to rest, in pairs of opposite directions."""
+    """Return deformation gradients (n, 3, 3) very close to rest, in pairs of opposite directions."""
     D = _samples()[1]
     D = np.concatenate([np.eye(3)[None], D + np.transpose(D, (0, 2, 1))])
     return np.eye(3) + NEAR * np.concatenate([D, -D])
 
 
 def _limits_of_energy(energy: Callable) -> list[Row]:
-    """Rows on the energy for J -> 0, J -> infinity, J = 0 and J < 0."""
+    """Return rows about the energy for J -> 0, J -> infinity, J = 0 and J < 0."""
 
     def along(*sizes: float) -> np.ndarray:
         return _as_numbers(energy, np.stack([s ** (1 / 3) * np.eye(3) for s in sizes]))
@@ -369,9 +384,10 @@ def _limits_of_energy(energy: Callable) -> list[Row]:
 
 
 def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
-    """Rows on the ranges around rest with positive work and strong ellipticity. A row fails if rest is not stable.
+    """Return rows with the ranges around rest with increasing stress and strong ellipticity.
 
-    A law without stiffness at rest, for example of fibres only, is neither stable nor unstable there: its row informs.
+    A row fails if the rest state is not stable. A law without stiffness at rest, for example a law with only fibres, is
+    neither stable nor unstable there, so its row does not fail.
     """
     rows, ranges = [], {}
     stress = jax.jit(partial(homogeneous.nominal_stress, law))
@@ -389,31 +405,31 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
         whole = " and maybe beyond" if (low, high) == (driven[0], driven[-1]) else ""
         text, passed = f"{what} {low:.3g} to {high:.3g}{whole}", (True if stable[start] else None)
         if not stable[start] and ellipticity(A[[start]])[0] >= -EXACT_LIMIT * np.abs(A[start]).max():
-            text = "no stiffness of its own at rest in some direction: add a law that has some"
+            text = "no stiffness at rest in some direction: add a law that has stiffness there"
         elif not stable[start]:
             text, passed = "not even at rest", False
         rows.append(Row(f"stable in {test.replace('_', ' ')}", text, "", passed))
     return rows, ranges
 
 
-#: A jump of the energy is searched in a step if its change differs from the work of the stress by more than this
-#: fraction. Then the step is cut into this number of parts, this many times. A jump stays in one part; without a jump
-#: the difference decreases.
+#: In a step with a jump, the change of the energy differs from the work of the stress. If the difference is above the
+#: fraction `_MISSED`, the step is cut into `_PARTS` parts, and the worst part again (`_CUTS` times). A jump stays in
+#: one part. Without a jump, the difference decreases.
 _MISSED, _PARTS, _CUTS = 0.05, 32, 3
 
 
 def _jumps(law: Law, energy: Callable) -> list[Row]:
-    """A row if the energy jumps: then its change is not the work of the stress.
+    """Return a row if the energy jumps, so that its change is not the work of the stress.
 
-    Checks at single states cannot find this.
+    Checks at single states cannot find a jump.
     """
     stress = jax.jit(partial(homogeneous.nominal_stress, law))
-    # The energy of a law of the volume only is 0 in these tests, apart from roundoff.
+    # If a law depends only on the volume, its energy is 0 in these tests, apart from roundoff.
     swollen = np.abs(_as_numbers(lambda F: law.first_piola(F[0])[None], 1.1 * np.eye(3)[None]))
     roundoff = 1e-12 * np.nan_to_num(swollen).max()
 
     def missed(test: str, driven: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Difference of the energy's change and the work, and this change, in each step (n - 1,) [Pa]."""
+        """Return |change of the energy - work| and |change of the energy| in each step, (n - 1,) [Pa]."""
         F = np.asarray(homogeneous.deformation_gradient(test, driven))
         P, W = _as_numbers(stress, F), _as_numbers(energy, F)
         with np.errstate(all="ignore"):
@@ -435,21 +451,21 @@ def _jumps(law: Law, energy: Callable) -> list[Row]:
             else:
                 at = low
                 found = f"by {parts.max():.3g} Pa at {what} {at:.3g} in {test.replace('_', ' ')}"
-                return [Row("the energy jumps", found, "its stress does not know it", False)]
+                return [Row("the energy jumps", found, "the stress does not show it", False)]
     return []
 
 
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Whether the nominal stress increases; at the ends by one-sided differences."""
+    """Return whether the nominal stress increases (n,). One-sided differences are used at the ends."""
     stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
     with np.errstate(all="ignore"):
         return np.gradient(stress, driven) > 0
 
 
 def ellipticity(A: np.ndarray) -> np.ndarray:
-    """Minimum eigenvalue (n,) [Pa] of the acoustic tensor A_iJkL n_J n_L over 203 directions."""
+    """Return the minimum eigenvalue (n,) [Pa] of the acoustic tensor A_iJkL n_J n_L over 203 directions n."""
     k = np.arange(200) + 0.5
-    z, angle = 1 - k / 200, np.pi * (1 + 5**0.5) * k  # Fibonacci's points of the upper half sphere
+    z, angle = 1 - k / 200, np.pi * (1 + 5**0.5) * k  # Fibonacci points on the upper half sphere
     n = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
     n = np.concatenate([n, np.eye(3)])
     finite = np.isfinite(A).all(axis=(1, 2, 3, 4))
@@ -468,7 +484,7 @@ def _range(driven: np.ndarray, stable: np.ndarray, start: int) -> tuple[float, f
 
 
 def table(result: Check) -> str:
-    """The rows as text, below the first line of the law's docstring."""
+    """Return the rows as text, below the first line of the law's docstring."""
     width = max(len(row.name) for row in result.rows)
     mark = {True: "ok", False: "FAILED", None: ""}
     lines = [(type(result.law).__doc__ or type(result.law).__name__).strip().splitlines()[0]]

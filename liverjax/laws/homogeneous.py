@@ -16,12 +16,12 @@ TESTS = {"uniaxial": "stretch", "equibiaxial": "stretch", "pure_shear": "stretch
 
 
 def deformation_gradient(test: str, driven: Number, stretch: Any = 1.0) -> jax.Array:
-    """F (..., 3, 3) with det F = 1, for a sample without traction along axis 3.
+    """Return deformation gradients F (..., 3, 3) with det F = 1, for a sample without traction along axis 3.
 
     Args:
         test: one of `TESTS`.
         driven: stretches along axis 1 (and 2 in `equibiaxial`) or amounts of shear (...).
-        stretch: only for `simple_shear`: a uniaxial stretch along axis 1 before the shear.
+        stretch: uniaxial stretch along axis 1 before the shear, only for `simple_shear`.
     """
     v = jnp.asarray(driven, float)
     zero, one = jnp.zeros_like(v), jnp.ones_like(v)
@@ -41,11 +41,11 @@ def deformation_gradient(test: str, driven: Number, stretch: Any = 1.0) -> jax.A
 
 
 def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
-    """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample with a free face 3: P_33 = 0.
+    """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample with a free face 3, so that P_33 = 0.
 
-    P = dW/dF - p cof F. The volumetric energy of a law does not contribute. A law without such a split is evaluated at
-    det F = 1. `constant` says that F is data and that no derivative with respect to F is needed. Derivatives of a law
-    of stretches with respect to its parameters then need much less time.
+    P = dW/dF - p cof F. The volumetric energy of a law does not contribute. A law without a separate volumetric energy
+    is evaluated at det F = 1. `constant` means that F is data and that no derivative with respect to F is needed. For a
+    law of principal stretches, derivatives with respect to its parameters then need much less time.
     """
     split = law.isochoric_part()
     if constant and split is not None and split.stretch_energy is not None:
@@ -57,7 +57,7 @@ def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
 
 
 def measured(test: str, P: jax.Array) -> jax.Array:
-    """The component that a test measures: P_11, or P_12 in simple shear."""
+    """Return the component of P that a test measures: P_11, or P_12 in simple shear."""
     return P[..., 0, 1] if test == "simple_shear" else P[..., 0, 0]
 
 

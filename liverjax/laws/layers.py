@@ -1,4 +1,4 @@
-"""Isotropic laws in thin parts of a body: layers without stress across their thickness, and bars."""
+"""Isotropic laws in thin parts of a body: layers without stress through the thickness, and bars."""
 
 import dataclasses
 from typing import Any
@@ -11,18 +11,18 @@ from liverjax.core.struct import replace
 from liverjax.laws.base import Law
 from liverjax.laws.registry import create, find
 
-#: Number of iterations for the stretch of the thickness, and maximum change of its logarithm in one iteration.
+#: Number of iterations for the thickness stretch, and maximum change of its logarithm in one iteration.
 _ITERATIONS, _LONGEST = 30, 0.5
 
 
 def read_layer(table: object, name: str) -> Law:
-    """Read the law of a thin part from its table. Its bulk modulus has no effect and may be left out.
+    """Read the law of a thin part from its table. The bulk modulus has no effect and may be left out.
 
     Raises:
-        InputError: an unknown law or parameter, in a sentence that begins with `name`.
+        InputError: a law or parameter is unknown. The message begins with `name`.
     """
     if not isinstance(table, dict) or "name" not in table:
-        raise InputError(f'{name} law needs name = "…": python -m liverjax laws lists them')
+        raise InputError(f'{name} law needs name = "…": python -m liverjax laws lists the names')
     values = {key: value for key, value in table.items() if key != "name"}
     fields = {f.name: f for f in dataclasses.fields(find(table["name"]))}  # type: ignore[arg-type]
     without = "bulk" in fields and "bulk" not in values
@@ -34,23 +34,23 @@ def read_layer(table: object, name: str) -> Law:
 
 
 def check(law: Law, name: str) -> None:
-    """Refuse a law that has directions, or parameters that contradict each other.
+    """Raise `InputError` if a law has directions, or parameters that contradict each other.
 
     Raises:
-        InputError: one sentence that begins with `name`.
+        InputError: the message begins with `name` if the law has directions.
     """
     if any(one.fibre is not None or one.green_energy is not None for one in law.summands()):
-        raise InputError(f"{name}.law has directions, which a thin part cannot use: take an isotropic law")
+        raise InputError(f"{name}.law has directions, which a thin part cannot use: use an isotropic law")
     law.check()
 
 
 def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
-    """Energy density (Q, m) [Pa] of a layer without stress across its thickness.
+    """Energy density (Q, m) [Pa] of a layer without stress through its thickness.
 
     Args:
-        law: isotropic law. It is evaluated at J = 1, or if `solved` at the J for which the stress across is 0.
+        law: isotropic law, evaluated at J = 1. If `solved`, J is such that the stress through the thickness is 0.
         C: C_11, C_12, C_22 (Q, m) of the in-plane right Cauchy-Green tensor.
-        solved: whether the stretch of the thickness is an unknown.
+        solved: whether the thickness stretch is an unknown.
     """
     f11 = jnp.sqrt(C[0])
     f12 = C[1] / f11
@@ -66,7 +66,7 @@ def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
 
 
 def _thinned(density: Any, start: jax.Array) -> jax.Array:
-    """Logarithm (Q, m) of the thickness stretch with the minimum energy. Its derivatives are exact."""
+    """Return the logarithm (Q, m) of the thickness stretch with the minimum energy. Its derivatives are exact."""
 
     def slope(u: jax.Array) -> jax.Array:
         return jax.jvp(density, (u,), (jnp.ones_like(u),))[1]
@@ -78,7 +78,7 @@ def _thinned(density: Any, start: jax.Array) -> jax.Array:
 
     frozen = jax.lax.stop_gradient
     u = jax.lax.fori_loop(0, _ITERATIONS, lambda _, u: frozen(newton(u)), frozen(start))
-    # At the root one more iteration gives the first derivative, and another one the second derivative.
+    # At the root, one more iteration makes the first derivative exact, and another one the second derivative.
     return newton(newton(u))
 
 

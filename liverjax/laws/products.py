@@ -1,4 +1,4 @@
-"""Laws in the form of the chapter (section 4.1.2 i): sums of products g(I1, I2) h(J), and functions of such sums."""
+"""Laws as in the book chapter (section 4.1.2 i): sums of products g(I1, I2) h(J), and functions of such sums."""
 
 from collections.abc import Callable
 from math import comb
@@ -22,7 +22,7 @@ from liverjax.tensors.matrices import Invariants
 
 
 class Product(NamedTuple):
-    """W^k = c I1^i I2^j J^p."""
+    """One product W^k = c I1^i I2^j J^p of an energy."""
 
     c: Number
     i: int
@@ -31,14 +31,14 @@ class Product(NamedTuple):
 
 
 class Group(NamedTuple):
-    """phi(sum_k W^k); `slopes` gives phi' and phi'' for a sum. None: phi is the identity."""
+    """A function phi(sum_k W^k) of products. `slopes` returns phi' and phi'' for a sum; None: phi is the identity."""
 
     products: list[Product]
     slopes: Callable[[Number], tuple[Number, Number]] | None = None
 
 
 def _isochoric(c: Number, i: int, j: int) -> list[Product]:
-    """c (Ibar1 - 3)^i (Ibar2 - 3)^j as products, by the binomial theorem, without the constant term."""
+    """Expand c (Ibar1 - 3)^i (Ibar2 - 3)^j into products by the binomial theorem, without the constant term."""
     return [
         Product(c * comb(i, a) * comb(j, b) * (-3.0) ** (i - a + j - b), a, b, -2 * a / 3 - 4 * b / 3)
         for a in range(i + 1)
@@ -48,7 +48,7 @@ def _isochoric(c: Number, i: int, j: int) -> list[Product]:
 
 
 def groups(law: Law) -> list[Group]:
-    """The products of a single law. Raise `InputError` if the law cannot be written in this form."""
+    """Return the products of a single law. Raise `InputError` if the law cannot be written in this form."""
     match law:
         case NeoHookean():
             return [Group(_isochoric(law.mu / 2, 1, 0))]
@@ -77,7 +77,7 @@ def groups(law: Law) -> list[Group]:
 
 
 def _exponential(scale: Number, factor: Number) -> Group:
-    """scale exp(factor (Ibar1 - 3))."""
+    """Return the group for the energy scale exp(factor (Ibar1 - 3))."""
 
     def slopes(s: Number) -> tuple[Number, Number]:
         e = scale * factor * jnp.exp(factor * (s - 3))
@@ -87,7 +87,7 @@ def _exponential(scale: Number, factor: Number) -> Group:
 
 
 def functions_of_volume(law: Law, J: Number) -> list[tuple[jax.Array, jax.Array]]:
-    """h' and h'' of the products with g = 1."""
+    """Return the derivatives h' and h'' of the products with g = 1, which depend only on J."""
     if isinstance(law, NeoHookeanCompressible):
         first, second = law.energy_derivatives(Invariants(J=J))
         return [(first["J"], second["J", "J"])]

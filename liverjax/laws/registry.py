@@ -1,4 +1,4 @@
-"""The laws by name (those of the chapter's Table 1 and three more), and functions to make, check and scale a law."""
+"""The laws by name (Table 1 of the book chapter, and three more), and functions to make, check and scale a law."""
 
 import dataclasses
 from typing import Any
@@ -48,26 +48,26 @@ LAWS: dict[str, type[Law]] = {
 
 
 def find(name: str) -> type[Law]:
-    """The class of the law with this name. The `InputError` for an unknown name suggests a similar known name."""
+    """Return the class of the law with this name. The `InputError` for an unknown name suggests a similar name."""
     if as_word(name, "law name") not in LAWS:
         raise InputError(f"law {name!r} is not known: {hint(name, LAWS)}")
     return LAWS[name]
 
 
 def parameters(law: Any) -> list[dataclasses.Field]:
-    """The numeric fields of a law, in order, with their `unit`, bounds and `about` in `metadata`."""
+    """Return the numeric fields of a law, in order, with their `unit`, bounds and `about` in `metadata`."""
     return [f for f in dataclasses.fields(law) if not f.metadata.get("static")]
 
 
 def create(name: str, **values: Numbers) -> Law:
-    """A law by its name. The parameters are checked against their bounds.
+    """Make a law from its name. The parameters are checked against their bounds.
 
     Args:
         name: a key of `LAWS`.
         values: parameters in the units that ``python -m liverjax laws`` lists; sequences become tuples.
 
     Raises:
-        InputError: unknown law or parameter, missing or out-of-bounds value.
+        InputError: a law or parameter is unknown, or a value is missing or out of bounds.
     """
     cls: Any = find(name)
     known = {f.name: f for f in dataclasses.fields(cls)}
@@ -88,7 +88,7 @@ def create(name: str, **values: Numbers) -> Law:
 
 
 def _sequence(value: Any) -> Any:
-    """A tuple with the parameters of the terms, so that each is a leaf. Directions of elements stay an array."""
+    """Return the parameters of the terms as a tuple, so that each is a leaf. Directions per element stay an array."""
     if isinstance(value, (list, tuple)) and not any(isinstance(v, (list, tuple)) for v in value):
         return tuple(value)
     if jnp.ndim(value) == 0:
@@ -97,7 +97,7 @@ def _sequence(value: Any) -> Any:
 
 
 def check_value(where: str, metadata: Any, value: Any) -> None:
-    """Refuse a value that the parameter's `metadata` does not allow. The message begins with `where`."""
+    """Raise `InputError` if the parameter's `metadata` does not allow the value. The message begins with `where`."""
     if metadata.get("static"):
         if not isinstance(value, str) or value not in VOLUMETRIC:
             raise InputError(f"{where} = {value!r} is not known: use one of {', '.join(VOLUMETRIC)}")
@@ -110,14 +110,14 @@ def check_value(where: str, metadata: Any, value: Any) -> None:
 
 
 def typical(name: str) -> Law:
-    """The law with the parameters of a soft tissue of 770 Pa ground-state shear modulus (synthetic, not fitted)."""
+    """Return the law with typical parameters, scaled to a ground-state shear modulus of 770 Pa (synthetic values)."""
     values = {f.name: f.metadata["typical"] for f in parameters(find(name))}
     law = find(name)(**values)
     return scaled(law, 770.0 / law.shear_modulus())
 
 
 def scaled(law: Law, factor: Number) -> Law:
-    """The law with its energy multiplied by `factor`: parameters in Pa are multiplied, other parameters are kept."""
+    """Return the law with its energy multiplied by `factor`. Parameters in Pa are multiplied, the others are kept."""
 
     def one(s: Law) -> Law:
         if isinstance(s, Continued):

@@ -21,12 +21,12 @@ def _simo(K, J):
     return 0.25 * K * ((J - 1) * (J + 1) - 2 * jnp.log(J)), 0.5 * K * (J - 1) * (J + 1) / J, 0.5 * K * (1 + 1 / J**2)
 
 
-#: Name -> function of (K, J) giving U, U', U'': K/2 (J-1)^2, K/2 ln^2 J, K/4 (J^2 - 1 - 2 ln J).
+#: Name -> function of (K, J) that returns U, U' and U''. U is K/2 (J-1)^2, K/2 ln^2 J or K/4 (J^2 - 1 - 2 ln J).
 VOLUMETRIC = {"quadratic": _quadratic_energy, "log": _log, "simo": _simo}
 
 
 def volumetric(kind: str, K: Number, J: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """U, dU/dJ and d2U/dJ2 [Pa] for the bulk modulus K [Pa]. Raise `InputError` for an unknown kind."""
+    """Return U, dU/dJ and d2U/dJ2 [Pa] for the bulk modulus K [Pa]. Raise `InputError` for an unknown kind."""
     if kind not in VOLUMETRIC:
         raise InputError(f"volumetric = {kind!r} is not known: use one of {', '.join(VOLUMETRIC)}")
     return VOLUMETRIC[kind](K, J)

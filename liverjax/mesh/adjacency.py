@@ -1,4 +1,7 @@
-"""Nodes of a mesh that share an element, and patches of nearby nodes. They are computed once per mesh, on the host."""
+"""Find nodes of a mesh that share an element, and patches of nearby nodes.
+
+Both are computed once per mesh, in NumPy (not in JAX).
+"""
 
 from typing import Any
 
@@ -11,51 +14,50 @@ from liverjax.core.struct import Indices, param, static, struct
 #: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
-#: Nodes per patch, up to `FEW_PATCHES` patches; nodes per patch in larger meshes, where the number of iterations must
-#: not grow; maximum number of patches, since the coarse matrix is dense with 12 unknowns per patch.
+#: A mesh has patches of `PATCH_SIZE` nodes, up to `FEW_PATCHES` patches. A larger mesh has patches of `LARGE_PATCH`
+#: nodes, since the number of iterations must not grow with the mesh. There are at most `MOST_PATCHES` patches, since
+#: the coarse matrix is dense with 12 unknowns per patch.
 PATCH_SIZE, FEW_PATCHES, LARGE_PATCH, MOST_PATCHES = 80, 32, 160, 192
 
-#: Two neighbours are near if their distance is below this fraction of the mean distance of each to its neighbours.
-#: Maximum number of nodes of a cluster. A mesh has clusters if at least this fraction of its vertices has a near
-#: neighbour.
+#: Two neighbours are near if their distance is below `NEAR` times the root mean square distance of each of them to its
+#: neighbours. A cluster has at most `LARGEST_CLUSTER` nodes. A mesh has clusters if at least the fraction `SHARE` of
+#: its vertices has a near neighbour.
 NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
 
 
 @struct
 class Clusters:
-    """Groups of near nodes in thin cells, and the sources of the blocks of their matrices.
+    """Groups (clusters) of near nodes in thin cells, and the sources of the entries of their matrices.
 
-    A cluster has M x M blocks. The matrix entries between its members a < b are at place a M + b.
+    The matrix of a cluster with M nodes has M x M blocks. The block of its members a < b has the index a M + b.
     """
 
     nodes: jax.Array = param("1", "members of every cluster (G, M), padded with 0")
     there: jax.Array = param("1", "1 for a member, 0 for padding (G, M)")
-    places: jax.Array = param("1", "place of every source (n,) in all blocks (G M M)")
+    places: jax.Array = param("1", "index of every source (n,) in all blocks (G M M)")
     sources: tuple[jax.Array, ...] = param(
-        "1", "arrays (n,); for vertices: edge; for functions: element, one function, another, sign of their product"
+        "1", "arrays (n,): the edge of two vertices; or element, two functions, and the sign of their product"
     )
 
 
 @struct
 class Pattern:
-    """Edges, and the neighbours of every node in rows of one length W (ELL format): the assembly needs no search."""
+    """Edges, and the neighbours of every node in rows of equal length W (ELL format). The assembly needs no search."""
 
     edges: jax.Array = param("1", "node numbers (2, N), the lower first")
-    element_edges: jax.Array = param("1", "number of the edge of each of `PAIRS` (6, E)")
+    element_edges: jax.Array = param("1", "edge number of each node pair in `PAIRS` (6, E)")
     row_nodes: jax.Array = param("1", "neighbours of every node (W, V), padded with the node itself")
     row_edges: jax.Array = param("1", "the edges to these neighbours (W, V), padded with N")
-    edge_slots: jax.Array = param("1", "place of each edge (N,) in the flattened rows, in the row of its lower node")
+    edge_slots: jax.Array = param("1", "index of each edge (N,) in the flattened rows, in the row of its lower node")
     patches: jax.Array = param("1", "number of the patch of every node (V,), for the coarse space")
-    patch_functions: jax.Array = param(
-        "1", "1 and the scaled position in its patch (up to about 1) of every node (V, 4)"
-    )
-    patch_width: jax.Array = param("m", "mean of the largest extents of the patches")
+    patch_functions: jax.Array = param("1", "for every node: 1, and its scaled position in its patch (-1 to 1), (V, 4)")
+    patch_width: jax.Array = param("m", "largest extent of a patch, mean over all patches")
     clusters: Any = param("1", "`Clusters` of the vertices, where cells are thin", default=None)
     number_of_patches: int = static(default=1, about="P")
 
 
 def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
-    """The pattern of elements (E, 4) on points (V, 3) [m]; host side. Equal meshes give equal patterns.
+    """Return the pattern of elements (E, 4) with points (V, 3) [m]. Equal meshes give equal patterns.
 
     The points may be traced (for derivatives with respect to the shape). Then all nodes are in one patch.
     """
@@ -65,7 +67,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
     functions, widest = _patch_functions(jax.lax.stop_gradient(points) if traced else points, near)
     tets = np.asarray(tetrahedra, dtype=int).reshape(-1, 4)
     if tets.size and (tets.min() < 0 or tets.max() >= number_of_nodes):
-        tets = tets[:0]  # a mesh that `check_mesh` refuses
+        tets = tets[:0]  # `check_mesh` raises an error for this mesh
     both = np.stack([np.sort(tets[:, p], axis=1) for p in PAIRS])  # (6, E, 2)
     code, inverse = np.unique(both[..., 0].astype(np.int64) * number_of_nodes + both[..., 1], return_inverse=True)
     low, high = np.divmod(code, number_of_nodes)
@@ -98,12 +100,15 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
 
 
 def node_numbers(of: Any) -> jax.Array:
-    """A copy as 32-bit integers. NumPy converts them, since JAX would compile a program for each shape."""
+    """Return a copy as 32-bit integers. NumPy converts them, since JAX would compile a program for each shape."""
     return jax.device_put(np.asarray(of).astype(np.int32))
 
 
 def patches(points: np.ndarray) -> np.ndarray:
-    """Number of the patch of every node (V,): boxes are halved at the median along their longest side; host side."""
+    """Return the patch number of every node (V,).
+
+    The largest patch is halved at the median along its longest side, until there are enough patches.
+    """
     groups = [np.arange(len(points))]
     few = min(-(-len(points) // PATCH_SIZE), FEW_PATCHES)
     while len(groups) < max(few, min(len(points) // LARGE_PATCH, MOST_PATCHES)):
@@ -118,7 +123,7 @@ def patches(points: np.ndarray) -> np.ndarray:
 
 
 def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    # On the host if positions are known: JAX would need a second to compile small programs for this.
+    # NumPy is used if the positions are known: JAX would need a second to compile small programs for this.
     xp: Any = jnp if isinstance(points, jax.core.Tracer) else np
     given: Any = points if xp is jnp else np.asarray(points)
     members = [given[patch == k] for k in range(int(patch.max(initial=0)) + 1)]
@@ -131,12 +136,12 @@ def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, j
 
 
 def vertex_clusters(points: np.ndarray, edges: np.ndarray) -> Clusters | None:
-    """Clusters of vertices (V, 3) along the edges (2, N); None if few cells are thin; host side."""
+    """Return the clusters of vertices (V, 3) [m] with edges (2, N). Returns None if few cells are thin."""
     return _clustered(near_groups(points, edges), edges, (np.arange(edges.shape[1]),))
 
 
 def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) -> Clusters | None:
-    """Clusters of the elements' functions, from their numbers (n, E), positions (N, 3) and signs (n, E); host side."""
+    """Return the clusters of shape functions, from their numbers (n, E), positions (N, 3) [m] and signs (n, E)."""
     a, b = np.triu_indices(len(nodes), 1)
     pairs, elements = np.stack([nodes[a], nodes[b]]).reshape(2, -1), np.tile(np.arange(nodes.shape[1]), len(a))
     group = near_groups(places, np.unique(np.sort(pairs, axis=0), axis=1))
@@ -145,9 +150,9 @@ def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) 
 
 
 def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Number of the group of every node (V,).
+    """Return the group number of every node (V,).
 
-    Nodes that chains of near `pairs` (2, N) connect form a group; host side.
+    Nodes form a group if chains of near `pairs` (2, N) connect them. Groups that are too large are divided.
     """
     count, (one, other) = len(places), pairs
     square = np.sum((places[one] - places[other]) ** 2, axis=1)
@@ -174,7 +179,7 @@ def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _packed(group: np.ndarray) -> np.ndarray:
-    """Join groups of several nodes up to the size of the largest one: then blocks of equal size have little padding."""
+    """Join groups of several nodes up to the size of the largest group, so that equal blocks need little padding."""
     size = np.bincount(group)
     largest, free, last = int(size.max()), 0, 0
     new = np.arange(len(size))
@@ -186,11 +191,14 @@ def _packed(group: np.ndarray) -> np.ndarray:
 
 
 def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, ...]) -> Clusters | None:
-    """Clusters from the group of each node (V,) and pairs (2, n) of nodes; `sources` has one entry for each pair."""
+    """Return clusters, from the group number of each node (V,) and pairs (2, n) of nodes.
+
+    `sources` has one entry for each pair. Returns None if every group has only one node.
+    """
     size = np.bincount(group)
     if size.max(initial=0) < 2:
         return None
-    number = np.cumsum(size > 1) - 1  # number of a group among the groups of several nodes
+    number = np.cumsum(size > 1) - 1  # number of a group among all groups with several nodes
     order = np.argsort(group, kind="stable")
     place = np.empty(len(group), int)
     place[order] = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)

@@ -1,4 +1,4 @@
-"""Cylinders with rings and layers at given places: complete cylinders, and sectors for axisymmetric problems.
+"""Meshes of cylinders with rings at given radii and layers at given heights, and sectors for axisymmetric problems.
 
 A ring is a regular polygon. Its corners lie a little outside the circle, so that the polygon and the circle have the
 same area. The error of a stiffness is then of fourth order in the angle between corners, not of second order.
@@ -14,22 +14,22 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.prisms import stacked
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: Growth of the cell length per distance from a rim. In quadratic elements slower growth gains little
-#: (experiments/TABLES.md).
+#: Increase of the cell length per distance from a rim. With quadratic elements, a smaller increase hardly improves the
+#: accuracy (experiments/TABLES.md).
 GROWTH = 0.7
 
 
 def graded(length: float, cells: Mapping[float, float], largest: float, growth: float = GROWTH) -> np.ndarray:
-    """Places from 0 to `length`, with short cells near given places.
+    """Return positions of nodes from 0 to `length`, with short cells near given positions.
 
     Args:
         length: total length [m].
-        cells: place [m] -> length of a cell there [m]; the result contains all these places.
+        cells: position [m] -> length of a cell there [m]. The result contains all these positions.
         largest: maximum length of a cell [m].
-        growth: increase of the cell length per distance from such a place.
+        growth: increase of the cell length per distance from such a position.
 
     Returns:
-        Increasing places (n,) [m].
+        Increasing positions (n,) [m].
     """
     stops = np.unique([0.0, *cells, length])
     parts = [np.zeros(1)]
@@ -47,7 +47,7 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
 
 
 def graded_cylinder(radii: np.ndarray, heights: np.ndarray, match_area: bool = True) -> TetMesh:
-    """A cylinder about the z axis with rings of nodes at `radii` and layers of nodes at `heights`.
+    """Mesh a cylinder about the z axis, with rings of nodes at `radii` and layers of nodes at `heights`.
 
     Edges around the axis are about as long as the width of the widest ring. The number of corners increases only across
     wide rings. A thin ring has the same number of corners outside and inside.
@@ -55,13 +55,13 @@ def graded_cylinder(radii: np.ndarray, heights: np.ndarray, match_area: bool = T
     Args:
         radii: radii of the rings (n,) [m], increasing from 0 (the axis).
         heights: heights of the layers (m,) [m], increasing.
-        match_area: whether each polygon has the area of its circle; else its corners are on the circle.
+        match_area: whether each polygon has the area of its circle. Otherwise its corners are on the circle.
 
     Returns:
         A mesh with the node sets bottom, top and mantle.
 
     Raises:
-        InputError: places that do not increase, radii that do not begin at 0.
+        InputError: radii or heights that do not increase, or radii that do not begin at 0.
     """
     radii, heights = _rising("radii", radii), _rising("heights", heights)
     corners = _corners(radii)
@@ -78,14 +78,14 @@ class Sector(NamedTuple):
     mesh: TetMesh  # node sets bottom, top, mantle, axis, start (the plane y = 0) and end
     normal: np.ndarray  # normal (3,) of the plane `end`
     parts: float  # number of such sectors in a cylinder
-    stretch: float  # distance of a ring's corners from the axis, over the radius of the ring
+    stretch: float  # distance of a ring's corners from the axis, divided by the radius of the ring
 
 
 def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1) -> Sector:
-    """The part of a cylinder between the plane y = 0 and another plane through the axis.
+    """Mesh the part of a cylinder between the plane y = 0 and another plane through the axis.
 
-    An axisymmetric problem needs only one slice: both planes are planes of symmetry. Every polygon has the area of its
-    circle.
+    An axisymmetric problem needs only one slice, since both planes are planes of symmetry. Every polygon has the area
+    of its circle.
 
     Args:
         radii, heights: as in `graded_cylinder`.
@@ -93,11 +93,14 @@ def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1
         slices: number of edges of a ring in the sector; `corners` / 4 gives a quarter of the cylinder.
 
     Raises:
-        InputError: as `graded_cylinder`; a sector of half of the cylinder or more.
+        InputError: radii or heights that do not increase, radii that do not begin at 0, or a sector that is half of the
+            cylinder or more.
     """
     radii, heights = _rising("radii", radii), _rising("heights", heights)
     if not 0 < 2 * slices < corners:
-        raise InputError(f"slices = {slices} of {corners} must make less than half a cylinder: take fewer, at least 1")
+        raise InputError(
+            f"slices = {slices} of {corners} must make less than half a cylinder: use fewer slices, at least 1"
+        )
     stretch, step = _stretch(corners), 2 * np.pi / corners
     angle = step * np.arange(slices + 1)
     ring = stretch * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -124,13 +127,13 @@ def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1
 
 
 def _stretch(corners: int) -> float:
-    """Radius of the corners of a regular polygon, over the radius of the circle with the same area."""
+    """Return the radius of the corners of a regular polygon, divided by the radius of the circle with the same area."""
     step = 2 * np.pi / corners
     return float(np.sqrt(step / np.sin(step)))
 
 
 def _corners(radii: np.ndarray) -> np.ndarray:
-    """Number of corners of the ring at each radius except the first."""
+    """Return the number of corners of the ring at each radius except the first."""
     width = np.diff(radii)
     edge = width.max()
     found, last = [], 6
@@ -144,7 +147,7 @@ def _corners(radii: np.ndarray) -> np.ndarray:
 
 
 def _rings(radii: np.ndarray, corners: np.ndarray, match_area: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and counter-clockwise triangles of a disc: one node at the centre, then ring after ring."""
+    """Return nodes and counter-clockwise triangles of a disc: one node at the centre, then ring after ring."""
     points, triangles = [np.zeros((1, 2))], []
     inner = np.zeros(1, int)
     for radius, count in zip(radii[1:], corners, strict=True):
@@ -158,10 +161,10 @@ def _rings(radii: np.ndarray, corners: np.ndarray, match_area: bool) -> tuple[np
 
 
 def _ring_of_triangles(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
-    """Triangles between two rings.
+    """Return the triangles between two rings.
 
-    Each triangle contains the next edge of the inner or of the outer ring: the edge whose middle comes first around the
-    axis.
+    Each triangle contains the next edge of the inner or of the outer ring. Of these two edges, the edge is used whose
+    middle has the smaller angle about the axis.
     """
     n, m = len(inner), len(outer)
     if n == 1:
@@ -180,7 +183,7 @@ def _ring_of_triangles(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
 def _rising(name: str, places: np.ndarray) -> np.ndarray:
     places = np.asarray(places, float)
     if places.ndim != 1 or len(places) < 2 or not np.all(np.isfinite(places)) or not np.all(np.diff(places) > 0):
-        raise InputError(f"{name} = {places} must be two or more increasing places: sort them")
+        raise InputError(f"{name} = {places} must be two or more increasing numbers: sort them")
     if name == "radii" and places[0] != 0:
-        raise InputError(f"radii begin at {places[0]:g}: begin with the axis, 0")
+        raise InputError(f"radii begin at {places[0]:g}: begin with 0, the axis")
     return places

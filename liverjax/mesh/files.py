@@ -26,7 +26,8 @@ CELLS = {1: "tetra", 2: "tetra10"}
 _NAMES = {1: "linear", 2: "quadratic"}
 #: Edges of a quadratic element in the order of VTK and meshio.
 _VTK = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
-#: A middle of an edge is moved onto the straight edge if its distance is more than this fraction of the edge's length.
+#: A middle node is moved onto its straight edge if its distance from the edge's middle is above this fraction of the
+#: edge's length.
 _STRAIGHT = 1e-6
 
 
@@ -41,7 +42,8 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
         unit: length unit of the file, one of `UNITS`.
 
     Raises:
-        InputError: unreadable file, no tetrahedra or other cells, unknown unit, unusable mesh.
+        InputError: the file is unreadable, has no tetrahedra or also has other volume cells. The same error is raised
+            for an unknown unit and an unusable mesh.
     """
     if as_word(unit, "mesh unit") not in UNITS:
         raise InputError(f"mesh unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
@@ -59,7 +61,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     others = sorted({b.type for b in data.cells if b.type != cell and not b.type.startswith(_FLAT_CELLS)})
     if others:
         raise InputError(
-            f"mesh file {path}: it holds {', '.join(others)} beside {_NAMES[order]} tetrahedra; remesh all of the body "
+            f"mesh file {path}: it holds {', '.join(others)} beside {_NAMES[order]} tetrahedra; remesh the whole body "
             f"with {4 if order == 1 else 10}-node tetrahedra"
         )
     points, tets = np.asarray(data.points, dtype=float)[:, :3] * UNITS[unit], np.vstack(blocks)
@@ -88,7 +90,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
 
 
 def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element_sets: dict, name: str) -> TetMesh:
-    """A quadratic mesh with straight edges, from elements (E, 10) in the order of VTK."""
+    """Make a quadratic mesh with straight edges, from elements (E, 10) in the node order of VTK."""
     used = np.unique(tets[:, :4])
     new = np.full(len(points), -1)
     new[used] = np.arange(len(used))
@@ -110,12 +112,12 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     if len(curved) and _permuted(points[of_file], straight[middles], length):
         raise InputError(
             f"{name}: the middle nodes of its elements are not in the order of its format (each lies on another edge "
-            "of the same element); export the mesh anew, as VTU or Gmsh"
+            "of the same element); export the mesh again, as VTU or Gmsh"
         )
     if len(curved):
         warnings.warn(
             f"{name}: {len(np.unique(curved))} middles of edges lie up to {off.max():.3g} m off the straight edge: "
-            "they are moved onto it, since elements are straight here; refine curved parts",
+            "these nodes are moved onto the edge, since elements must be straight; refine curved parts",
             stacklevel=3,
         )
     sets = {k: new[nodes][new[nodes] >= 0] for k, nodes in node_sets.items()}
@@ -123,7 +125,10 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
 
 
 def _permuted(points: np.ndarray, middles: np.ndarray, length: np.ndarray) -> bool:
-    """Whether the points (E, 6, 3) [m] are the middles (E, 6, 3) of edges, in one other order for all elements."""
+    """Return whether the points (E, 6, 3) [m] are the edge middles (E, 6, 3) [m] in another order.
+
+    The order must be the same for all elements.
+    """
     apart = np.linalg.norm(points[:, :, None] - middles[:, None], axis=3)
     order = apart[0].argmin(axis=1)
     return bool(np.all(apart[:, np.arange(6), order] <= _STRAIGHT * length[:, order]))
@@ -154,7 +159,7 @@ def _read_quietly(path: Path) -> Any:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
             return meshio.read(path)
     except SystemExit:  # meshio exits if no reader accepts the file, and prints the reasons
-        reason = " ".join(said.getvalue().split()) or f"its content is not what {path.suffix} files hold"
+        reason = " ".join(said.getvalue().split()) or f"its content is not in the format of {path.suffix} files"
     except KeyError as error:  # a missing attribute, or a missing entity of a Gmsh group
         reason = f"the entry {error.args[0]} is missing"
     except Exception as error:  # meshio's readers raise many kinds of errors
@@ -169,7 +174,7 @@ _LARGE = 10.0
 
 
 def _node_sets(data: Any, tets: np.ndarray, name: str) -> dict[str, np.ndarray]:
-    """Node sets: meshio's point sets, integer point data ``set:NAME`` (from `write_mesh`), and groups of triangles.
+    """Return node sets from meshio's point sets, integer point data ``set:NAME``, and groups of triangles.
 
     Raises:
         InputError: two different sets have the same name.
@@ -193,19 +198,20 @@ _MOST_GROUPS = 100
 
 
 def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
-    """Sets of tetrahedra: meshio's cell sets, cell data ``set:NAME``, and groups given by whole numbers.
+    """Return sets of tetrahedra from meshio's cell sets, cell data ``set:NAME``, and groups given by whole numbers.
 
-    The name of a group is from the file (Gmsh's physical names), or made of array and number, e.g. ``medit:ref=2``.
+    The name of a group comes from the file (Gmsh's physical names). Otherwise, it is made from the name of the array
+    and the group's number, e.g. ``medit:ref=2``.
     """
     return _cell_groups(data, (cell,), 3)
 
 
-#: Types of surface cells whose named groups become node sets; then the edges of a triangle.
+#: Types of surface cells with named groups that become node sets, and the edges of a triangle.
 _TRIANGLES, _EDGES = ("triangle", "triangle6"), ((0, 1), (1, 2), (0, 2))
 
 
 def _surface_sets(data: Any, tets: np.ndarray) -> dict[str, np.ndarray]:
-    """Nodes of each named group of triangles. In a quadratic mesh, middles of edges are added to 3-node triangles."""
+    """Return the nodes of each named group of triangles. In a quadratic mesh, 3-node triangles get middle nodes."""
     sets = {}
     for name, parts in _triangle_groups(data).items():
         nodes = [part.ravel() for part in parts]
@@ -216,13 +222,13 @@ def _surface_sets(data: Any, tets: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _named_triangles(data: "meshio.Mesh") -> dict[str, np.ndarray]:
-    """Vertices (m, 3) of each named group of triangles."""
+    """Return the vertices (m, 3) of each named group of triangles."""
     groups = _triangle_groups(data)
     return {name: np.concatenate([part[:, :3] for part in parts]).astype(np.int32) for name, parts in groups.items()}
 
 
 def _triangle_groups(data: "meshio.Mesh") -> dict[str, list[np.ndarray]]:
-    """Triangles of each named group, with 3 or 6 nodes: one array for each block of cells."""
+    """Return the triangles of each named group, with 3 or 6 nodes, in one array for each block of cells."""
     blocks = [block for block in data.cells if block.type in _TRIANGLES]
     first = np.cumsum([0, *(len(block.data) for block in blocks)])
     return {
@@ -235,7 +241,7 @@ def _triangle_groups(data: "meshio.Mesh") -> dict[str, list[np.ndarray]]:
 
 
 def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Middles of the edges of triangles (m, 3) in quadratic elements (E, 10) in the order of VTK."""
+    """Return the middle nodes on the edges of triangles (m, 3), from elements (E, 10) in the node order of VTK."""
 
     def code(pairs: np.ndarray) -> np.ndarray:
         low, high = np.moveaxis(np.sort(pairs.astype(np.int64), axis=-1), -1, 0)
@@ -245,9 +251,9 @@ def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str, np.ndarray]:
-    """Name of a group -> numbers of its cells, counted over all blocks of the types `cells`.
+    """Return {name of a group: numbers of its cells}, counted over all blocks of the types `cells`.
 
-    If a group has a number but no name, a group of volumes is named by its number. A group of surfaces is left out.
+    A group of tetrahedra without a name is named by its number. A group of surface cells without a name is left out.
     """
     kinds = [block.type for block in data.cells]
     first = np.cumsum([0, *(len(block.data) if block.type in cells else 0 for block in data.cells)])
@@ -267,19 +273,19 @@ def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str,
             continue
         values = values.astype(int)
         if name.startswith("set:"):
-            if values.any() or all(kind in cells for kind in kinds):  # else the set has other kinds of cells
+            if values.any() or all(kind in cells for kind in kinds):  # otherwise the set has other kinds of cells
                 sets[name.removeprefix("set:")] = np.flatnonzero(values)
             continue
         groups = np.unique(values)
         for group in groups if len(groups) <= _MOST_GROUPS else ():
             if dimension == 3 or (int(group), name) in names:
-                # Here a cell in several groups has only the number of the first group; cell sets contain all groups.
+                # Here a cell in several groups has only the number of its first group; cell sets contain all groups.
                 sets.setdefault(names.get((int(group), name), f"{name}={group}"), np.flatnonzero(values == group))
     return sets
 
 
 def _are_whole(values: np.ndarray) -> bool:
-    """Whether all values are whole numbers of any type, since ParaView's filters write region numbers as floats."""
+    """Return whether all values are whole numbers of any type. ParaView's filters write region numbers as floats."""
     if np.issubdtype(values.dtype, np.floating):
         return bool(np.all(np.isfinite(values)) and np.all(values == np.rint(values)))
     return np.issubdtype(values.dtype, np.integer)
@@ -316,14 +322,14 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, 
 
 
 def _mask(numbers: object, size: int) -> np.ndarray:
-    """An array (size,) with 1 at the given numbers and 0 elsewhere."""
+    """Return an array (size,) with 1 at the given numbers and 0 elsewhere."""
     mask = np.zeros(size, dtype=np.int32)
     mask[np.asarray(numbers, int)] = 1
     return mask
 
 
 def meshio_cells(mesh: TetMesh) -> tuple[str, np.ndarray]:
-    """meshio's name of the cells, and the cells (E, 4) or (E, 10) in the order of VTK."""
+    """Return meshio's name of the cells, and the cells (E, 4) or (E, 10) in the order of VTK."""
     if mesh.order == 1:
         return "tetra", np.asarray(mesh.tetrahedra)
     nodes = mesh.element_nodes_on_host.T

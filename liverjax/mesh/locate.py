@@ -1,4 +1,4 @@
-"""Points and lines inside a mesh: the tetrahedra that contain them; host side."""
+"""Find the tetrahedra of a mesh that contain points and lines, in NumPy (not in JAX)."""
 
 from typing import NamedTuple
 
@@ -10,30 +10,30 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 #: A point counts as inside if all its barycentric coordinates are above minus this number.
 _INSIDE = 1e-9
-#: Two vertices are at the same place if their distance is below this fraction of the body's size.
+#: Two vertices coincide if their distance is below this fraction of the body's size.
 SAME_PLACE = 1e-9
-#: A piece is left out if it is shorter than this fraction of the line.
+#: A piece of a line is left out if it is shorter than this fraction of the line.
 _SHORTEST = 1e-9
 
 
 class Pieces(NamedTuple):
     """Pieces of lines, each in one tetrahedron."""
 
-    element: np.ndarray  # (m,)
+    element: np.ndarray  # (m,) number of the tetrahedron
     line: np.ndarray  # (m,) number of the line
-    begin: np.ndarray  # (m,) beginning on the line, from 0 to 1
-    end: np.ndarray  # (m,) end on the line, from 0 to 1
+    begin: np.ndarray  # (m,) beginning of the piece as a fraction of the line, from 0 to 1
+    end: np.ndarray  # (m,) end of the piece as a fraction of the line, from 0 to 1
 
 
 def doubled_vertices(mesh: TetMesh) -> int:
-    """Number of vertices at the place of another vertex: there, parts of the mesh are not joined."""
+    """Return the number of vertices that coincide with another vertex. There, parts of the mesh are not connected."""
     points = np.asarray(mesh.points)
     steps = np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * float(np.ptp(points, axis=0).max())))
     return mesh.number_of_vertices - len(np.unique(steps, axis=0))
 
 
 def barycentric(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (4, n, E) of points (n, 3) in every tetrahedron."""
+    """Return the barycentric coordinates (4, n, E) of points (n, 3) [m] in every tetrahedron."""
     corners = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)]
     inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
     rest = np.einsum("eij,nej->ine", inverse, points[:, None] - corners[None, :, 0])
@@ -41,10 +41,10 @@ def barycentric(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
 
 
 def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Elements (n,) that contain points (n, 3) [m], and the barycentric coordinates (4, n) of the points.
+    """Return the elements (n,) that contain points (n, 3) [m], and the barycentric coordinates (4, n) of the points.
 
     Raises:
-        InputError: a point outside the mesh.
+        InputError: a point is outside the mesh.
     """
     L = barycentric(mesh, points)
     least = L.min(axis=0)
@@ -56,7 +56,7 @@ def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarra
 
 
 def around_a_point(corners: np.ndarray) -> np.ndarray:
-    """Whether tetrahedra with corners (E, 4, 3) contain the origin."""
+    """Return whether tetrahedra with corners (E, 4, 3) contain the origin, (E,)."""
     a, b, c, d = np.moveaxis(corners, 1, 0)
 
     def volume(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def around_a_point(corners: np.ndarray) -> np.ndarray:
 
 
 def around_a_point_in_plane(corners: np.ndarray) -> np.ndarray:
-    """Whether the projections of tetrahedra to a plane, with corners (E, 4, 2), contain the origin."""
+    """Return whether tetrahedra projected to a plane, with corners (E, 4, 2), contain the origin, (E,)."""
     met = np.zeros(len(corners), bool)
     for face in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]):
         a, b, c = np.moveaxis(corners[:, face], 1, 0)
@@ -76,14 +76,14 @@ def around_a_point_in_plane(corners: np.ndarray) -> np.ndarray:
     return met
 
 
-#: Local node numbers of the eight tetrahedra with straight edges that make a 10-node element.
+#: Local node numbers of the eight straight tetrahedra that together fill a 10-node element.
 _EIGHTHS = np.array(
     [[0, 4, 5, 6], [1, 4, 7, 8], [2, 5, 7, 9], [3, 6, 8, 9], [5, 8, 4, 6], [5, 8, 6, 9], [5, 8, 9, 7], [5, 8, 7, 4]]
 )
 
 
 def straight_corners(mesh: TetMesh, x: np.ndarray) -> np.ndarray:
-    """Corners of straight tetrahedra at positions x (V, 3) [m]: (E, 4, 3), or (8 E, 4, 3) for 10-node elements."""
+    """Return corners (E, 4, 3) of straight tetrahedra at positions x (V, 3) [m]; (8 E, 4, 3) for 10-node elements."""
     if mesh.order == 1:
         return x[np.asarray(mesh.tetrahedra)]
     nodes = mesh.element_nodes_on_host[:10].T
@@ -91,19 +91,19 @@ def straight_corners(mesh: TetMesh, x: np.ndarray) -> np.ndarray:
 
 
 def _all_alike(parts: np.ndarray) -> np.ndarray:
-    """Whether the parts (n, E) of an element have the same sign, for elements whose sum is not 0."""
+    """Return whether the parts (n, E) of an element have the same sign, (E,). It is False if their sum is 0."""
     whole = parts.sum(axis=0)
     return (whole != 0) & ((np.sign(whole) * parts).min(axis=0) >= -_INSIDE * np.abs(whole))
 
 
 def weights(mesh: TetMesh, element: np.ndarray, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (n, m) of elements (m,), and their shape functions at barycentric coordinates L (4, m)."""
+    """Return the nodes (n, m) of elements (m,), and their shape functions at barycentric coordinates L (4, m)."""
     nodes = mesh.element_nodes_on_host[: 4 if mesh.order == 1 else 10, element]
     return nodes, L if mesh.order == 1 else functions(2, L)[0]
 
 
 def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
-    """Straight lines from `begin` to `end` (n, 3), cut at the faces of the tetrahedra. Parts outside are left out."""
+    """Cut straight lines from `begin` to `end` (n, 3) [m] at the faces of tetrahedra. Parts outside are left out."""
     found = []
     first, last = barycentric(mesh, begin), barycentric(mesh, end)
     for line in range(len(begin)):
@@ -117,7 +117,7 @@ def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
         least = (a[:, None] + b[:, None] * middle[None, :, None]).min(axis=0)
         element = least.argmax(axis=1)
         inside = least[np.arange(len(middle)), element] > -_INSIDE
-        # Planes of distant elements also cut the lines: neighbouring parts in the same element are joined.
+        # Planes of distant elements also cut the lines, so neighbouring parts in the same element are joined.
         start = np.flatnonzero(inside & ~np.concatenate([[False], (element[1:] == element[:-1]) & inside[:-1]]))
         for k in start:
             stop = k

@@ -15,7 +15,7 @@ from liverjax.tensors.places import given, taken
 
 
 def to_nodes(mesh: TetMesh, share: jax.Array) -> jax.Array:
-    """Sums (V,) at the vertices: each element adds its `share` (E,) to each of its vertices."""
+    """Return sums (V,) at the vertices: each element adds its `share` (E,) to each of its vertices."""
     total = jnp.zeros(mesh.number_of_vertices, share.dtype)
     for a in range(4):
         total = given(total, mesh.tetrahedra[:, a], share)
@@ -23,10 +23,10 @@ def to_nodes(mesh: TetMesh, share: jax.Array) -> jax.Array:
 
 
 def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Integrals over the reference volume of a density times the linear function of every vertex: (V,).
+    """Integrate a density times the linear shape function of every vertex over the reference volume: (V,).
 
     Args:
-        density: one number for each integration point, (E,) or (Q, E), or one for each element (E,).
+        density: one number for each integration point, (E,) or (Q, E), or one number for each element (E,).
     """
     if density.ndim == 1:
         return to_nodes(mesh, mesh.volumes * density / 4)
@@ -34,7 +34,7 @@ def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def gathered(mesh: TetMesh, shares: jax.Array) -> jax.Array:
-    """The transpose of `interpolated`: sums (V,) at the vertices of values at the points (Q, E)."""
+    """Return sums (V,) at the vertices of values at integration points (Q, E): the transpose of `interpolated`."""
     if mesh.order == 1:
         return to_nodes(mesh, shares / 4)
     parts = jnp.asarray(basis(mesh.order).L, shares.dtype) @ shares
@@ -42,12 +42,12 @@ def gathered(mesh: TetMesh, shares: jax.Array) -> jax.Array:
 
 
 def summed(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """Sums over the points of every element: (E,)."""
+    """Return the sums (E,) over the integration points of every element."""
     return values if mesh.order == 1 else jnp.sum(values, axis=0)
 
 
 def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """Values at the points, (E,) or (Q, E), of a field that is linear in elements, from its values at vertices (V,)."""
+    """Interpolate a field, linear in each element, from the vertices (V,) to the integration points, (E,) or (Q, E)."""
     corner = [taken(values, mesh.tetrahedra[:, a]) for a in range(4)]
     if mesh.order == 1:
         return (corner[0] + corner[1] + corner[2] + corner[3]) / 4
@@ -55,16 +55,16 @@ def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
     return sum((L[a][:, None] * corner[a][None] for a in range(1, 4)), L[0][:, None] * corner[0][None])
 
 
-#: Order -> fraction of an element's volume at each vertex and at each middle of an edge. First for the lumped mass
-#: (Hinton, Rock and Zienkiewicz 1976: positive, in proportion to the integrals of squared functions), then for the
-#: integrals of the functions.
+#: Order -> fraction of an element's volume at each vertex and at each middle of an edge. `_LUMPED` is for the lumped
+#: mass (Hinton, Rock and Zienkiewicz 1976: positive, proportional to the integrals of the squared functions).
+#: `_INTEGRALS` is for the integrals of the shape functions.
 _LUMPED = {1: (1 / 4,), 2: (1 / 36, 4 / 27)}
 _INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
 
 
 @partial(jax.jit, inline=True)
 def nodal_volumes(mesh: TetMesh) -> jax.Array:
-    """Lumped mass divided by density (V,) [m^3]; a node of linear elements gets a quarter of each element around it."""
+    """Lumped mass divided by density (V,) [m^3]. In linear elements a node gets a quarter of each adjacent element."""
     return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)])
 
 
@@ -86,10 +86,10 @@ def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
 
 @cache
 def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Consistent mass matrix of an element, divided by its mass, as a sum of a diagonal (n,) and another matrix (n, n).
+    """Split the consistent mass matrix of an element, divided by its mass, into a diagonal (n,) and a rest (n, n).
 
-    The diagonal is the lumped mass. Functions of order 3 have no lumped mass: their diagonal entries are the integrals
-    of their squares.
+    The diagonal is the lumped mass. Functions of order 3 have no lumped mass, so their diagonal entries are the
+    integrals of their squares.
     """
     whole = products(order)
     parts, lumped = np.diag(whole).copy(), _LUMPED[min(order, 2)]
@@ -99,7 +99,7 @@ def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def products(order: int) -> np.ndarray:
-    """Exact integrals (n, n) of the products of two shape functions over an element, divided by its volume."""
+    """Return the exact integrals (n, n) of products of two shape functions over an element, divided by its volume."""
     vertex = [tuple(int(k == a) for k in range(4)) for a in range(4)]
     if order == 1:
         functions: list[dict[tuple, float]] = [{v: 1.0} for v in vertex]
@@ -121,5 +121,5 @@ def products(order: int) -> np.ndarray:
 
 
 def _exponents(vertex: list[tuple], *which: int) -> tuple:
-    """Exponents of a product of linear functions."""
+    """Return the exponents of the product of the linear functions with the indices `which`."""
     return tuple(sum(v) for v in zip(*(vertex[k] for k in which), strict=True))

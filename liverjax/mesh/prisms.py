@@ -1,10 +1,10 @@
-"""Columns of prisms over a triangulated plane, cut into tetrahedra."""
+"""Make columns of prisms over a triangulated plane, and cut them into tetrahedra."""
 
 import numpy as np
 
 
 def stacked(plane: np.ndarray, triangles: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n L, 3) and tetrahedra (3 m (L - 1), 4) between planes of n nodes at L heights.
+    """Return points (n L, 3) [m] and tetrahedra (3 m (L - 1), 4) between planes of n nodes at L heights.
 
     Args:
         plane: x and y of the nodes in every plane (n, 2) [m].
@@ -18,11 +18,11 @@ def stacked(plane: np.ndarray, triangles: np.ndarray, heights: np.ndarray) -> tu
 
 
 def _split(prisms: np.ndarray) -> np.ndarray:
-    """Cut each prism (bottom a b c, top d e f) in three.
+    """Cut each prism (bottom nodes a b c, top nodes d e f) into three tetrahedra.
 
-    Diagonals start at the lowest node, so neighbours' faces match.
+    Diagonals start at the node with the lowest number, so the faces of neighbouring prisms match.
     """
-    # Rotate each prism so that its lowest bottom number comes first. Then only one diagonal has to be chosen.
+    # Rotate each prism so that the bottom node with the lowest number comes first. Then only one diagonal has a choice.
     shift = np.argmin(prisms[:, :3], axis=1)
     turn = (np.arange(3)[None] + shift[:, None]) % 3
     a, b, c = np.take_along_axis(prisms[:, :3], turn, axis=1).T

@@ -1,4 +1,4 @@
-"""Quadratic tetrahedra from linear ones, with a node at the middle of every edge; and additional cubic functions."""
+"""Make quadratic tetrahedra with a node at the middle of every edge, and add cubic shape functions."""
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,12 @@ from liverjax.mesh.selection import boundary_triangles, face_codes
 from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Two neighbours on the surface have nearly the same direction if the cosine of their angle is above this.
+#: Two adjacent surface triangles are nearly parallel if the cosine of the angle between their normals is above this.
 _ONE_PLACE = 0.7
 
 
 def quadratic(mesh: TetMesh) -> TetMesh:
-    """The mesh with 10 nodes in each element. A quadratic mesh is returned unchanged.
+    """Return the mesh with 10 nodes in each element. A quadratic mesh is returned unchanged.
 
     The vertices keep their numbers. The middles of the edges follow in the order of `pattern.edges`. A node set also
     gets the middles of the edges of its faces (`middles_of_set`), so that a fixed face stays fixed.
@@ -38,9 +38,9 @@ def _points_and_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
 
 
 def middles_of_set(mesh: TetMesh, name: str) -> np.ndarray:
-    """Numbers V + edge of the middles that belong to a node set of the mesh; host side.
+    """Return the node numbers (V + edge number) of the edge middles that belong to a node set of the mesh.
 
-    If the mesh has a triangle set of the same name with the same vertices, its triangles say which edges these are.
+    If the mesh has a triangle set with the same name and the same vertices, these are the edges of its triangles.
     """
     V, nodes = mesh.number_of_vertices, np.asarray(mesh.node_sets[name])
     nodes = nodes[nodes < V]
@@ -51,19 +51,20 @@ def middles_of_set(mesh: TetMesh, name: str) -> np.ndarray:
 
 
 def of_faces(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Vertices `nodes` (n,), and the middles of edges that `middles_of_places` finds between them; host side."""
+    """Return the vertices `nodes` (n,), and the edge middles that `middles_of_places` finds between them."""
     return np.concatenate([nodes, middles_of_places(mesh, nodes)])
 
 
 def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Numbers V + edge of the middles of edges of all faces that form a place with only vertices `nodes`; host side.
+    """Return the node numbers (V + edge number) of the edge middles on the regions that the vertices `nodes` form.
 
-    Two places may meet at an edge of the body, such as two held sides. A face there can have all its vertices in the
-    two places without belonging to one of them. On the surface, it meets the faces of the places at an angle, and goes
-    on in its own direction outside them. If the positions of the mesh are traced, directions are not known: then all
-    faces on the surface belong to a place. Inside the body, a face of a place is at or beside a held vertex that is not
-    on the surface. Where the body is only one element thick, there are no such vertices, and all faces belong to a
-    place.
+    A region consists of element faces with all their vertices in `nodes`, for example a fixed side of the body. Two
+    regions may meet at an edge of the body. A face there can have all its vertices in the two regions without belonging
+    to one of them. On the surface, such a face is at an angle to the faces of the regions, and nearly parallel to a
+    neighbour outside them. If the positions of the mesh are traced, angles are unknown, and all faces on the surface
+    belong to a region. Inside the body, a face belongs to a region only if it has a vertex below the surface, or next
+    to a vertex of `nodes` below the surface. Where the body is only one element thick, there are no such vertices, and
+    all faces belong to a region.
     """
     V = mesh.number_of_vertices
     inside = np.zeros(V, bool)
@@ -90,7 +91,7 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
 
 
 def _and_neighbours(mesh: TetMesh, inside: np.ndarray) -> np.ndarray:
-    """Vertices `inside` (V,) and all vertices that an edge connects with one of them."""
+    """Return the vertices `inside` (V,), and all vertices that an edge connects with one of them."""
     low, high = np.asarray(mesh.pattern.edges)
     found = inside.copy()
     found[low[inside[high]]] = True
@@ -99,16 +100,17 @@ def _and_neighbours(mesh: TetMesh, inside: np.ndarray) -> np.ndarray:
 
 
 def _edges_of(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
-    """Numbers (3, m) of the edges of faces (m, 3)."""
+    """Return the edge numbers (3, m) of faces (m, 3)."""
     low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
     ends = np.sort(np.stack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=2)
     return np.searchsorted(low * mesh.number_of_vertices + high, ends[..., 0] * mesh.number_of_vertices + ends[..., 1])
 
 
 def _in_a_place(mesh: TetMesh, surface: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Which triangles of the surface with only vertices `inside` belong to a place.
+    """Return which of the surface triangles with all vertices `inside` belong to a region (see `middles_of_places`).
 
-    All do, except those that have nearly the direction of a neighbour outside the places, and of none within them.
+    A triangle does not belong to a region if it has neighbours inside and outside the regions, and is nearly parallel
+    only to neighbours outside.
     """
     own = inside[surface].all(axis=1)
     normal = _normals(mesh, surface)
@@ -127,7 +129,7 @@ def _normals(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
 
 
 def _pairs_at_edges(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of a triangle and another one with a common edge; edges (3, m)."""
+    """Return all ordered pairs of triangles with a common edge, from their edge numbers (3, m)."""
     triangle = np.tile(np.arange(edges.shape[1]), 3)
     order = np.argsort(edges.ravel(), kind="stable")
     first, last = (np.searchsorted(edges.ravel()[order], edges.ravel(), side) for side in ("left", "right"))
@@ -138,7 +140,7 @@ def _pairs_at_edges(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cubic(mesh: TetMesh) -> TetMesh:
-    """A quadratic mesh with additional functions of order 3. Their unknowns are 0 in the reference shape."""
+    """Return a quadratic mesh with additional functions of order 3. Their unknowns are 0 in the reference shape."""
     tets = np.asarray(mesh.tetrahedra)
     triples = np.concatenate([np.sort(tets[:, face], axis=1) for face in map(list, FACES)])
     _, number = np.unique(triples, axis=0, return_inverse=True)
@@ -149,7 +151,10 @@ def cubic(mesh: TetMesh) -> TetMesh:
 
 
 def _all_clusters(mesh: TetMesh) -> Clusters | None:
-    """Clusters of all functions, with each at the middle of its edge or face; None if vertices have none; host side."""
+    """Return the clusters of all functions, with each function at the middle of its edge or face.
+
+    Returns None if the vertices have no clusters.
+    """
     if mesh.pattern.clusters is None or isinstance(mesh.points, jax.core.Tracer):
         return None
     points, tets, (low, high) = (np.asarray(a) for a in (mesh.points, mesh.tetrahedra, mesh.pattern.edges))
@@ -167,7 +172,7 @@ def _all_clusters(mesh: TetMesh) -> Clusters | None:
 
 
 def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:
-    """Numbers (m,) of the faces of a mesh of order 3 with vertices (m, 3); host side."""
+    """Return the face numbers (m,) of triangles with vertices (m, 3), in a mesh of order 3."""
     tets, V = np.asarray(mesh.tetrahedra).astype(np.int64), mesh.number_of_vertices
     of_elements = np.concatenate([tets[:, face] for face in map(list, FACES)])
     code, wanted = (face_codes(np.sort(t.astype(np.int64), axis=1), V) for t in (of_elements, triangles))
@@ -176,9 +181,9 @@ def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:
 
 
 def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
-    """Triangles (m, 3).
+    """Return triangles (m, 3) with additional face numbers if the mesh has order 3; otherwise unchanged.
 
-    In a mesh of order 3 (m, 4): vertices in increasing order, and number of the face; host side.
+    Triangles with face numbers (m, 4) have three vertices in increasing order, and then the number of the face.
     """
     if mesh.order < 3:
         return triangles
@@ -187,7 +192,7 @@ def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
 
 
 def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Nodes (n,) of quadratic elements, then the functions of order 3 on edges and faces between them; host side."""
+    """Return nodes (n,) of quadratic elements, then the functions of order 3 on the edges and faces between them."""
     inside = np.zeros(mesh.number_of_nodes, bool)
     inside[nodes] = True
     V, N = mesh.number_of_vertices, mesh.pattern.edges.shape[1]
@@ -206,7 +211,7 @@ def _nodes_of_face(face: tuple[int, ...]) -> list[int]:
 
 
 def on_middles(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """Values at vertices and middles of edges of a field that is linear along edges, from (..., V) at vertices."""
+    """Add the values at middles of edges to vertex values (..., V) of a field that is linear along edges."""
     if mesh.order == 1:
         return values
     low, high = mesh.pattern.edges

@@ -1,4 +1,4 @@
-"""A finer mesh: every tetrahedron is cut into eight of half its size, or tetrahedra near some nodes are cut in two."""
+"""Refine a mesh: cut every tetrahedron into eight of half its size, or cut only tetrahedra near some nodes in two."""
 
 import jax
 import jax.numpy as jnp
@@ -13,18 +13,18 @@ from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 
 def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
-    """The mesh with every tetrahedron cut into eight (Bey 1995), of the same order; host side.
+    """Return the mesh with every tetrahedron cut into eight (Bey 1995). Quadratic elements stay quadratic.
 
     The old vertices keep their numbers, and the middles of the edges follow in the order of `pattern.edges`. So the new
-    vertices are the nodes of `quadratic(mesh)`, and a node set gets the same of them as there. The parts of element e
-    are the elements 8 e … 8 e + 7, and an element set contains the parts of its elements. The surface keeps its flat
-    triangles: refinement does not bring it nearer to the organ. Positions may be traced if `near` is not given and the
-    mesh has no triangle sets.
+    vertices are the nodes of `quadratic(mesh)`, and a node set gets the same new nodes as in `quadratic(mesh)`. The
+    parts of element e are the elements 8 e … 8 e + 7, and an element set contains the parts of its elements. The
+    surface keeps its flat triangles, so refinement does not bring it nearer to the real surface of the organ. Positions
+    may be traced if `near` is not given and the mesh has no triangle sets.
 
     Args:
-        near: node numbers (n,). If given, only edges at these nodes are halved, and other edges if the mesh would not
-            be conforming otherwise. An element is cut at its longest edge first (Rivara 1984), so elements do not
-            become flatter. `rim` gives the nodes around a clamp, where most of the mesh error is.
+        near: node numbers (n,). If given, only edges at these nodes are halved, and other edges that must be halved to
+            keep the mesh conforming. An element is cut at its longest edge first (Rivara 1984), so elements do not
+            become flatter. `rim` returns the nodes around a clamp, where most of the mesh error occurs.
     """
     V = mesh.number_of_vertices
     points: Array = mesh.points if isinstance(mesh.points, jax.core.Tracer) else np.asarray(mesh.points)
@@ -49,12 +49,12 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
 
 
 def parts_of(elements: Indices) -> np.ndarray:
-    """Numbers (8 n,) of the parts of elements (n,) in the mesh of `refined`."""
+    """Return the numbers (8 n,) of the parts of elements (n,) in the refined mesh (`refined`)."""
     return (8 * np.asarray(elements)[:, None] + np.arange(8)).ravel()
 
 
 def quarters(mesh: TetMesh, triangles: Indices) -> jax.Array:
-    """The four parts of each triangle (m, 3) of the mesh, (4 m, 3) nodes of the mesh of `refined`; host side."""
+    """Return the four parts of each triangle (m, 3) as node numbers (4 m, 3) of the refined mesh (`refined`)."""
     low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
     V, (a, b, c) = mesh.number_of_vertices, np.asarray(triangles).astype(np.int64).T
     ends = np.sort(np.stack([[a, b], [b, c], [c, a]]), axis=1)
@@ -65,8 +65,10 @@ def quarters(mesh: TetMesh, triangles: Indices) -> jax.Array:
 
 
 def places_in(mesh: TetMesh, fine: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """For each node of `fine` = `refined(mesh)`: an element (V',) of the mesh, and the place in it, barycentric
-    (4, V'); host side."""
+    """Locate the V' nodes of `fine` = `refined(mesh)` in the original mesh.
+
+    Returns an element (V',) that contains each node, and the barycentric coordinates (4, V') of the node in it.
+    """
     corners = _corners_of_parts(*np.eye(4), *(np.eye(4)[[i, j]].mean(axis=0) for i, j in PAIRS))  # (8, 4, 4)
     inside = np.concatenate([corners, corners[:, [i for i, _ in PAIRS]] / 2 + corners[:, [j for _, j in PAIRS]] / 2], 1)
     own = fine.element_nodes_on_host  # (n, 8 E)
@@ -76,14 +78,17 @@ def places_in(mesh: TetMesh, fine: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _triangles_in(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) -> jax.Array:
-    """Triangles of the new surface that lie in old ones (m, 3); `ends` (2, V) are the old vertices of each new one."""
+    """Return the triangles of the new surface that lie in old triangles (m, 3).
+
+    `ends` (2, V) contains the ends of the old edge on whose middle each new vertex lies; an old vertex occurs twice.
+    """
     old = {tuple(corners) for corners in np.sort(triangles, axis=1).tolist()}
     of_each = np.moveaxis(ends[:, surface], 0, 1).reshape(len(surface), -1).tolist()
     return node_numbers(surface[[tuple(sorted(set(own))) in old for own in of_each]])
 
 
 def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
-    """The nodes (m,) at the border of the surface region that nodes (n,) cover. Strain is largest there."""
+    """Return the nodes (m,) at the border of the surface region that nodes (n,) cover. Strain is largest there."""
     held = np.asarray(nodes)[np.asarray(nodes) < mesh.number_of_vertices]
     triangles = boundary_triangles(mesh, held)
     sides = np.sort(np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)
@@ -92,13 +97,13 @@ def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
 
 
 def _eighths(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
-    """Elements (8 E, 4), from the node numbers (N,) of the edges' middles."""
+    """Return the refined elements (8 E, 4), from the node numbers (N,) of the edges' middles."""
     parts = _corners_of_parts(*np.asarray(mesh.tetrahedra).T, *middle[np.asarray(mesh.pattern.element_edges)])
     return parts.transpose(2, 0, 1).reshape(-1, 4)
 
 
 def _corners_of_parts(a: Array, b: Array, c: Array, d: Array, *middles: Array) -> np.ndarray:
-    """Corners (8, 4, …) of the parts of an element, from those of the element and the middles of its edges."""
+    """Return corners (8, 4, …) of the parts of an element, from its corners a, b, c, d and its edges' middles."""
     ab, ac, ad, bc, bd, cd = middles
     return np.array(
         [
@@ -109,10 +114,10 @@ def _corners_of_parts(a: Array, b: Array, c: Array, d: Array, *middles: Array) -
 
 
 def _by_length(mesh: TetMesh) -> np.ndarray:
-    """Ranks (N,) of the edges by length. All ranks differ, so two elements cut their common face in the same way."""
+    """Rank the edges (N,) by length. All ranks differ, so two elements cut their common face in the same way."""
     low, high = np.asarray(mesh.pattern.edges)
     points = np.asarray(mesh.points)
-    # Lengths are rounded, so that on all machines edges of equal length are ordered by their number.
+    # Lengths are rounded, so that edges of equal length are ordered by their number on all machines.
     lengths = np.linalg.norm(points[low] - points[high], axis=1).astype(np.float32)
     place = np.empty(len(low), int)
     place[np.argsort(lengths, kind="stable")] = np.arange(len(low))
@@ -120,7 +125,10 @@ def _by_length(mesh: TetMesh) -> np.ndarray:
 
 
 def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
-    """Which edges (N,) are halved: edges at the nodes, and the longest edge of elements and faces with halved edges."""
+    """Return which edges (N,) are halved.
+
+    These are the edges at the nodes `near`, and the longest edge of each element and face with a halved edge.
+    """
     edges, place = np.asarray(mesh.pattern.element_edges), _by_length(mesh)
     groups = [edges, *(edges[[k for k, pair in enumerate(PAIRS) if set(pair) <= set(face)]] for face in FACES)]
     longest = [np.take_along_axis(g, place[g].argmax(axis=0)[None], axis=0)[0] for g in groups]
@@ -134,7 +142,7 @@ def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
 
 
 def _bisected(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
-    """Elements (m, 4): each is cut in two at its longest halved edge, until no halved edge is left."""
+    """Return elements (m, 4). Each old element is cut in two at its longest halved edge, until no such edge is left."""
     V, place = mesh.number_of_vertices, _by_length(mesh)
     low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
     code = low * V + high  # in ascending order

@@ -1,4 +1,4 @@
-"""Parts of a mesh: nodes selected by place or by name, and triangles of the surface."""
+"""Select nodes of a mesh by their position or by the name of a set, and triangles of the surface."""
 
 import warnings
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ AXES = "xyz"
 def select(
     mesh: TetMesh, where: dict[str, float] | None = None, set: str | None = None, name: str = "where"
 ) -> np.ndarray:
-    """Numbers of the nodes that satisfy all conditions of `where`, or of a node set of the mesh.
+    """Return the numbers of the nodes that satisfy all conditions of `where`, or that are in a node set of the mesh.
 
     Args:
         mesh: `TetMesh`.
@@ -26,7 +26,7 @@ def select(
         name: name of the condition, for messages.
 
     Raises:
-        InputError: `where` and `set` both given or both missing, unknown key or set, no node found.
+        InputError: `where` and `set` are both given or both missing, a key or set is unknown, or no node is found.
     """
     if (where is None) == (set is None):
         raise InputError(f'{name}: give either where = {{z_max = 0.0}} or set = "name"')
@@ -39,7 +39,7 @@ def select(
             raise InputError(f"{name}: the node set {set!r} of the mesh holds no node: correct the mesh, or use where")
         return nodes
     if not isinstance(where, Mapping):
-        raise InputError(f"{name} = {where!r} is not a place: write where = {{z_max = 0.0}}")
+        raise InputError(f"{name} = {where!r} is not a table of bounds: write where = {{z_max = 0.0}}")
     points = np.asarray(mesh.points)
     tolerance = 1e-9 * np.linalg.norm(np.ptp(points, axis=0))
     inside = np.ones(len(points), dtype=bool)
@@ -55,24 +55,24 @@ def select(
     if not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         box = ", ".join(f"{a} {lo:.4g} to {hi:.4g}" for a, lo, hi in zip(AXES, low, high, strict=True))
-        raise InputError(f"{name} = {where} meets no node: the mesh spans {box} m")
+        raise InputError(f"{name} = {where} selects no node: the mesh spans {box} m")
     return np.flatnonzero(inside)
 
 
 def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> None:
-    """Warn if a bound excludes nothing, although it would lie within the mesh if it were in millimetres."""
+    """Warn if a bound excludes no node, but would lie within the mesh if it were in millimetres."""
     low, high = x.min(), x.max()
     idle = bound > high if key.endswith("max") else bound < low
     if idle and abs(bound) > 1 and low < 1e-3 * bound < high:
         warnings.warn(
-            f"{name}: {key} = {bound:g} m excludes nothing, since the mesh spans {low:.4g} to {high:.4g} m: bounds are "
-            f"in metres, write {1e-3 * bound:g} if it is in mm",
+            f"{name}: {key} = {bound:g} m excludes no node, since the mesh spans {low:.4g} to {high:.4g} m: bounds are "
+            f"in metres, so write {1e-3 * bound:g} if you meant mm",
             stacklevel=3,
         )
 
 
 def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:
-    """Outer triangles (m, 3) with outward normals; with `nodes`, only triangles with all vertices in `nodes`."""
+    """Return outer triangles (m, 3) with outward normals. If `nodes` is given, all their vertices are in `nodes`."""
     tets = np.asarray(mesh.tetrahedra)
     faces = np.concatenate([tets[:, f] for f in FACES])
     codes = face_codes(np.sort(faces.astype(np.int64), axis=1), mesh.number_of_vertices)
@@ -82,17 +82,17 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
 
 
 def face_codes(triples: np.ndarray, V: int) -> np.ndarray:
-    """A number for each sorted triple, different for different triples. It is below 2^63 up to two million vertices."""
+    """Return a unique number for each sorted triple of vertices. It is below 2^63 for up to two million vertices."""
     return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
 
 
 def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> np.ndarray:
-    """Outer triangles (m, 3) of a place: triangles between its nodes; if `set` is a triangle set, only its triangles.
+    """Return outer triangles (m, 3) with all vertices in `nodes`. If `set` is a triangle set, use only its triangles.
 
     Args:
         mesh: `TetMesh`.
-        nodes: nodes of the place, from `select`; None: the whole surface.
-        set: name of the set with which the place was selected, if any.
+        nodes: nodes of a region of the surface, from `select`. None means the whole surface.
+        set: name of the set with which the region was selected, if any.
     """
     triangles, groups = boundary_triangles(mesh, nodes), mesh.triangle_sets or {}
     if set is None or set not in groups:
@@ -102,34 +102,34 @@ def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> 
     if 0 < len(kept) < len(group):
         warnings.warn(
             f"{len(group) - len(kept)} of {len(group)} triangles of {set!r} are not on the surface and are left out: "
-            "draw the set on the surface alone",
+            "draw the set only on the surface",
             stacklevel=2,
         )
     return kept
 
 
 def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
-    """Refuse a value that is not a list (n,) of node numbers below `count`; host side.
+    """Raise `InputError` if a value is not a list (n,) of node numbers below `count`.
 
     Raises:
-        InputError: one sentence that begins with `name`.
+        InputError: the message begins with `name`.
     """
     numbers = np.asarray(nodes)
     if numbers.ndim != 1 or (numbers.size and numbers.dtype.kind not in "iu"):
         found = f"shape {numbers.shape}" if numbers.ndim != 1 else f"numbers of type {numbers.dtype}"
         raise InputError(f"{name} has {found}: give whole node numbers (n,)")
     if numbers.size < least:
-        raise InputError(f"{name} names no node: give node numbers from 0 to {count - 1}")
+        raise InputError(f"{name} contains no node: give node numbers from 0 to {count - 1}")
     wrong = numbers[(numbers < 0) | (numbers >= count)]
     if wrong.size:
         raise InputError(f"{name} names node {wrong[0]}, but the nodes are 0 to {count - 1}: renumber them")
 
 
 def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
-    """Refuse triangles (m, 3) that are not faces of elements; host side.
+    """Raise `InputError` if triangles (m, 3) are not faces of elements.
 
     Raises:
-        InputError: one sentence that begins with `name`.
+        InputError: the message begins with `name`.
     """
     numbers = np.asarray(triangles)
     if numbers.ndim != 2 or numbers.shape[1] != 3:
@@ -145,4 +145,4 @@ def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
     lost = np.flatnonzero(~np.isin(own @ code, faces @ code))
     if len(lost):
         first = numbers[lost[0]].tolist()
-        raise InputError(f"{name} has {first}, not a face of an element: take boundary_triangles of the mesh")
+        raise InputError(f"{name} has {first}, which is not a face of an element: use boundary_triangles of the mesh")

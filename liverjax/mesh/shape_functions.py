@@ -1,15 +1,16 @@
 """Shape functions of straight tetrahedra, and their integration points.
 
-With barycentric coordinates L_k and their constant gradients D_k, the shape vectors of the linear element,
+L_k are the barycentric coordinates. Their gradients D_k are constant; these are the shape vectors of the linear
+element. Then, with y_k = sum_a c_ak x_a,
 
     grad N_a = sum_k c_ak D_k,    c_ak = dN_a/dL_k,    so    F = sum_a x_a (x) grad N_a = sum_k y_k (x) D_k
 
-with y_k = sum_a c_ak x_a. So at each point an element of any order is like a linear element with corners y_k. The terms
-of MJED hold at every point, and no matrix is inverted.
+So at each point, an element of any order behaves like a linear element with corners y_k. The terms of force and
+stiffness (`liverjax.elements.mjed`) therefore hold at every point, and no matrix is inverted.
 
-Functions of order 2: L_k (2 L_k - 1) of the vertices and 4 L_i L_j of the edges (10 nodes). Order 3 has in addition L_i
-L_j (L_i - L_j) of the edges and 27 L_i L_j L_k of the faces. The unknowns of these functions are not positions. Order 3
-is used to estimate the mesh error (`liverjax.simulation.mesh_error`).
+The functions of order 2 are L_k (2 L_k - 1) for the vertices and 4 L_i L_j for the edges (10 nodes). Order 3 adds L_i
+L_j (L_i - L_j) for the edges and 27 L_i L_j L_k for the faces. The unknowns of these additional functions are not
+positions. Order 3 is used to estimate the mesh error (`liverjax.simulation.mesh_error`).
 """
 
 from functools import cache
@@ -24,7 +25,7 @@ FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 
 class Basis(NamedTuple):
-    """Functions at the integration points of an element: NumPy arrays that are the same for all elements."""
+    """Shape functions at the integration points of an element. The NumPy arrays are the same for all elements."""
 
     weights: np.ndarray  # (Q,) with the sum 1
     L: np.ndarray  # (4, Q) linear functions
@@ -34,13 +35,13 @@ class Basis(NamedTuple):
 
 @cache
 def basis(order: int) -> Basis:
-    """The functions of `order` 2 or 3, at points of a rule that integrates products of two gradients exactly."""
+    """Return the functions of `order` 2 or 3 at the points of a rule that integrates products of gradients exactly."""
     weights, L = _four_points() if order == 2 else _fourteen_points()
     return Basis(weights, L, *functions(order, L))
 
 
 def functions(order: int, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """N (n, Q) and c (n, 4, Q) at barycentric coordinates L (4, Q)."""
+    """Return the functions N (n, Q) and derivatives c = dN/dL (n, 4, Q) at barycentric coordinates L (4, Q)."""
     values = [L[k] * (2 * L[k] - 1) for k in range(4)] + [4 * L[i] * L[j] for i, j in PAIRS]
     slopes = [{k: 4 * L[k] - 1} for k in range(4)] + [{i: 4 * L[j], j: 4 * L[i]} for i, j in PAIRS]
     if order == 3:
@@ -56,13 +57,13 @@ def functions(order: int, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _four_points() -> tuple[np.ndarray, np.ndarray]:
-    """A rule that is exact to degree 2 (Hammer and Stroud 1956): weights (4,), coordinates (4, 4)."""
+    """Return weights (4,) and coordinates (4, 4) of a rule of degree 2 (Hammer and Stroud 1956)."""
     near, far = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
     return np.full(4, 0.25), far + (near - far) * np.eye(4)
 
 
 def _fourteen_points() -> tuple[np.ndarray, np.ndarray]:
-    """A rule that is exact to degree 5, with positive weights (Walkington 2000): weights (14,), coordinates (4, 14)."""
+    """Return positive weights (14,) and coordinates (4, 14) of a rule of degree 5 (Walkington 2000)."""
     columns, weights = [], []
     for a, w in ((0.31088591926330060980, 0.11268792571801585080), (0.092735250310891226402, 0.073493043116361949544)):
         columns += [np.where(np.arange(4) == k, 1 - 3 * a, a) for k in range(4)]
@@ -75,7 +76,10 @@ def _fourteen_points() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def triangle_rule(degree: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (Q,) and barycentric coordinates (3, Q) on a triangle, of degree 4 (Dunavant 1985) or 5 (Radon 1948)."""
+    """Return weights (Q,) and barycentric coordinates (3, Q) of an integration rule on a triangle.
+
+    Its degree is 4 (Dunavant 1985) or 5 (Radon 1948).
+    """
     pairs = [(0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)]
     if degree == 5:
         root = np.sqrt(15)

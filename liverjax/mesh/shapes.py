@@ -16,7 +16,7 @@ MOST_TETRAHEDRA = 20_000_000
 
 
 def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
-    """A box with one corner at the origin. Each brick is cut into six tetrahedra along one diagonal (Kuhn).
+    """Mesh a box with one corner at the origin. Each brick is cut into six tetrahedra along one diagonal (Kuhn).
 
     Args:
         size: edge lengths (x, y, z) [m].
@@ -38,7 +38,7 @@ def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
             path = path[[0, 2, 1, 3]]
         nodes = corner[:, None, :] + path[None]
         sixths.append(np.ravel_multi_index(tuple(np.moveaxis(nodes, -1, 0)), shape))
-    # Tetrahedra of one brick stay together: neighbours in memory share their nodes.
+    # Tetrahedra of one brick stay together, so that neighbours in memory share their nodes.
     tets = np.stack(sixths, axis=1).reshape(-1, 4)
     points = grid * np.asarray(size, dtype=float) / np.asarray(cells)
     names = ("x_min", "x_max"), ("y_min", "y_max"), ("z_min", "z_max")
@@ -54,7 +54,7 @@ def cylinder(
     rings: Sequence[float] = (),
     match_area: bool = False,
 ) -> TetMesh:
-    """A cylinder about the z axis that stands on z = 0. Ring k has 6 k nodes; prisms are cut into three tetrahedra.
+    """Mesh a cylinder about the z axis that stands on z = 0. Ring k has 6 k nodes.
 
     Args:
         radius, height: radius and height [m].
@@ -63,11 +63,11 @@ def cylinder(
         rings: radii [m] at which there is a ring of nodes, for example the radius of a punch.
         match_area: whether each polygon has the area of its circle.
 
-    Without `match_area` the mantle is a polygon of 6 n corners on the circle, so the volume is below pi r^2 h by
-    O(cell_size^2).
+    Without `match_area` the mantle is a polygon of 6 n corners on the circle. The volume is then smaller than pi r^2 h
+    by O(cell_size^2).
 
     Raises:
-        InputError: lengths that are not positive, a ring outside the cylinder.
+        InputError: a length is not positive, or a ring is outside the cylinder.
     """
     _positive("radius", [radius])
     _positive("height", [height])
@@ -91,14 +91,14 @@ def cylinder(
 def _graded(
     radius: float, height: float, cells: tuple[float, float], rings: Sequence[float], match_area: bool
 ) -> TetMesh:
-    """A cylinder with two cell lengths, `cells`: the second one at its rims and rings, the first one elsewhere."""
+    """Mesh a cylinder with two cell lengths `cells` [m]: the second at its rims and rings, the first elsewhere."""
     cell_size, rim_cell = cells
     _positive("rim_cell", [rim_cell])
     for ring in rings:
         if not (np.isfinite(ring) and 0 < ring < radius):
-            raise InputError(f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: mend them")
+            raise InputError(f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: correct them")
     largest = min(cell_size, radius / 2)
-    # A ring of radius r has at least 2 pi r / largest cells, so there are at least as many prisms as with such cells.
+    # A ring of radius r has at least 2 pi r / largest cells. This gives a lower bound of the number of prisms.
     _not_too_many(18 * math.ceil(radius / largest) ** 2 * math.ceil(height / cell_size), "radius, height and cell_size")
     _not_too_many(18 * math.ceil(min(radius, height) / rim_cell) ** 2 // 100, "rim_cell")
     radii = graded(radius, dict.fromkeys([*map(float, rings), float(radius)], rim_cell), largest)
@@ -107,7 +107,7 @@ def _graded(
 
 
 def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit disc: one node at the centre, 6 k nodes on ring k; counter-clockwise triangles between the rings."""
+    """Return nodes and counter-clockwise triangles of a unit disc: one node at the centre, 6 k nodes on ring k."""
     points = [np.zeros((1, 2))]
     start = [0, 1]
     for k in range(1, rings + 1):
@@ -127,10 +127,10 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _not_too_many(tetrahedra: int, names: str) -> None:
-    """Refuse a mesh that is too large for the memory, before it is made."""
+    """Raise `InputError` before a mesh is made that is too large for the memory."""
     if tetrahedra > MOST_TETRAHEDRA:
         raise InputError(
-            f"shape {names} ask for about {tetrahedra:.2g} tetrahedra, more than {MOST_TETRAHEDRA:.0e}: are the "
+            f"shape {names} would give about {tetrahedra:.2g} tetrahedra, more than {MOST_TETRAHEDRA:.0e}: are the "
             "lengths in metres, or is the unit missing?"
         )
 

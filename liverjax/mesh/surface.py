@@ -1,4 +1,4 @@
-"""Integrals over triangles of the surface, which distribute tractions, pressures and springs to nodes."""
+"""Integrate over triangles of the surface, to distribute tractions, pressures and springs to nodes."""
 
 from functools import partial
 
@@ -13,14 +13,14 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 #: Edges of a triangle, in the order of the middles of its edges.
 _EDGES = ((0, 1), (1, 2), (2, 0))
-#: The same edges, in the direction of their functions of order 3, if the vertices are in increasing order.
+#: The same edges in the direction of their functions of order 3. The vertices must be in increasing order.
 _THIRD = ((0, 1), (1, 2), (0, 2))
 
 
 def triangle_nodes(mesh: TetMesh, triangles: Indices) -> list[Indices]:
-    """Numbers (m,) of the nodes of triangles (m, 3): their vertices and, in quadratic meshes, middles of edges.
+    """Return the node numbers (m,) of triangles (m, 3): their vertices and, in quadratic meshes, middles of edges.
 
-    For triangles (m, 4) of a mesh of order 3, the functions of order 3 of the edges and of the face follow.
+    For triangles (m, 4) of a mesh of order 3, the order-3 functions of the edges and of the face follow.
     """
     vertices = [triangles[:, a] for a in range(3)]
     if mesh.order == 1:
@@ -33,25 +33,25 @@ def triangle_nodes(mesh: TetMesh, triangles: Indices) -> list[Indices]:
 
 
 def _middle(mesh: TetMesh, a: Indices, b: Indices) -> jax.Array:
-    """Numbers (m,) of the nodes between neighbouring vertices a and b (m,)."""
+    """Return the numbers (m,) of the nodes at the middle of edges between vertices a and b (m,)."""
     pattern = mesh.pattern
     edge = jnp.where(pattern.row_nodes[:, a] == b[None], pattern.row_edges[:, a], 0)
     return mesh.number_of_vertices + jnp.sum(edge, axis=0)
 
 
-@partial(jax.jit, inline=True)  # outside of a program: one program for all operations
+@partial(jax.jit, inline=True)  # called outside of a compiled program, all operations form one program
 def areas(points: jax.Array, triangles: Indices) -> jax.Array:
-    """Areas times normals (m, 3) [m^2] of flat triangles."""
+    """Return area times unit normal (m, 3) [m^2] of flat triangles."""
     corner = points[triangles]
     return 0.5 * jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
 def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float]]:
-    """Nodes (m,) of flat triangles that share a uniform load, and the share of each node.
+    """Return the nodes (m,) of flat triangles that carry a uniform load, and the share of the load of each node.
 
-    In a linear element each vertex has a third. In a quadratic element the integrals of the vertices' functions are 0,
-    and the middle of each edge has a third. Triangles (m, 4) of a mesh of order 3 have the number of their face in the
-    last column.
+    In a linear element, each vertex carries a third. In a quadratic element, the integrals of the vertices' functions
+    are 0, and the middle of each edge carries a third. Triangles (m, 4) of a mesh of order 3 have the number of their
+    face in the last column.
     """
     nodes = triangle_nodes(mesh, triangles)
     if mesh.order == 1:
@@ -61,14 +61,17 @@ def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float
 
 
 def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
-    """Nodal forces (V, 3) [N] of a unit pressure on the triangles at positions x (V, 3) [m]: integrals of -N n da."""
+    """Return nodal forces (V, 3) [N] of a pressure of 1 Pa on the triangles at positions x (V, 3) [m].
+
+    The forces are the integrals of -N n da with the shape functions N and the normal n.
+    """
     if mesh is None or mesh.order == 1:
         corner = x[triangles]
         twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         nodes, own = triangles.T, jnp.broadcast_to(-1 / 6 * twice, (3, *twice.shape))
     else:
         nodes = jnp.stack(triangle_nodes(mesh, triangles))
-        # The rule is exact for quadratic positions; the derivative in the reference shape is exact, too.
+        # The rule is exact for quadratic positions. The derivative in the reference shape is also exact.
         weights, l = triangle_rule(4 if mesh.order == 2 else 5)
         N, along = (_quadratic if mesh.order == 2 else _ten_functions)(l)
         signs = None if mesh.order == 2 else _signs_of_functions(triangles, x.dtype)
@@ -80,7 +83,7 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
 
 
 def _signs_of_functions(triangles: Indices, dtype: DTypeLike) -> jax.Array:
-    """Signs (10, m, 1) of the ten functions of triangles (m, 4) with vertices in the order of the normal.
+    """Return signs (10, m, 1) of the ten functions of triangles (m, 4) with vertices counter-clockwise to the normal.
 
     A function of order 3 on an edge points to the vertex with the higher number. If the triangle goes along this edge
     to the vertex with the lower number, the sign is -1.
@@ -92,7 +95,10 @@ def _signs_of_functions(triangles: Indices, dtype: DTypeLike) -> jax.Array:
 
 
 def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (Q,) of points on a triangle; slopes (2, Q, n) of its functions towards the second and third vertex."""
+    """Return weights (Q,) of points on a triangle, and derivatives (2, Q, n) of its functions at these points.
+
+    The directions of the derivatives are from the first vertex to the second and to the third vertex.
+    """
     if mesh.order == 1:
         return np.ones(1), np.array([[[-1.0, 1.0, 0.0]], [[-1.0, 0.0, 1.0]]])
     weights, l = triangle_rule()
@@ -101,7 +107,7 @@ def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def triangle_functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
-    """Functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q).
+    """Return the functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q).
 
     In a mesh of order 3 the functions on edges point to the vertex with the higher number. So the vertices of triangles
     must be in increasing order (`liverjax.mesh.promotion.with_faces`).
@@ -110,7 +116,7 @@ def triangle_functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
 
 
 def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Six functions (6, Q) at barycentric coordinates l (3, Q); their slopes towards the second and third vertex."""
+    """Return six functions (6, Q) at barycentric coordinates l (3, Q), and derivatives as in `triangle_slopes`."""
     N = [l[k] * (2 * l[k] - 1) for k in range(3)] + [4 * l[a] * l[b] for a, b in _EDGES]
     zero = np.zeros_like(l[0])
     by = [[4 * l[k] - 1 if m == k else zero for m in range(3)] for k in range(3)]
@@ -120,7 +126,7 @@ def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def _ten_functions(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Ten functions (10, Q), those of `_quadratic` and those of order 3 on the edges and the face; their slopes."""
+    """Return ten functions (10, Q) and their derivatives: `_quadratic`, then order 3 on the edges and on the face."""
     N, slopes = _quadratic(l)
     zero = np.zeros_like(l[0])
     more, by = [], []

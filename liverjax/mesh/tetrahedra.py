@@ -27,7 +27,7 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 class TetMesh:
     """Straight tetrahedra with their reference geometry: a pytree with arrays as leaves.
 
-    `tet_mesh` makes it. `shape_vectors` and `volumes` are computed from points and tetrahedra, also under `jax.grad`.
+    `tet_mesh` makes a mesh. `shape_vectors` and `volumes` are computed from points and tetrahedra, also in `jax.grad`.
     With `order` 2 the nodes are the vertices, followed by the middles of the edges in the order of `pattern.edges`.
     """
 
@@ -39,11 +39,11 @@ class TetMesh:
     element_sets: dict[str, Any] = param("1", "named arrays of element numbers")
     pattern: Pattern = param("1", "which vertices share an element")
     triangle_sets: dict[str, jax.Array] | None = param(
-        "1", "named arrays of vertices (m, 3) of triangles; None: the file had none", default=None
+        "1", "named arrays of triangles' vertices (m, 3); None if the file has no triangle sets", default=None
     )
     faces: Any = param("1", "numbers of every element's faces (4, E), for order 3", default=None)
     clusters: Any = param("1", "`Clusters` of all nodes, if cells are thin and the order is above 1", default=None)
-    order: int = static(default=1, about="of the shape functions: 1 linear, 2 quadratic", lower=1)
+    order: int = static(default=1, about="order of the shape functions: 1 linear, 2 quadratic", lower=1)
 
     @property
     def number_of_nodes(self) -> int:
@@ -62,7 +62,7 @@ class TetMesh:
 
     @property
     def weights(self) -> jax.Array:
-        """Reference volume [m^3] of every integration point: (E,) for linear elements, else (Q, E)."""
+        """Reference volume [m^3] of every integration point: (E,) for linear elements, otherwise (Q, E)."""
         if self.order == 1:
             return self.volumes
         return jnp.asarray(basis(self.order).weights, self.volumes.dtype)[:, None] * self.volumes[None]
@@ -73,7 +73,7 @@ class TetMesh:
         return self.shape_vectors if self.order == 1 else self.shape_vectors[:, :, None]
 
     def at_points(self, numbers: T) -> T:
-        """A pytree, for example a law, with an axis for the points added to its arrays (E,) or (E, 3) over elements."""
+        """Return a pytree, for example a law, whose arrays (E,) or (E, 3) get an axis for the integration points."""
         if self.order == 1:
             return numbers
         by_element = ((self.number_of_elements,), (self.number_of_elements, 3))
@@ -81,12 +81,12 @@ class TetMesh:
 
     @property
     def element_nodes(self) -> list[jax.Array]:
-        """Numbers (E,) of the nodes of every element: 4, or 10 with the middles of edges `PAIRS`; more in order 3."""
+        """Node numbers of every element: 4 arrays (E,), or 10 with the middles of edges `PAIRS`; more in order 3."""
         return self._nodes(self.tetrahedra, self.pattern.element_edges, self.faces)
 
     @property
     def element_nodes_on_host(self) -> np.ndarray:
-        """`element_nodes` as a NumPy array (n, E). JAX would compile a program for each of them."""
+        """`element_nodes` as a NumPy array (n, E). JAX would compile a program for each of the n arrays."""
         faces = None if self.faces is None else np.asarray(self.faces)
         return np.stack(self._nodes(np.asarray(self.tetrahedra), np.asarray(self.pattern.element_edges), faces))
 
@@ -102,10 +102,10 @@ class TetMesh:
         return vertices + middles + [N + m for m in middles] + [V + 2 * N + face for face in more]
 
     def edges(self, columns: Sequence[jax.Array]) -> list[tuple[jax.Array, ...]]:
-        """y_k - y_0 of a nodal field with columns (V,): for k = 1, 2, 3 one array per column, (E,) or (Q, E).
+        """Return y_k - y_0 (k = 1, 2, 3) of a nodal field with columns (V,): one array per column, (E,) or (Q, E).
 
-        y_k are the corners of `liverjax.mesh.shape_functions`. The gradient of the field is the sum of (y_k - y_0) D_k
-        with the shape vectors D_k.
+        y_k are the corner values defined in `liverjax.mesh.shape_functions`. The gradient of the field is the sum of
+        (y_k - y_0) D_k with the shape vectors D_k.
         """
         if self.order == 1:
             corners = [taken(column, self.tetrahedra.T) for column in columns]
@@ -116,7 +116,10 @@ class TetMesh:
         return [tuple(y[k, :, i] for i in range(len(columns))) for k in range(3)]
 
     def spread(self, forces: Sequence[Sequence[jax.Array]]) -> list[jax.Array]:
-        """The transpose of `edges`: nodal columns (V,) from forces at corners 1, 2, 3; corner 0 has minus their sum."""
+        """Return nodal columns (V,) from forces at corners 1, 2, 3 of the elements. This is the transpose of `edges`.
+
+        The force at corner 0 is minus the sum of the forces at the other corners.
+        """
         count = len(forces[0])
         if self.order == 1:
             forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(count)], *forces]
@@ -134,12 +137,15 @@ class TetMesh:
         return columns
 
     def _slopes(self) -> jax.Array:
-        """c_ak - c_a0 as a matrix (3 Q, n) for `edges`. A product with a matrix keeps the program small."""
+        """Return c_ak - c_a0 as a matrix (3 Q, n) for `edges`. A product with one matrix keeps the program small."""
         c = basis(self.order).c
         return jnp.asarray((c[:, 1:] - c[:, :1]).reshape(len(c), -1).T, self.volumes.dtype)
 
     def oriented(self, values: jax.Array) -> jax.Array:
-        """Values (n, C, E) times the signs of the functions: those of order 3 on edges point to the higher vertex."""
+        """Multiply values (n, C, E) by the signs of the functions.
+
+        Functions of order 3 on edges point to the vertex with the higher number.
+        """
         if self.order < 3:
             return values
         t, first = self.tetrahedra, 4 + len(PAIRS)
@@ -153,7 +159,7 @@ def tet_mesh(
     node_sets: Mapping[str, object] | None = None,
     element_sets: Mapping[str, object] | None = None,
 ) -> TetMesh:
-    """A mesh from positions (V, 3) [m] and node numbers (E, 4). Nothing is checked (see `check_mesh`).
+    """Make a mesh from positions (V, 3) [m] and node numbers (E, 4). Nothing is checked (see `check_mesh`).
 
     The positions may be traced, but not the node numbers.
     """
@@ -181,7 +187,7 @@ def _float_copy(points: Numbers) -> jax.Array:
 
 
 def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:
-    """The mesh with other reference positions (V, 3) [m], which may be traced. Its patches do not change.
+    """Return the mesh with other reference positions (V, 3) [m], which may be traced. The patches do not change.
 
     Edges stay straight: in a quadratic mesh the middles of edges are computed from the vertices.
     """
@@ -197,7 +203,7 @@ def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:
 
 @jax.jit
 def _geometry(points: jax.Array, tetrahedra: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Shape vectors and volumes. A shape vector is a cross product of edges divided by six times the volume."""
+    """Compute shape vectors and volumes. A shape vector is a cross product of edges divided by six times the volume."""
     corner = points[tetrahedra]
     e = corner[:, 1:] - corner[:, :1]
     normals = jnp.stack([jnp.cross(e[:, 1], e[:, 2]), jnp.cross(e[:, 2], e[:, 0]), jnp.cross(e[:, 0], e[:, 1])])
@@ -206,11 +212,11 @@ def _geometry(points: jax.Array, tetrahedra: jax.Array) -> tuple[jax.Array, jax.
 
 
 def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
-    """Refuse a mesh that no simulation can use; host side, before any compile.
+    """Raise `InputError` for a mesh that no simulation can use. Nothing is compiled.
 
     Raises:
-        InputError: no elements, node numbers out of range, positions that are not finite, flat or inverted elements,
-            elements that occur twice or overlap at a face, vertices that belong to no element.
+        InputError: the mesh has no elements, node numbers out of range or positions that are not finite. Other causes
+            are flat or inverted elements, elements that occur twice or overlap, and vertices without an element.
     """
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     if tets.size == 0:
@@ -256,6 +262,6 @@ def _refuse_overlaps(tets: np.ndarray, name: str) -> None:
     if np.any(copies > 1):
         own = int(place[copies > 1].min())
         raise InputError(
-            f"{name}: tetrahedra overlap: {int((copies > 1).sum())} faces have two of them on the same side (first: "
+            f"{name}: tetrahedra overlap: {int((copies > 1).sum())} faces have two tetrahedra on the same side (first: "
             f"nodes {faces[own].tolist()}, of element {own // 4}); remesh, or remove one of the two"
         )

@@ -1,23 +1,25 @@
-"""The base class of all physics: one frozen struct of numbers, and a second struct that acts during a step.
+"""The base class of all physics, and the base classes of the force terms of a step.
 
-A scene has a tuple of physics. Each physics has a memory between steps, and a part that acts during a step:
+A physics is one object that adds forces or constraints to a body: a law, viscosity, loads, contact or a support. It is
+a frozen struct of numbers. A scene has a tuple of physics. A physics may have a memory, which passes from step to step.
+In a step it acts through a force term, which stores everything that is constant during the step:
 
-* `begin(start)` -> memory: its memory at the beginning of a run, any pytree;
-* `freeze(memory, step)` -> the acting part, with everything that is constant during the step;
-* `advance(memory, acting, end)` -> memory: its memory after an accepted step;
-* `check(...)`: refuses numbers that no step can use, with one sentence.
+* `begin(start)` -> memory: the memory at the beginning of a run, any pytree;
+* `freeze(memory, step)` -> force term of the step;
+* `advance(memory, acting, end)` -> memory after an accepted step; `acting` is the force term;
+* `check(...)` raises InputError for numbers that no step can use.
 
-Loads and motions change during a step: they are evaluated at a fraction s of the step (0 at its beginning, 1 at its
-end).
+Loads and prescribed motions change during a step. They are evaluated at a fraction s of the step (0 at the beginning, 1
+at the end).
 
-There are three kinds of acting parts. The step, its tangent and its energy are sums over these parts and need nothing
-else.
+There are three kinds of force terms. The forces, the tangent and the energy of a step are sums over these terms.
 
-* `Solid` and `VolumeStress` act in elements, before assembly: stress and blocks of the stiffness.
-* `NodalForce` acts at nodes, after assembly: forces and blocks of the diagonal.
+* `Solid` and `VolumeStress` act in the elements, before assembly. They return stresses and blocks of the stiffness.
+* `NodalForce` acts at the nodes, after assembly. It returns forces and diagonal blocks of the stiffness.
 
-A `VolumeStress` has pressures at the nodes. The mixed system of positions and pressures solves for them
-(`liverjax.simulation.mixed_system`).
+A `VolumeStress` has pressures at the nodes. Positions and pressures are solved together as a mixed system
+(`liverjax.simulation.mixed_system`). V is the number of nodes (for pressures the number of vertices), E the number of
+elements.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,41 +43,49 @@ Pairs = tuple[tuple[int, int], ...]
 
 
 class Tied(Protocol):
-    """Nodes that move together in a step. A few unknowns give their motion; they are stored in a field of the nodes."""
+    """Nodes that move together in a step, for example as a rigid body.
+
+    A few unknowns define their motion. These unknowns are stored in a nodal field (V, 3), in the rows of these nodes.
+    """
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """The part of a field (V, 3) along the free motions. For forces it depends on the positions x (V, 3)."""
+        """Project a field (V, 3) onto the free motions of the nodes. For forces, x (V, 3) are the positions."""
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
         """Write the unknowns of the motion to positions x (V, 3) into a field (V, 3).
 
-        `placed` is the inverse of this.
+        `placed` is the inverse of this method.
         """
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Positions (V, 3) from a field, at fraction s of the step."""
+        """Positions (V, 3) from a field with these unknowns, at fraction s of the step."""
 
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
-        """The mask (V, 3) with 0 at the nodes whose motion is given, and the free directions (V, 3) of these nodes.
+        """Set the mask (V, 3) to 0 at nodes with a given motion, and return the free directions (V, 3) of these nodes.
 
-        A direction is the only free direction of a node with a given motion, and 0 at other nodes. None: there is no
-        such node.
+        A node with a given motion has at most one free direction. The directions are 0 at other nodes, and None if no
+        node has such a direction.
         """
 
     def rigid(self, x: jax.Array, velocity: jax.Array, acceleration: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Velocity and acceleration (V, 3) of a rigid motion of the nodes at positions x (V, 3), from those of every
-        node by itself."""
+        """Replace velocity and acceleration (V, 3) of the nodes at positions x (V, 3) by those of a rigid motion.
+
+        The given values were computed for each node separately.
+        """
 
 
 class Free(NamedTuple):
     """The directions in which the body can move, as a projection of nodal vectors."""
 
-    mask: jax.Array  # (V, 3) 0 along held or prescribed axes, else 1
-    normals: jax.Array | None = None  # (V, 3) unit normals; nodes may not move along them; 0 elsewhere
+    mask: jax.Array  # (V, 3) 0 along fixed or prescribed axes, else 1
+    normals: jax.Array | None = None  # (V, 3) unit normals along which nodes cannot move; 0 at other nodes
     tied: tuple[Tied, ...] = ()  # nodes that move together
 
     def vectors(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """The free part of a field (V, 3). Forces need the positions x (V, 3) if nodes move together."""
+        """Project a nodal field (V, 3) onto the free directions.
+
+        For forces the positions x (V, 3) are needed if nodes move together.
+        """
         field = self.mask * field
         if self.normals is not None:
             field = field - jnp.sum(self.normals * field, axis=1, keepdims=True) * self.normals
@@ -84,7 +94,7 @@ class Free(NamedTuple):
         return field
 
     def columns(self, columns: Sequence[jax.Array]) -> list[jax.Array]:
-        """The free part of a field that is given as its columns x, y, z (V,)."""
+        """Project a nodal field, given by its three columns (V,) of x, y and z, onto the free directions."""
         if self.tied:
             return list(self.vectors(jnp.stack(columns, axis=-1)).T)
         masked = [m * c for m, c in zip(self.mask.T, columns, strict=True)]
@@ -101,8 +111,8 @@ class Start(NamedTuple):
     mesh: TetMesh
     x: jax.Array  # (V, 3) [m]
     free: Free
-    force: Callable[[], jax.Array]  # (V, 3) [N] forces of the nodes at x, without inertia
-    moved: bool = False  # whether the body was just moved to x; if not, it rests at x or x is only a guess
+    force: Callable[[], jax.Array]  # (V, 3) [N] nodal forces at x, without inertia
+    moved: bool = False  # True: the body was just moved to x. False: the body rests at x, or x is only a guess
 
 
 class Step(NamedTuple):
@@ -112,11 +122,11 @@ class Step(NamedTuple):
     x: jax.Array  # (V, 3) [m] positions at the beginning of the step
     k: Number  # number of the step, from 1
     steps: int  # number of steps of the run
-    dt: Any  # [s] or None: load steps without time
-    inertia: bool  # whether there is inertia: then loads act at once
-    tolerance: Any  # of the residual, without derivative
+    dt: Any  # [s]; None for load steps without time
+    inertia: bool  # whether there is inertia; then the full loads act from the first step on
+    tolerance: Any  # tolerance of the residual, not differentiated
     free: Free
-    averaged: bool = False  # whether forces at the beginning and at the end of a step count half each: Newmark's method
+    averaged: bool = False  # True for Newmark's method: the forces at both ends of a step count half each
 
 
 class End(NamedTuple):
@@ -124,19 +134,22 @@ class End(NamedTuple):
 
     x: jax.Array  # (V, 3) [m]
     F: Matrix  # deformation gradients (E,), or (Q, E) if elements have Q points
-    pressure: Any  # (V,) [Pa] of the nodes, or None
-    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] minus the acceleration by `NodalForce.at_end`
+    pressure: Any  # (V,) [Pa] at the nodes, or None
+    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] minus the acceleration due to `NodalForce.at_end` terms
 
 
 class Solid:
-    """An acting part whose stress in an element depends only on the deformation gradient."""
+    """A force term of one step. Its stress in an element depends only on the deformation gradient."""
 
     def stress(self, F: Matrix) -> Matrix:
         """First Piola-Kirchhoff stress [Pa]."""
         raise TypeError(f"{type(self).__name__} lacks stress(F)")
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
-        """Blocks d2W/dx_i dx_j per reference volume, for shape vectors D [1/m] and pairs (i, j)."""
+        """Stiffness blocks d2W/dx_i dx_j per reference volume, for pairs (i, j) of nodes.
+
+        D [1/m] are the gradients of the shape functions.
+        """
         raise TypeError(f"{type(self).__name__} lacks blocks(F, D, pairs)")
 
     def energy(self, F: Matrix) -> jax.Array:
@@ -144,20 +157,20 @@ class Solid:
         raise TypeError(f"{type(self).__name__} lacks energy(F)")
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix | None]:
-        """Pairs (weight, law), and a constant second Piola-Kirchhoff stress [Pa]. Their sum is the stress."""
+        """Pairs (weight, law), and a constant second Piola-Kirchhoff stress [Pa] or None. Their sum is the stress."""
         raise TypeError(f"{type(self).__name__} lacks parts()")
 
 
 class VolumeStress:
-    """An acting part that depends on the volume of elements, with pressures at the nodes."""
+    """A force term of one step with a stress from the volume ratio of the elements, and with pressures at the nodes."""
 
-    #: Whether pressures depend on the positions at the end of the step: then they are in the mixed system.
+    #: Whether the pressures depend on the positions at the end of the step. Then they are part of the mixed system.
     coupled: ClassVar[bool] = True
-    #: Whether pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`) and not eliminated.
+    #: Whether the pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`) and not eliminated.
     unknown: ClassVar[bool] = False
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: Guess | None = None) -> jax.Array:
-        """Pressures (V,) [Pa] of a step that ends with volume ratios J (E,). A solve for them begins with `guess`."""
+        """Pressures (V,) [Pa] at the end of a step with volume ratios J (E,). An iterative solve starts at `guess`."""
         raise TypeError(f"{type(self).__name__} lacks pressure(mesh, J)")
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
@@ -165,36 +178,36 @@ class VolumeStress:
         raise TypeError(f"{type(self).__name__} lacks stress(mesh, pressure, F)")
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """Stress and slope at given pressures."""
+        """First and second derivative of the energy density with respect to J, at given pressures (V,) [Pa]."""
         raise TypeError(f"{type(self).__name__} lacks scalars(mesh, pressure, F)")
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Energy [J] at volume ratios J (E,), with the pressures that belong to them."""
+        """Energy [J] at volume ratios J (E,), with the pressures that these volume ratios cause."""
         raise TypeError(f"{type(self).__name__} lacks energy(mesh, J)")
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """Matrix of the pressures [m^3/Pa]. If `positive`, it has no negative eigenvalue."""
+        """Matrix [m^3/Pa] of the pressure equation. If `positive` is true, it has no negative eigenvalues."""
         raise TypeError(f"{type(self).__name__} lacks matrix(mesh, J, positive)")
 
-    #: The equation of pressures that flow (`liverjax.physics.darcy.Flow`); None: there is no flow between nodes.
+    #: The pressure equation of a flowing fluid (`liverjax.physics.darcy.Flow`). None: nothing flows between nodes.
     flow: Any = None
 
 
 class NodalForce:
-    """An acting part with forces at nodes."""
+    """A force term of one step with forces at nodes."""
 
-    #: Whether it has a stiffness at every node: then slowly varying motions do not slow down the linear solver.
+    #: Whether the term has a stiffness at every node. Then long waves do not slow down the linear solver.
     everywhere: ClassVar[bool] = False
-    #: Whether the force has an energy. A force that follows the body has none, and its stiffness is not symmetric.
+    #: Whether the force has an energy. A follower force has none, and its stiffness is not symmetric.
     conservative: bool = True
     #: Whether the derivative of the force jumps, for example where contact begins.
     kinked: ClassVar[bool] = False
-    #: Whether Newmark's method takes only the force at the end of the step. The force is then doubled, since the mean
-    #: of the other forces is half of the sum at both ends.
+    #: Whether Newmark's method uses only the force at the end of the step. This force is doubled, since the other
+    #: forces enter as half of the sum at both ends.
     at_end: bool = False
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Gradient of the energy (V, 3) [N] at positions x (V, 3) [m], at fraction s of the step."""
+        """Nodal forces (V, 3) [N], the gradient of the energy, at positions x (V, 3) and fraction s of a step."""
         raise TypeError(f"{type(self).__name__} lacks force(mesh, x, s)")
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
@@ -202,63 +215,66 @@ class NodalForce:
         raise TypeError(f"{type(self).__name__} lacks energy(mesh, x)")
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """An energy [J] at x for a search that begins at `start` (V, 3). Its gradient at `start` is the force there.
+        """Energy [J] at x for a minimisation that begins at `start` (V, 3). Its gradient at `start` is the force there.
 
-        If the force has an energy, this is that energy. Otherwise the part of the force that has no energy keeps its
+        If the force has an energy, this energy is returned. Otherwise the non-conservative part of the force keeps its
         value at `start`.
         """
         return self.energy(mesh, x)
 
     def stiffness(self) -> Block | None:
-        """Diagonal blocks: 3 x 3 entries (V,) [N/m], None for an entry that is 0. None: there are no such blocks."""
+        """Diagonal blocks of the stiffness: 3 x 3 entries (V,) [N/m], or None for an entry that is 0.
+
+        Returns None if the term has no such blocks.
+        """
         return None
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
-        """Stiffness at x of elements between nodes, in addition to `stiffness`; None: there are no such elements."""
+        """Stiffness at x of elements that connect nodes, in addition to `stiffness`; None if there are no elements."""
         return None
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
-        """`attached` without negative eigenvalues."""
+        """The stiffness of `attached` without its negative eigenvalues."""
         own = self.attached(mesh, x, s)
         return without_negative(own) if isinstance(own, Attached) else own
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
-        """The loss of stiffness that an eliminated unknown causes, for example the travel of an obstacle.
+        """Loss of stiffness from the elimination of an unknown, for example of the displacement of an obstacle.
 
-        With `definite` it is the loss for `definite` above, without negative eigenvalues. None: there is no such
-        unknown.
+        If `definite` is true, the loss belongs to the stiffness of the method `definite`. Returns None if there is no
+        such unknown.
         """
         return None
 
     def predicted(self) -> jax.Array | None:
-        """Positions (V, 3) [m] that the body would reach without forces, as a guess for Newton; None: no such guess."""
+        """Positions (V, 3) [m] that the body would reach without forces, to start Newton's method; None if unknown."""
         return None
 
     def accelerations(self, force: jax.Array, x: jax.Array) -> jax.Array | None:
-        """Accelerations (V, 3) [m/s^2] of free nodes at x (V, 3) by a force (V, 3) [N]; None: the part has no mass."""
+        """Accelerations (V, 3) [m/s^2] of free nodes at x (V, 3) due to forces (V, 3) [N]; None if there is no mass."""
         return None
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:
-        """Forces (V, 3) [N] of inertia, for a part with mass."""
+        """Inertia forces (V, 3) [N], for a term with mass."""
         raise TypeError(f"{type(self).__name__} lacks inertial(acceleration)")
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
-        """Change (V, 3) [N] of a force that is not conservative, for a motion dx (V, 3) [m]."""
+        """Change (V, 3) [N] of a non-conservative force for a displacement dx (V, 3) [m]."""
         return jax.jvp(lambda x: self.force(mesh, x, s), (x,), (dx,))[1]
 
 
 class Physics:
-    """One physics of a scene: a struct of numbers. The module explains its methods."""
+    """Base class of a physics: a struct of numbers. The docstring of the module explains the methods."""
 
-    #: Every physics is a struct, so `dataclasses.replace` takes it.
+    #: Every physics is a struct, so `dataclasses.replace` works with it.
     __dataclass_fields__: ClassVar[Content]
-    #: Name of its table in scene files; `keys` are the keys of this table.
+    #: Name of the table in scene files; `keys` are the keys of this table.
     section: ClassVar[str] = ""
-    #: Whether it makes nodes move together. The factorisation cannot treat such nodes.
+    #: Whether the physics makes nodes move together. The factorisation cannot treat such nodes.
     ties: ClassVar[bool] = False
-    #: Whether it needs the time step `step.dt`. Then a scene without a time step is refused.
+    #: Whether the physics needs the time step `step.dt`. Then a scene without a time step raises InputError.
     in_time: ClassVar[bool] = False
-    #: Whether its forces have an energy. Friction forces have none.
+    #: Whether the forces have an energy. Friction forces have none.
     conservative: ClassVar[bool] = True
     keys: ClassVar[tuple[str, ...]] = ()
 
@@ -272,21 +288,21 @@ class Physics:
         raise TypeError(f"{cls.__name__} has no table in scene files")
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse numbers that no step can use; host side.
+        """Check the numbers on the host.
 
         Raises:
-            InputError: one sentence that begins with `name`.
+            InputError: numbers that no step can use. The message begins with `name`.
         """
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Refuse a mesh with which it cannot begin; host side. A loaded mesh is not checked: no run begins with it.
+        """Check on the host that a run can begin with this mesh. Meshes of a loaded shape are not checked.
 
         Raises:
-            InputError: one sentence that begins with `name`.
+            InputError: the run cannot begin. The message begins with `name`.
         """
 
     def in_body(self, mesh: TetMesh, law: Any) -> "Physics":
-        """The same physics, with the numbers that follow from the law of the body."""
+        """The same physics, with default numbers computed from the law of the body."""
         return self
 
     def at_beginning(self) -> "Physics":
@@ -294,16 +310,16 @@ class Physics:
         return self
 
     def begin(self, start: Start) -> Any:
-        """Memory at the beginning of a run; None: this physics has no memory."""
+        """Memory at the beginning of a run, or None if this physics has no memory."""
         return None
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """Whether `freeze` accepts None as the memory of a body at rest at the beginning of a run."""
+        """Whether `freeze` accepts None as the memory, for a body at rest at the beginning of a run."""
         return cls.begin is Physics.begin
 
     def freeze(self, memory: Any, step: Step) -> Any:
-        """The part that acts during a step; None: nothing acts."""
+        """Force term of a step, or None if nothing acts."""
         return None
 
     def advance(self, memory: Any, acting: Any, end: End) -> Any:
@@ -311,33 +327,37 @@ class Physics:
         return memory
 
     def constrain(self, free: Free) -> Free:
-        """The free directions without the directions that this physics holds."""
+        """Remove the directions that this physics constrains from the free directions."""
         return free
 
     def tied(self, step: Step) -> Tied | None:
-        """Nodes that move together during a step because of this physics; None: there are none."""
+        """Nodes that move together during a step because of this physics, or None if there are no such nodes."""
         return None
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Node numbers (n,) and directions (n, 3) along which this physics holds the body against rigid motions."""
+        """Node numbers (n,) and directions (n, 3) along which this physics prevents rigid motions of the body."""
         return np.zeros(0, int), np.zeros((0, 3))
 
-    def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Physics":
-        """The same physics on a mesh of richer elements.
+    def pulls_single_nodes(self) -> bool:
+        """Whether forces act at single nodes, not on an area. Then displacements there depend on the mesh."""
+        return False
 
-        `more` adds the new nodes between nodes (n,) to their numbers.
+    def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Physics":
+        """The same physics on a mesh with elements of higher order.
+
+        `more` takes node numbers (n,) and adds the numbers of the new nodes that lie between these nodes.
         """
         return self
 
     def bulk_modulus(self) -> Any:
-        """Bulk modulus [Pa] that replaces the bulk modulus of the law; None: it is not replaced."""
+        """Bulk modulus [Pa] that replaces the bulk modulus of the law, or None if it is not replaced."""
         return None
 
     def output(self, memory: Any) -> dict[str, jax.Array]:
-        """Fields of the vertices (V,) for the result, in addition to positions and reactions."""
+        """Fields (V,) of the vertices by name, which the result contains in addition to positions and reactions."""
         return {}
 
 
 def diagonal(value: jax.Array) -> Block:
-    """Diagonal 3 x 3 blocks with the same value (V,) for every axis."""
+    """3 x 3 blocks of a diagonal matrix, with the same value (V,) for every axis."""
     return ((value, None, None), (None, value, None), (None, None, value))

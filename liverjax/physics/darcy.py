@@ -1,8 +1,10 @@
-"""Darcy's law (book chapter, section 4.3): storage and flow of the fluid, with its pressure at the nodes.
+"""Darcy's law (book chapter, section 4.3): storage and flow of a fluid with the pressure P at the nodes.
 
     (1/K_lim) dP/dt = kappa lap P - (dJ/dt)/J
 
-The equation uses the volumes at the beginning of a step, so that it is linear in P: A P = b.
+J is the volume ratio, kappa the permeability, lap the Laplacian, and 1/K_lim the fluid volume stored per volume and
+pressure. The equation uses the volumes at the beginning of a step, so that it is linear in P. Its discrete form is the
+pressure equation A P = b, with the pressure matrix A.
 """
 
 from typing import Any, NamedTuple
@@ -25,24 +27,27 @@ LEAST_J = 1e-3
 
 
 class Flow(NamedTuple):
-    """The pressure equation of a step at its initial positions: storage plus dt times Darcy's Laplacian."""
+    """The pressure equation of a step at its initial positions. The matrix is storage plus dt times Darcy's Laplacian.
 
-    matrix: block_matrix.BlockMatrix  # symmetric positive definite, 1 x 1 blocks
-    store: jax.Array  # (V,) [m^3/Pa]
-    mask: jax.Array  # (V,) 0 where P is given
+    D is the diagonal of the matrix A.
+    """
+
+    matrix: block_matrix.BlockMatrix  # A, symmetric positive definite, 1 x 1 blocks
+    store: jax.Array  # (V,) [m^3/Pa] fluid volume stored per unit of pressure
+    mask: jax.Array  # (V,) 0 where P is given, 1 elsewhere
     slow: Coarse  # coarse space of the matrix
     low: jax.Array  # estimated minimum eigenvalue of D^-1 A outside the coarse space
     high: jax.Array  # upper bound of the eigenvalues of D^-1 A
-    tolerance: jax.Array  # of a solve, relative to its right-hand side
-    given: jax.Array | None = None  # (V,) [Pa] pressures where they are given, 0 elsewhere; None: they are 0
-    enters: jax.Array | None = None  # (V,) [m^3] fluid that enters during the step; None: none enters
+    tolerance: jax.Array  # tolerance of a solve, relative to the right-hand side
+    given: jax.Array | None = None  # (V,) [Pa] given pressures, 0 elsewhere; None: all given pressures are 0
+    enters: jax.Array | None = None  # (V,) [m^3] fluid that enters during the step; None: no fluid enters
 
 
 def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Array:
-    """1 at vertices (V,) whose pressure is unknown, 0 where it is drained or given."""
+    """Mask (V,) of the vertices: 1 if the pressure is unknown, 0 if the vertex is drained or its pressure is given."""
     mask = jnp.ones(mesh.number_of_vertices, dtype)
     if porosity.drained is not None:
-        # Only vertices have pressures: middles of edges among these nodes are ignored.
+        # Only vertices have pressures, so edge middles among these nodes are ignored.
         mask = mask.at[porosity.drained].set(0.0, mode="drop")
     for inlet in porosity.inlet:
         if inlet.nodes is not None:
@@ -51,14 +56,14 @@ def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Arr
 
 
 def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tolerance: jax.Array) -> Flow:
-    """The matrix of the pressure equation for a step of dt [s] that begins at F, with volume ratios J (E,)."""
+    """Pressure equation of a step dt [s], with deformation gradient F and volume ratios J (E,) at its beginning."""
     mask = unknown_pressures(porosity, mesh, J.dtype)
     # Everything is multiplied by dt, so that the storage term does not depend on the step.
     J = jnp.maximum(J, LEAST_J)
     by_element = jnp.ndim(porosity.limit_bulk) > 0
     store = integrals(mesh, J / porosity.limit_bulk) if by_element else integrals(mesh, J) / porosity.limit_bulk
     g = volume_gradients(mesh, F)
-    # grad N_a = cof(F) D_a / J per current volume J V0.
+    # grad N_a = cof(F) D_a / J is integrated over the current volume J V0, so one factor 1/J remains.
     weight = dt * porosity.permeability * mesh.weights / J
     rows = block_matrix.off_diagonal(mesh, {(a, b): ((summed(mesh, weight * dot(g[a], g[b])),),) for a, b in PAIRS})
     diagonal = ((store - block_matrix.row_sums(rows)[0][0],),)
@@ -71,28 +76,31 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tole
 
 
 def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: jax.Array) -> jax.Array:
-    """Estimated minimum eigenvalue of D^-1 A outside the coarse space; `rate` is dt kappa, one or one per element."""
+    """Estimate the minimum eigenvalue of D^-1 A outside the coarse space, with the diagonal D of A.
+
+    `rate` is dt kappa, one number or one per element (E,).
+    """
     stored, total = jnp.sum(store), jnp.sum(diagonal)
     if jnp.ndim(rate):
-        # It is smallest where the fluid flows fastest: treat the whole body as if it flowed everywhere as fast.
+        # The minimum belongs to the elements with the fastest flow, so their rate is used for the whole body.
         fastest, mean = jnp.max(rate), jnp.sum(jnp.ravel(rate) * mesh.volumes) / jnp.sum(mesh.volumes)
         total, rate = stored + (total - stored) * fastest / jnp.where(mean > 0, mean, 1.0), fastest
-    # Storage, and flow at the wave number 5 / width: the coarse space treats longer waves (measured: 4.9 to 5.4).
+    # Storage plus flow at the wave number 5 / width (measured: 4.9 to 5.4). The coarse space treats longer waves.
     waves = rate * (5 / mesh.pattern.patch_width) ** 2 * jnp.sum(mesh.volumes)
     return (stored + waves) / total
 
 
 def right_side(flow: Flow, b: jax.Array) -> jax.Array:
-    """The part of b (V,) for the free pressures: inflow added, the effect of given pressures subtracted."""
+    """Right-hand side (V,) for the unknown pressures: b plus the inflow, minus the effect of the given pressures."""
     if flow.enters is not None:
         b = b + flow.enters
     return flow.mask * (b if flow.given is None else b - flow_product(flow, flow.given))
 
 
 def lack(flow: Flow, b: jax.Array, pressure: jax.Array) -> jax.Array:
-    """Residual b - A P (V,) for pressures P (V,) [Pa]. At nodes with a given pressure it is the error of P.
+    """Residual b - A P (V,) for pressures P (V,) [Pa]; 0 at a solution.
 
-    It is 0 at a solution.
+    At nodes with a given pressure, the residual is the given pressure minus P.
     """
     own = flow.mask * pressure
     error = own - pressure if flow.given is None else own - pressure + flow.given
@@ -100,26 +108,26 @@ def lack(flow: Flow, b: jax.Array, pressure: jax.Array) -> jax.Array:
 
 
 class Guess(NamedTuple):
-    """Pressures at which a solve begins, and the accuracy that it needs."""
+    """Starting pressures of a solve, and the accuracy that this solve needs."""
 
-    pressure: jax.Array  # (V,) [Pa], without derivative
-    looser: Number  # tolerance of the solve, over `Flow.tolerance`
+    pressure: jax.Array  # (V,) [Pa], not differentiated
+    looser: Number  # tolerance of the solve, divided by `Flow.tolerance`
 
 
 def with_given(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) -> jax.Array:
-    """All pressures (V,) [Pa]: the computed and the given ones."""
+    """Solve the pressure equation. Return all pressures (V,) [Pa], computed and given."""
     P = solved(mesh, flow, right_side(flow, b), guess)
     return P if flow.given is None else P + flow.given
 
 
 def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) -> jax.Array:
-    """A^-1 b for b (V,), with A the matrix of the pressures, to the tolerance of the flow. It has derivatives.
+    """Solve A p = b for b (V,), with the pressure matrix A, to the tolerance of the flow. The result is differentiable.
 
-    A `guess` saves iterations; the derivatives are as accurate as without a guess.
+    A `guess` saves iterations. The derivatives are as accurate as without a guess.
     """
 
     def apply(p):
-        # Rows of given pressures are unit rows: adjoint loads may be different from 0 there.
+        # Rows of given pressures are unit rows, because adjoint loads may be nonzero there.
         return flow.mask * flow_product(flow, flow.mask * p) + (1 - flow.mask) * p
 
     diagonal = flow.mask * flow.matrix.diagonal[0][0] + (1 - flow.mask)
@@ -147,21 +155,21 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) 
 
 
 def flow_product(flow: Flow, p: jax.Array) -> jax.Array:
-    """The product A p, from differences between neighbours: a uniform p gives exactly no flow, in any precision."""
+    """Product A p, computed from differences between neighbours. A uniform p then causes exactly no flow."""
     rows, nodes = flow.matrix.rows[0][0], flow.matrix.nodes
     # One kernel for all neighbours takes a third of the time of a loop over them, on small and on large meshes.
     return flow.store * p + jnp.sum(rows * (p[nodes] - p[None]), axis=0)
 
 
-#: Error of the polynomial that replaces the inverse of the matrix of the pressures in Newton's direction.
+#: Error of the polynomial that approximates the inverse of the pressure matrix in Newton's direction.
 _POLYNOMIAL_ERROR = 0.1
 
 
 def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
-    """Approximate A^-1 b for b (V,), with A the matrix of the pressures.
+    """Solve A p = b for b (V,) approximately, with the pressure matrix A.
 
-    The approximation is linear in b, symmetric and positive definite. The coarse space solves exactly for long waves; a
-    polynomial treats the other waves.
+    The approximate inverse is linear, symmetric and positive definite. Long waves are solved exactly in the coarse
+    space. A polynomial of the matrix treats the other waves.
     """
     d = flow.matrix.diagonal[0][0]
     degree = jnp.ceil(0.5 * jnp.sqrt(flow.high / flow.low) * jnp.log(2 / _POLYNOMIAL_ERROR)).astype(jnp.int32)

@@ -1,9 +1,10 @@
-"""An elastic support: springs between the body and a wall that does not move, on nodes or on a part of the surface.
+"""An elastic support: springs between the body and a rigid wall, at nodes or on a part of the surface.
 
-Springs on a surface (a Winkler foundation) have two stiffnesses per area: one along the normal of the reference
-surface, and one along the surface. They begin without tension. A history of factors changes their stiffness with time.
-A history of displacements moves the wall, and the springs with it. In linear elements each node of a triangle gets a
-third of the triangle's stiffness. In other elements the springs are integrated over the triangle.
+Springs on a surface (a Winkler foundation) have two stiffnesses per area: one normal and one tangential to the
+reference surface. In the reference shape the springs have no tension. A history of factors changes the stiffness of the
+springs with time. A history of displacements moves the wall, and with it one end of the springs. In linear elements
+each node of a triangle gets a third of the triangle's stiffness. In elements of higher order the springs are integrated
+over the triangle.
 """
 
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from liverjax.physics.base import NodalForce, Physics, Step
 from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block
 
-#: Order of the mesh -> degree of the integration rule on triangles.
+#: Degree of the integration rule on triangles, for each order of the elements.
 _DEGREE = {2: 4, 3: 5}
 
 
@@ -36,7 +37,7 @@ class ElasticSupport(Physics):
     normal: Number = param("Pa/m", "stiffness per area along the normal", lower=0.0, default=0.0)
     tangential: Number = param("Pa/m", "stiffness per area along the surface", lower=0.0, default=0.0)
     nodes: Indices | None = param("1", "node numbers (n,)", lower=0, default=None)
-    stiffness: Number = param("N/m", "of each node, in every direction", lower=0.0, default=0.0)
+    stiffness: Number = param("N/m", "stiffness of each node, equal in all directions", lower=0.0, default=0.0)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param(
         "1", "factors of the stiffness (T,), or displacements of the wall (T, 3) [m]", default=None
@@ -47,7 +48,7 @@ class ElasticSupport(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "ElasticSupport":
-        """Read [[support]]: a place and the stiffnesses."""
+        """Read [[support]]: a set of nodes and the stiffnesses."""
         nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
         given: Content = {k: table[k] for k in ("normal", "tangential", "stiffness") if k in table}
         if ("stiffness" in given) == bool({"normal", "tangential"} & set(given)):
@@ -63,11 +64,11 @@ class ElasticSupport(Physics):
             return cls(nodes=jnp.asarray(nodes, jnp.int32), **given)
         triangles = selection.surface_of(mesh, nodes, table.get("set"))
         if not len(triangles):
-            raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
+            raise InputError(f"{name} where selects nodes but no boundary triangle: enlarge the region to a whole face")
         return cls(triangles=jnp.asarray(triangles, jnp.int32), **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse wrong node numbers, a missing place, and a history that does not fit its times."""
+        """Raise InputError for wrong or missing node numbers, and for a history that does not fit its times."""
         history.check_times(self.times, self.history, name)
         if (self.triangles is None) == (self.nodes is None):
             raise InputError(f"{name} needs either triangles or nodes: give one of them")
@@ -84,9 +85,9 @@ class ElasticSupport(Physics):
             bounds.check_bound(f"{name} history", {"lower": 0.0}, self.history)
 
     def freeze(self, memory: None, step: Step) -> "Springs | Foundation":
-        """The springs during a step: one symmetric block per node.
+        """Force term of the springs for one step, with one symmetric stiffness block per node.
 
-        On surfaces of meshes that are not linear there is one block per integration point.
+        On surfaces of elements of higher order there is one block per integration point.
         """
         kind: Any = Foundation if self.triangles is not None and step.mesh.order > 1 else Springs
         own = point_blocks(self, step.mesh) if kind is Foundation else blocks(self, step.mesh)
@@ -98,14 +99,18 @@ class ElasticSupport(Physics):
             return kind(blocks=own, wall=jnp.stack([before, after]), **given)
         return kind(blocks=tuple(tuple(after * entry for entry in row) for row in own), **given)
 
+    def pulls_single_nodes(self) -> bool:
+        """Whether the springs are given for nodes, and not per area."""
+        return self.triangles is None
+
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "ElasticSupport":
-        """The support on the same triangles or nodes of the richer mesh."""
+        """The support on the same triangles or nodes of the mesh of higher order."""
         if self.triangles is None:
             return self
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held along the principal axes in which their block has a stiffness."""
+        """Return the nodes, and the principal axes along which their block has a stiffness."""
         K = np.moveaxis(np.array([[np.asarray(e) for e in row] for row in blocks(self, mesh)]), -1, 0)
         size, axes = np.linalg.eigh(K)
         node, axis = np.nonzero(size > 1e-9 * max(size.max(), 1e-300))
@@ -113,7 +118,7 @@ class ElasticSupport(Physics):
 
 
 def _refuse_idle(support: ElasticSupport, keys: tuple[str, ...], name: str, instead: str) -> None:
-    """Refuse stiffnesses of the other kind of springs: they would have no effect."""
+    """Raise InputError for stiffnesses of the other kind of springs, since they would have no effect."""
     for key in keys:
         if np.any(np.asarray(getattr(support, key)) != 0):
             raise InputError(f"{name}.{key} = {getattr(support, key)} changes nothing: {instead}")
@@ -121,7 +126,7 @@ def _refuse_idle(support: ElasticSupport, keys: tuple[str, ...], name: str, inst
 
 @partial(jax.jit, inline=True)
 def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
-    """Stiffness of the nodes: 3 x 3 blocks of arrays (V,) [N/m]."""
+    """Spring stiffness of the nodes: 3 x 3 blocks of arrays (V,) [N/m]."""
     zero = jnp.zeros(mesh.points.shape[0], mesh.points.dtype)
     if support.triangles is None:
         own = zero.at[support.nodes].add(support.stiffness)
@@ -137,13 +142,13 @@ def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
 
 
 def point_blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
-    """Stiffness at the integration points of triangles: 3 x 3 blocks of arrays (Q, m) [N/m]."""
+    """Spring stiffness at the Q integration points of m triangles: 3 x 3 blocks of arrays (Q, m) [N/m]."""
     weights = triangle_rule(_DEGREE[mesh.order])[0]
     return _each(support, mesh, lambda whole: jnp.asarray(weights, whole.dtype)[:, None] * whole[None])
 
 
 def _each(support: ElasticSupport, mesh: TetMesh, shared: Callable[[jax.Array], jax.Array]) -> Block:
-    """3 x 3 blocks of stiffness. `shared` distributes the stiffness (m,) [N/m] of triangles to nodes or points."""
+    """Spring stiffness as 3 x 3 blocks. `shared` distributes stiffnesses (m,) [N/m] of triangles to nodes or points."""
     normal = surface.areas(mesh.points, support.triangles)
     area = jnp.sqrt(jnp.sum(normal * normal, axis=1))
     n = normal / area[:, None]
@@ -158,9 +163,9 @@ def _each(support: ElasticSupport, mesh: TetMesh, shared: Callable[[jax.Array], 
 
 @struct
 class Springs(NodalForce):
-    """Springs during a step."""
+    """Force term of springs at nodes, for one step."""
 
-    blocks: Block = param("N/m", "3 x 3 of (V,)")
+    blocks: Block = param("N/m", "3 x 3 blocks of arrays (V,)")
     wall: jax.Array | None = param(
         "m", "displacement of the wall at the beginning and at the end of the step (2, 3)", default=None
     )
@@ -172,31 +177,33 @@ class Springs(NodalForce):
         return x - mesh.points - (self.wall[0] + s * (self.wall[1] - self.wall[0]))[None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Forces (V, 3) [N]: blocks times stretch."""
+        """Nodal forces (V, 3) [N]: blocks times stretch."""
         u = self._stretch(mesh, x, s).T
         return jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks], axis=-1)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Half of stretch times force."""
+        """Energy [J] of the springs: half of stretch times force."""
         return 0.5 * jnp.sum(self._stretch(mesh, x, 1.0) * self.force(mesh, x, 1.0))
 
     def stiffness(self) -> Block:
-        """The blocks, which are constant during the step."""
+        """Stiffness blocks, which are constant during the step."""
         return self.blocks
 
 
 @struct
 class Foundation(NodalForce):
-    """Springs on a surface during a step, integrated over its triangles."""
+    """Force term of springs on a surface, integrated over its triangles, for one step."""
 
-    triangles: Indices = param("1", "(m, 3), or (m, 4) of order 3 as in `liverjax.mesh.promotion.with_faces`")
-    blocks: Block = param("N/m", "3 x 3 of (Q, m)")
+    triangles: Indices = param(
+        "1", "node numbers (m, 3), or (m, 4) for elements of order 3 (`liverjax.mesh.promotion.with_faces`)"
+    )
+    blocks: Block = param("N/m", "3 x 3 blocks of arrays (Q, m)")
     wall: jax.Array | None = param(
         "m", "displacement of the wall at the beginning and at the end of the step (2, 3)", default=None
     )
 
     def _at_points(self, mesh: TetMesh, x: jax.Array, s: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Nodes (n, m), their shape functions (n, Q), and the stretch of the springs (3, Q, m) [m]."""
+        """Node numbers (n, m), their shape functions (n, Q), and the stretch of the springs (3, Q, m) [m]."""
         nodes = jnp.stack(surface.triangle_nodes(mesh, self.triangles))
         N = jnp.asarray(surface.triangle_functions(mesh, triangle_rule(_DEGREE[mesh.order])[1]), x.dtype)
         u = jnp.einsum("aq,ami->iqm", N, (x - mesh.points)[nodes])
@@ -205,18 +212,18 @@ class Foundation(NodalForce):
         return nodes, N, u
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Forces at the integration points, distributed to the nodes by the shape functions."""
+        """Nodal forces (V, 3) [N]: forces at the integration points, distributed by the shape functions."""
         nodes, N, u = self._at_points(mesh, x, s)
         own = jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks])
         return jnp.zeros_like(x).at[nodes].add(jnp.einsum("aq,iqm->ami", N, own))
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Half of stretch times force."""
+        """Energy [J] of the springs: half of stretch times force."""
         u = self._at_points(mesh, x, 1.0)[2]
         return 0.5 * jnp.einsum("iqm,ijqm,jqm->", u, jnp.stack([jnp.stack(row) for row in self.blocks]), u)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of the energy."""
+        """Stiffness: second derivative of the energy."""
         nodes, N, _ = self._at_points(mesh, x, s)
         H = jnp.stack([jnp.stack(row) for row in self.blocks])
         return Attached(nodes, jnp.einsum("aq,bq,ijqm->aibjm", N, N, H))

@@ -1,4 +1,4 @@
-"""A hyperelastic solid: its law acts in every element, without memory."""
+"""A hyperelastic solid: the stress in every element follows from the law, without memory."""
 
 from typing import Any
 
@@ -13,33 +13,33 @@ from liverjax.tensors.matrices import Matrix, Vector
 
 @struct
 class Elasticity(Physics):
-    """A law that acts element by element."""
+    """A hyperelastic law, evaluated in every element."""
 
     law: Law = param("1", "the law")
 
     def freeze(self, memory: None, step: Step) -> "Elastic":
-        """The law, ready to act during a step."""
+        """Force term of the law, for one step."""
         return Elastic(law=self.law)
 
 
 @struct
 class Elastic(Solid):
-    """The law during a step."""
+    """Force term of a hyperelastic law, for one step."""
 
     law: Law = param("1", "the law")
 
     def stress(self, F: Matrix) -> Matrix:
-        """First Piola-Kirchhoff stress, from hand-derived terms."""
+        """First Piola-Kirchhoff stress [Pa], from hand-derived formulas."""
         return invariant_terms.first_piola(self.law, F)
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
-        """Blocks of the stiffness, from hand-derived terms."""
+        """Blocks of the stiffness, from hand-derived formulas."""
         return invariant_terms.blocks(invariant_terms.state(self.law, F), D, pairs)
 
     def energy(self, F: Matrix) -> jax.Array:
-        """Strain energy."""
+        """Strain energy density [Pa]."""
         return self.law.strain_energy(self.law.measures(F))
 
     def parts(self) -> tuple[list[tuple[Any, Any]], None]:
-        """The law with weight 1, and no constant stress."""
+        """The law with weight 1, and None because there is no constant stress."""
         return [(1.0, self.law)], None

@@ -1,9 +1,9 @@
 """Inertia of lumped or consistent masses, with implicit Euler or Newmark's average acceleration.
 
-Newmark's method takes the mean of the forces at both ends of a step. Of the forces of an obstacle whose place is
-given, it takes only those at the end (Kane et al. 1999, Comput. Methods Appl. Mech. Eng. 180, 1). Then a still obstacle
-never gives energy to the body; with the mean it does, where contact begins or ends within a step. The acceleration in
-the memory is that of all other forces.
+Newmark's method uses the mean of the forces at both ends of a step. The forces of an obstacle with a given position are
+an exception: only their value at the end of the step is used (Kane et al. 1999, Comput. Methods Appl. Mech. Eng. 180,
+1). An obstacle at rest then never adds energy to the body. With the mean it would add energy where contact begins or
+ends within a step. The acceleration in the memory comes from all other forces.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -20,9 +20,9 @@ from liverjax.solvers.attached import Masses, masses
 from liverjax.solvers.block_matrix import Block
 from liverjax.tensors.places import given
 
-#: k of the acceleration k (x - ...)/dt^2 at the end of a step.
+#: Factor k in the acceleration k (x - ...)/dt^2 at the end of a step, with positions x and time step dt.
 FACTOR = {"euler": 1.0, "newmark": 4.0}
-#: Tolerance of the accelerations at the beginning of a run.
+#: Relative tolerance of the solves for accelerations.
 _EXACT = 1e-12
 
 
@@ -37,14 +37,15 @@ class Motion(NamedTuple):
 class Inertia(Physics):
     """Mass of the body: lumped at its nodes, or consistent (integrals of products of the shape functions)."""
 
-    density: Any = param("kg/m^3", "per reference volume, one number or one per node (V,)", above=0.0)
+    density: Any = param("kg/m^3", "mass per reference volume, one number or one per node (V,)", above=0.0)
     integrator: str = static(default="euler", about="euler (first order) or newmark (second order)")
-    mass: str = static(default="lumped", about="lumped: at the nodes; or consistent")
+    mass: str = static(default="lumped", about="lumped (at the nodes) or consistent")
 
     def begin(self, start: Start) -> Motion:
-        """Begin at rest.
+        """Memory of a body at rest.
 
-        For Newmark's method the acceleration solves m a = f, so that the first step has full order.
+        For Newmark's method the initial acceleration a solves m a = f, with masses m and forces f. The first step then
+        has the full order of accuracy.
         """
         acceleration = None
         if self.integrator == "newmark":
@@ -54,11 +55,11 @@ class Inertia(Physics):
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """True: at rest its force is 0, but it has a stiffness."""
+        """Return True: without memory the body is at rest, so its inertia force is 0."""
         return True
 
     def freeze(self, memory: Motion | None, step: Step) -> "Moving":
-        """Masses, and the motion at the beginning of the step."""
+        """Force term of inertia, with the masses and with the motion at the beginning of the step."""
         if memory is None:
             still = jnp.zeros_like(step.x)
             memory = Motion(still, still if self.integrator == "newmark" else None)
@@ -71,7 +72,7 @@ class Inertia(Physics):
         return Moving(mass=mass, shared=shared, axes=axes, **own)
 
     def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
-        """Masses (V,) [kg] of the nodes, and the other part of the elements' consistent mass (None if lumped)."""
+        """Masses (V,) [kg] of the nodes, and the remaining part of the consistent mass matrix (None if lumped)."""
         if self.mass == "lumped":
             return self.density * nodal_volumes(mesh), None
         density, (parts, matrix) = jnp.asarray(self.density), mass_parts(mesh.order)
@@ -91,11 +92,11 @@ class Inertia(Physics):
 
 
 def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: jax.Array) -> jax.Array:
-    """Solution a (V, 3) [m/s^2] of m a = f in free directions, for free parts f (V, 3) [N]; 0 along others."""
+    """Solve m a = f in the free directions for f (V, 3) [N]. Return a (V, 3) [m/s^2], 0 in other directions."""
     if shared is None and not free.tied:
         return force / mass[:, None]
 
-    # In reverse mode a cotangent may have parts along held directions: the matrix is regular there, too.
+    # In reverse mode a cotangent may have components in fixed directions, so the matrix is made regular there.
     mean = jnp.mean(mass)
 
     def product(a: jax.Array) -> jax.Array:
@@ -111,23 +112,25 @@ def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: ja
 
 
 def _inertia(mass: jax.Array, shared: Masses | None, a: jax.Array) -> jax.Array:
-    """Mass times accelerations (V, 3): forces (V, 3) [N]."""
+    """Inertia forces (V, 3) [N]: mass times accelerations a (V, 3) [m/s^2]."""
     force = mass[:, None] * a
     return force if shared is None else force + jnp.stack(attached.product(shared, tuple(a.T)), axis=1)
 
 
 @struct
 class Moving(NodalForce):
-    """Inertia during a step."""
+    """Force term of inertia, for one step."""
 
     mass: jax.Array = param("kg", "(V,)")
-    x: jax.Array = param("m", "positions at the beginning (V, 3)")
-    motion: Motion = param("1", "velocity and acceleration there")
+    x: jax.Array = param("m", "positions at the beginning of the step (V, 3)")
+    motion: Motion = param("1", "velocity and acceleration at the beginning of the step")
     dt: jax.Array = param("s", "time step")
-    mask: jax.Array = param("1", "(V, 3) 1 where the motion is not given")
+    mask: jax.Array = param("1", "(V, 3) 1 where the motion is unknown, 0 where it is given")
     integrator: str = static(default="euler")
-    shared: Masses | None = param("kg", "other part of the consistent mass; None: lumped", default=None)
-    axes: jax.Array | None = param("1", "(V, 3) axis of a lifting plate with a given angle, 0 elsewhere", default=None)
+    shared: Masses | None = param("kg", "remaining part of the consistent mass matrix; None: lumped", default=None)
+    axes: jax.Array | None = param(
+        "1", "(V, 3) axis along which a plate with a given angle can move, 0 elsewhere", default=None
+    )
 
     free: Free | None = param("1", "free directions; None for implicit Euler", default=None)
 
@@ -139,45 +142,45 @@ class Moving(NodalForce):
         velocity = (x - self.x) / dt
         acceleration = (velocity - before.velocity) / dt
         if before.acceleration is not None:
-            # Only for free degrees: where motion is prescribed, the average acceleration would oscillate without end.
+            # Only where the motion is free: the average acceleration of a prescribed motion would oscillate forever.
             average = 4 * acceleration - before.acceleration
             velocity = self._where_free(before.velocity + 0.5 * dt * (before.acceleration + average), velocity)
             acceleration = self._where_free(average, acceleration)
         return velocity, acceleration
 
     def _where_free(self, own: jax.Array, given: jax.Array) -> jax.Array:
-        """A field (V, 3): `own` in free directions, `given` in directions of given motion."""
+        """A field (V, 3) with the values `own` in free directions and `given` in directions of a given motion."""
         out = jnp.where(self.mask > 0, own, given)
         return out if self.axes is None else out + jnp.sum(self.axes * (own - given), axis=1, keepdims=True) * self.axes
 
     def predicted(self) -> jax.Array:
-        """Positions after a motion at constant velocity."""
+        """Positions (V, 3) [m] after a motion at constant velocity."""
         return self.x + self.dt * self.motion.velocity
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Mass times acceleration."""
+        """Inertia forces (V, 3) [N]: mass times acceleration."""
         return _inertia(self.mass, self.shared, self.kinematics(x)[1])
 
     def accelerations(self, force: jax.Array, x: jax.Array) -> jax.Array | None:
-        """Solution a (V, 3) of m a = f in free directions."""
+        """Accelerations a (V, 3) [m/s^2] in the free directions from m a = f, with masses m and forces f (V, 3) [N]."""
         assert self.free is not None
         return _accelerations(self.mass, self.shared, self.free, self.free.vectors(force, x))
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:
-        """Mass times acceleration."""
+        """Inertia forces (V, 3) [N]: mass times acceleration."""
         return _inertia(self.mass, self.shared, acceleration)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """m a . a dt^2/(2k); the force is its gradient."""
+        """Incremental energy m a . a dt^2/(2k) [J]; the inertia force is its gradient."""
         a = self.kinematics(x)[1]
         return 0.5 * self.dt**2 / FACTOR[self.integrator] * jnp.sum(_inertia(self.mass, self.shared, a) * a)
 
     def stiffness(self) -> Block:
-        """Stiffness k m/dt^2 of every node along every axis."""
+        """Stiffness k m/dt^2 [N/m] of every node along every axis."""
         return diagonal(FACTOR[self.integrator] / self.dt**2 * self.mass)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Masses | None:
-        """k/dt^2 times the other part of the consistent mass, between the nodes of an element."""
+        """Remaining part of the consistent mass matrix, between the nodes of an element, times k/dt^2."""
         if self.shared is None:
             return None
         return self.shared._replace(size=FACTOR[self.integrator] / self.dt**2 * self.shared.size)

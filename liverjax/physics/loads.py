@@ -1,4 +1,4 @@
-"""Loads: weight, dead tractions, and pressures that follow the body."""
+"""Loads: weight, dead tractions (fixed direction), and follower pressures (normal to the deformed surface)."""
 
 from functools import partial
 from typing import Any
@@ -16,16 +16,16 @@ from liverjax.physics.base import NodalForce, Physics, Step
 
 @struct
 class Traction:
-    """A load on boundary triangles: a dead load (`value`), or a pressure that follows the triangles."""
+    """A load on boundary triangles: a dead load (`value`), or a follower pressure normal to the deformed triangles."""
 
     triangles: Indices = param("1", "node numbers (m, 3), normals outwards", lower=0)
     value: Any = param("Pa", "force per reference area (3,), in a fixed direction", default=None)
-    pressure: Number | None = param("Pa", "positive pushes inwards; current normal and area", default=None)
+    pressure: Number | None = param("Pa", "per current area, along the current normal; inwards if > 0", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Any = param("1", "factors of value or pressure (T,), or the value itself (T, 3) [Pa]", default=None)
 
     def at(self, time: Number) -> "Traction":
-        """The load at a time [s], without a history."""
+        """The load at a time [s], as a load without history."""
         if self.history is None:
             return self
         now = history.value_at(self.value if self.pressure is None else self.pressure, time, self.times, self.history)
@@ -35,7 +35,7 @@ class Traction:
 
 @partial(jax.jit, inline=True)
 def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
-    """Dead nodal forces (V, 3) [N]: reference area times traction, distributed to the nodes."""
+    """Nodal forces (V, 3) [N] of the dead loads: reference area times traction, distributed to the nodes."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for load in tractions:
         if load.value is None:
@@ -49,12 +49,15 @@ def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
 
 
 def follows(tractions: tuple) -> bool:
-    """Whether a load is a pressure, which follows the body: then the tangent is not symmetric."""
+    """Whether one of the loads is a follower pressure. Its tangent is not symmetric."""
     return any(load.pressure is not None for load in tractions)
 
 
 def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
-    """Nodal forces (V, 3) [N] of the pressures, -p n da, at positions x (V, 3) [m]. By default the mesh is linear."""
+    """Nodal forces (V, 3) [N] of the follower pressures p at positions x (V, 3) [m].
+
+    They are integrals of -p n da, with the normal n and the area element da. Without `mesh` the elements are linear.
+    """
     force = jnp.zeros_like(x)
     for load in tractions:
         if load.pressure is not None:
@@ -63,7 +66,7 @@ def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None)
 
 
 def dead_loads(mesh: TetMesh, density: Number, gravity: Numbers, tractions: tuple) -> jax.Array:
-    """Nodal forces (V, 3) [N] that do not follow the body: tractions, and weight if `density` is not None."""
+    """Nodal forces (V, 3) [N] of the dead loads: tractions, and weight if `density` is not None."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     if density is not None:
         # The density of a node multiplies the node's share of volume. In quadratic elements a vertex has a negative
@@ -84,14 +87,14 @@ class Loads(Physics):
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
 
     def freeze(self, memory: None, step: Step) -> "Loading":
-        """Sum the dead loads once. Which fraction of them acts depends on the step and on the fraction s."""
+        """Force term of the loads. Dead loads are summed once; the step and s determine the fraction that acts."""
         if self.history is not None or any(load.history is not None for load in self.traction):
             begin, end = (self.at(n * step.dt)._loading(step, "none") for n in (step.k - 1, step.k))
             return replace(end, before=begin)
         return self._loading(step, "steps" if step.dt is None else "none" if step.inertia else "first")
 
     def at(self, time: Number) -> "Loads":
-        """The loads at a time [s], without histories."""
+        """The loads at a time [s], as loads without histories."""
         traction = tuple(load.at(time) for load in self.traction)
         gravity = history.value_at(self.gravity, time, self.times, self.history)
         return replace(self, gravity=gravity, traction=traction, times=None, history=None)
@@ -103,18 +106,20 @@ class Loads(Physics):
 
 @struct
 class Loading(NodalForce):
-    """Loads during a step."""
+    """Force term of the loads, for one step."""
 
     dead: jax.Array = param("N", "(V, 3)")
-    traction: tuple[Traction, ...] = param("1", "tractions; pressures among them follow the body")
+    traction: tuple[Traction, ...] = param("1", "tractions and follower pressures on the surface")
     k: Number = param("1", "number of the step")
     steps: int = static(default=1, about="of the run")
-    growth: str = static(default="none", about="steps: with the load steps; first: within the first step; none")
+    growth: str = static(
+        default="none", about="the loads grow with the load steps (steps), in the first step (first), or not (none)"
+    )
     before: "Loading | None" = param("1", "loads at the beginning of the step, if there is a history", default=None)
 
     @property
     def conservative(self) -> bool:  # type: ignore[override]
-        """Whether no pressure follows the body."""
+        """Whether the loads have an energy: true if there are no follower pressures."""
         return not follows(self.traction)
 
     def fraction(self, s: Number) -> Any:
@@ -135,17 +140,17 @@ class Loading(NodalForce):
         return -outer
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Minus the work of the dead loads."""
+        """Energy [J]: minus the work of the dead loads."""
         return -jnp.vdot(self.fraction(jnp.ones((), x.dtype)) * self.dead, x - mesh.points)
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """Energy of the loads. Pressures keep the nodal forces that they have at `start`."""
+        """Energy [J] of the loads. Follower pressures keep the nodal forces that they have at `start`."""
         if self.conservative:
             return self.energy(mesh, x)
         return jnp.vdot(self.force(mesh, start, jnp.ones((), x.dtype)), x - start)
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
-        """Change of the forces of the pressures only: dead loads do not change."""
+        """Change (V, 3) [N] of the forces of the follower pressures. Dead loads do not change."""
         if self.before is not None:
             end = replace(self, before=None)
             return s * end.product(mesh, x, s, dx) + (1 - s) * self.before.product(mesh, x, s, dx)

@@ -1,16 +1,18 @@
-"""A sponge in parallel to the law: Kerdok-Hencky volumetric stress and Darcy diffusion (book chapter, section 4.3).
+"""A porous body: Kerdok-Hencky volumetric stress and Darcy flow, in parallel to the law (book chapter, section 4.3).
 
     sigma_p = sigma_Heq(J) - P,   (1/K_lim) dP/dt = kappa lap P - (dJ/dt)/J
 
-The fluid has a pressure P at the nodes. sigma_Heq = K0 r_w ln((r_w + J - 1)/r_w). Below J0 = 1 - r_w + r_w K0/K_lim it
-is the tangent line at J0, of slope K_lim. (The chapter prints J0 without the factor r_w: then the slope would be r_w
-K_lim.) The pressure equation uses the volumes at the beginning of a step, so that it is linear in P. There are two
-schemes:
+sigma_p is the volumetric stress, J the volume ratio, P the pressure of the fluid at the nodes, kappa the permeability,
+and lap the Laplacian. The Kerdok-Hencky stress is sigma_Heq = K0 r_w ln((r_w + J - 1)/r_w), with the drained bulk
+modulus K0 and the fluid fraction r_w. Below J0 = 1 - r_w + r_w K0/K_lim it is replaced by its tangent line at J0, which
+has the slope K_lim. (The chapter prints J0 without the factor r_w. The slope would then be r_w K_lim.) The pressure
+equation uses the volumes at the beginning of a step, so that it is linear in P. There are two schemes:
 
-* "implicit": P at the end of the step follows from the volume change of the same step. P = P(x) is eliminated. The
-  problem in x is symmetric, and it is stable for any step. Newton's direction comes from the coupled matrix of (x, P).
-* "lagged": P follows from the volume change of the previous step, as in the chapter. It is conditionally stable. The
-  old name "chapter" is accepted.
+* "implicit": P at the end of the step follows from the volume change of the same step. P is a function of the positions
+  x and is eliminated. The problem in x is symmetric, and stable for any time step. Newton's direction comes from the
+  coupled matrix of (x, P).
+* "lagged": P follows from the volume change of the previous step, as in the chapter. This scheme is conditionally
+  stable. The old name "chapter" is accepted.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -38,7 +40,7 @@ SCHEMES = ("implicit", "lagged")
 
 @struct
 class Inlet:
-    """A place with a given pressure of the fluid, or a part of the surface with a given flux."""
+    """A set of nodes with a given pressure of the fluid, or a part of the surface with a given flux."""
 
     nodes: Indices | None = param("1", "nodes with the given pressure (n,)", lower=0, default=None)
     pressure: Number | None = param("Pa", "of the fluid at the nodes", default=None)
@@ -54,17 +56,19 @@ class Inlet:
 
 @struct
 class Porosity(Physics):
-    """A sponge of bulk modulus K0, filled with a fluid. The fluid fills the fraction r_w of its volume."""
+    """A porous body with the drained bulk modulus K0. A fluid fills the fraction r_w of its volume."""
 
-    bulk: Number = param("Pa", "K0, bulk modulus of the drained sponge at rest", above=0.0)
-    limit_bulk: Number = param("Pa", "K_lim, bulk modulus of the compressed sponge and for the pressure", above=0.0)
+    bulk: Number = param("Pa", "K0, bulk modulus of the drained body at small strain", above=0.0)
+    limit_bulk: Number = param("Pa", "K_lim, bulk modulus of the compressed body and of fluid storage", above=0.0)
     fluid_fraction: Number = param("1", "r_w", above=0.0, upper=1.0)
     permeability: Number = param("m^4/(N s)", "kappa", lower=0.0)
     drained: Indices | None = param("1", "nodes where P = 0 (n,); None: sealed", lower=0, default=None)
     inlet: tuple[Inlet, ...] = param("1", "given pressures and fluxes", default=())
-    initial_pressure: Number | None = param("Pa", "of the fluid at the beginning; None: 0", default=None)
-    scheme: str = static(default="implicit", about="implicit or lagged (the chapter's)", words=SCHEMES)
-    keep_bulk: bool = static(default=False, about="keep the law's volumetric energy in addition to the sponge")
+    initial_pressure: Number | None = param("Pa", "pressure of the fluid at the beginning; None: 0", default=None)
+    scheme: str = static(default="implicit", about="implicit, or lagged as in the chapter", words=SCHEMES)
+    keep_bulk: bool = static(
+        default=False, about="keep the law's volumetric energy in addition to that of the porous body"
+    )
 
     def __post_init__(self) -> None:
         """Replace the old name of a scheme by the new one."""
@@ -72,11 +76,11 @@ class Porosity(Physics):
             object.__setattr__(self, "scheme", "lagged")
 
     def begin(self, start: Start) -> "Fluid":
-        """The fluid at the beginning of a run: the initial pressure and the reference volumes."""
+        """State of the fluid at the beginning of a run: the initial pressure and the reference volumes."""
         return initial_fluid(self, start.mesh)
 
     def freeze(self, memory: "Fluid", step: Step) -> "Sponge":
-        """Make the pressure equation. It is solved here if it does not depend on the end of the step."""
+        """Assemble the pressure equation. The lagged scheme solves it here: it does not depend on the step's end."""
         F = deformation_gradient(step.mesh, step.x)
         found = darcy.flow(self, step.mesh, memory.J, F, step.dt, 1e-2 * step.tolerance)
         if self.inlet:
@@ -91,27 +95,27 @@ class Porosity(Physics):
         return Fluid(end.pressure, determinant(end.F), memory.J if self.scheme == "lagged" else None)
 
     def bulk_modulus(self) -> Number:
-        """Bulk modulus of the drained sponge."""
+        """Bulk modulus [Pa] of the drained body."""
         return self.bulk
 
     def output(self, memory: "Fluid") -> dict[str, jax.Array]:
-        """The fluid's pressure (V,) [Pa], by its name."""
+        """Pressure (V,) [Pa] of the fluid, under the name `pressure`."""
         return {"pressure": memory.pressure}
 
 
 class Fluid(NamedTuple):
     """Pressure and volume ratios at the end of a step: the memory of the fluid."""
 
-    pressure: jax.Array  # P of the vertices (V,) [Pa]
+    pressure: jax.Array  # P at the vertices (V,) [Pa]
     J: jax.Array  # volume ratios at every integration point
     J_before: jax.Array | None  # J one step earlier; only for the lagged scheme
 
 
 def check_porosity(porosity: Porosity) -> None:
-    """Refuse values that no step can use; host side.
+    """Check on the host that a step can use the values.
 
     Raises:
-        InputError: unknown scheme, values out of bounds, K_lim not above K0, an inlet without a complete condition.
+        InputError: unknown scheme, values out of bounds, K_lim not above K0, an inlet with an incomplete condition.
     """
     check_sponge(porosity)
     for k, inlet in enumerate(porosity.inlet):
@@ -120,11 +124,11 @@ def check_porosity(porosity: Porosity) -> None:
         if (inlet.pressure is None) == (inlet.flux is None):
             raise InputError(f"{name} needs either pressure in Pa or flux in m/s: give one of them")
         if (inlet.nodes is None) != (inlet.pressure is None) or (inlet.triangles is None) != (inlet.flux is None):
-            raise InputError(f"{name} needs nodes with a pressure, triangles with a flux: give those")
+            raise InputError(f"{name} needs nodes for a pressure, or triangles for a flux: give them")
 
 
 def check_sponge(porosity: Porosity) -> None:
-    """Refuse parameters of a sponge that no step can use. Traced parameters pass.
+    """Check the parameters of the porous body. Traced parameters pass.
 
     Raises:
         InputError: values out of bounds, K_lim not above K0.
@@ -134,7 +138,7 @@ def check_sponge(porosity: Porosity) -> None:
 
 
 def check_limit(porosity: Porosity) -> None:
-    """Refuse a sponge that does not stiffen under compression. Traced parameters pass.
+    """Check that the porous body stiffens under compression. Traced parameters pass.
 
     Raises:
         InputError: K_lim not above K0.
@@ -145,15 +149,15 @@ def check_limit(porosity: Porosity) -> None:
     if np.any(limit <= bulk):
         k = int(np.argmax(limit - bulk <= 0))
         raise InputError(
-            f"porosity limit_bulk = {limit.flat[k]:g} must be above bulk = {bulk.flat[k]:g}: a sponge stiffens"
+            f"porosity limit_bulk = {limit.flat[k]:g} must be above bulk = {bulk.flat[k]:g}: a porous body stiffens"
         )
 
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:
-    """The law that acts in parallel to the sponge.
+    """The law that acts in parallel to the porous body.
 
-    Its summands have no volumetric energy U(J), since the bulk modulus would count twice. With `keep_bulk` they keep
-    it. A law that does not separate volume change from shear is not changed.
+    The volumetric energy U(J) of the law is removed, since the bulk modulus would count twice. It stays if `keep_bulk`
+    is true. A law that does not separate volume change from shear is not changed.
     """
     if porosity is None or porosity.keep_bulk:
         return law
@@ -162,21 +166,21 @@ def law_in_force(porosity: Porosity | None, law: Law) -> Law:
 
 def bulk_in_force(porosity: Porosity, law: Law) -> str:
     """One sentence that says which bulk modulus acts."""
-    sponge = f"bulk modulus in force: the sponge's, {float(porosity.bulk):g} Pa"
+    sponge = f"bulk modulus in use: that of the porous body, {float(porosity.bulk):g} Pa"
     if porosity.keep_bulk:
-        return f"{sponge}, and the law's own (keep_bulk)"
+        return f"{sponge}, plus that of the law (keep_bulk)"
     parts = [part for own in law.pieces() for part in own.summands()]
     whole = [part for part in parts if isochoric_part(part) is None and part.without_volume() is not None]
     if not whole:
-        return f"{sponge}; the law's own volumetric energy is off"
+        return f"{sponge}; the volumetric energy of the law is not used"
     names = " and ".join(dict.fromkeys(type(getattr(part, "law", part)).__name__ for part in whole))
     changed = any(part.without_volume() is not part for part in parts)
-    off = "; the separate volumetric energy is off" if changed else ""
-    return f"{sponge}, and the part of {names} that is not separate from shear{off}"
+    off = "; the separate volumetric energy is not used" if changed else ""
+    return f"{sponge}, plus the part of {names} that is not separate from shear{off}"
 
 
 def volumetric_stress(porosity: Porosity, J: Number) -> Number:
-    """sigma_Heq(J) [Pa]: Hencky's logarithm above J0, and its tangent line below J0. It is finite for every J."""
+    """Stress sigma_Heq(J) [Pa]: Hencky's logarithm above J0, its tangent line below J0. It is finite for every J."""
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
     logarithm = K0 * r_w * jnp.log1p((jnp.maximum(J, J0) - 1) / r_w)
@@ -184,14 +188,14 @@ def volumetric_stress(porosity: Porosity, J: Number) -> Number:
 
 
 def volumetric_slope(porosity: Porosity, J: Number) -> jax.Array:
-    """d sigma_Heq / dJ [Pa]."""
+    """Derivative d sigma_Heq / dJ [Pa]."""
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
     return jnp.where(J > J0, K0 / (1 + (jnp.maximum(J, J0) - 1) / r_w), K_lim)
 
 
 def volumetric_energy(porosity: Porosity, J: Number) -> Number:
-    """The integral of sigma_Heq from 1 to J [Pa].
+    """Volumetric energy density [Pa]: the integral of sigma_Heq from 1 to J.
 
     It is K0 r_w^2 (u ln u - u + 1) with u = (r_w + J - 1)/r_w, and a parabola below J0.
     """
@@ -203,7 +207,7 @@ def volumetric_energy(porosity: Porosity, J: Number) -> Number:
 
 
 def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
-    """The fluid with the initial pressure (0 if None) and the reference volumes."""
+    """State of the fluid with the initial pressure (0 if None) and the reference volumes."""
     J = jnp.ones_like(mesh.weights)
     start = 0.0 if porosity.initial_pressure is None else porosity.initial_pressure
     return Fluid(jnp.full(mesh.number_of_vertices, start, J.dtype), J, J if porosity.scheme == "lagged" else None)
@@ -226,7 +230,7 @@ def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple
 def pressure(
     porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: jax.Array, guess: darcy.Guess | None = None
 ) -> jax.Array:
-    """P (V,) [Pa] at the end of a step with volume ratios J_end (E,) at its end."""
+    """Pressures P (V,) [Pa] at the end of a step, for the volume ratios J_end (E,) there."""
     before: Any = fluid.J_before
     increment = fluid.J - before if porosity.scheme == "lagged" else J_end - fluid.J
     b = flow.store * fluid.pressure - integrals(mesh, increment)
@@ -234,7 +238,10 @@ def pressure(
 
 
 def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: jax.Array) -> jax.Array:
-    """b . P / 2 [J], with P = A^-1 b the pressure at the end of a step and J_end (E,) the volume ratios there."""
+    """Energy b . P / 2 [J] of the fluid, with the pressures P = A^-1 b at the end of a step.
+
+    J_end (E,) are the volume ratios at the end of the step.
+    """
     b = flow.store * fluid.pressure - integrals(mesh, J_end - fluid.J)
     P = pressure(porosity, mesh, fluid, flow, J_end)
     if flow.given is None:
@@ -243,23 +250,23 @@ def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_
 
 
 def first_piola(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Matrix:
-    """(sigma_Heq(J) - P) cof F [Pa], with P linear in every element."""
+    """First Piola-Kirchhoff stress (sigma_Heq(J) - P) cof F [Pa], with P linear in every element."""
     sigma = volumetric_stress(porosity, determinant(F)) - interpolated(mesh, P)
     return tuple(tuple(sigma * c for c in row) for row in cofactor(F))
 
 
 class Sponge(VolumeStress):
-    """Sponge and fluid during a step."""
+    """Force term of the porous body and its fluid, for one step."""
 
     porosity: Porosity
     fluid: Fluid
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
-        """See `first_piola`."""
+        """First Piola-Kirchhoff stress [Pa], computed by `first_piola`."""
         return first_piola(self.porosity, mesh, pressure, F)
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """sigma_Heq(J) - P and its slope at given pressure."""
+        """Volumetric stress sigma_Heq(J) - P [Pa], and its derivative with respect to J at given pressure P."""
         J = determinant(F)
         stress = volumetric_stress(self.porosity, J) - interpolated(mesh, pressure)
         return Scalars({"J": stress}, {("J", "J"): volumetric_slope(self.porosity, J)})
@@ -267,14 +274,14 @@ class Sponge(VolumeStress):
 
 @struct
 class CoupledSponge(Sponge):
-    """Sponge and fluid during a step, with the pressure at the end of the step as an unknown."""
+    """Force term of the implicit scheme: the pressure depends on the positions at the end of the step."""
 
     porosity: Porosity = param("1", "its numbers")
-    fluid: Fluid = param("1", "at the beginning of the step")
-    flow: Flow = param("1", "the equation of the pressure")
+    fluid: Fluid = param("1", "state of the fluid at the beginning of the step")
+    flow: Flow = param("1", "pressure equation of the step")
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: darcy.Guess | None = None) -> jax.Array:
-        """Pressures from the volume change of this step."""
+        """Pressures (V,) [Pa] from the volume change of this step."""
         return pressure(self.porosity, mesh, self.fluid, self.flow, J, guess)
 
     def in_force(self, pressure: jax.Array) -> jax.Array:
@@ -283,37 +290,37 @@ class CoupledSponge(Sponge):
         return free if self.flow.given is None else free + self.flow.given
 
     def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
-        """Residual (V,) [m^3] of the pressure equation, 0 at a solution.
+        """Residual (V,) [m^3] of the pressure equation; 0 at a solution.
 
-        At nodes with a given pressure: minus its error.
+        At nodes with a given pressure, it is the given pressure minus `pressure`.
         """
         b = self.flow.store * self.fluid.pressure - integrals(mesh, J - self.fluid.J)
         return darcy.lack(self.flow, b, pressure)
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """Matrix of storage and flow; it is positive."""
+        """Matrix [m^3/Pa] of storage and flow; it is positive definite."""
         return self.flow.matrix
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Energy of the sponge and of the fluid that leaves it."""
+        """Energy [J] of the porous body and of the fluid that leaves it."""
         density = volumetric_energy(self.porosity, J)
         return jnp.sum(mesh.weights * density) + fluid_energy(self.porosity, mesh, self.fluid, self.flow, J)
 
 
 @struct
 class LaggedSponge(Sponge):
-    """Sponge and fluid during a step, with a pressure that is known at the beginning of the step."""
+    """Force term of the lagged scheme: the pressure is known at the beginning of the step."""
 
     coupled: ClassVar[bool] = False
     porosity: Porosity = param("1", "its numbers")
-    fluid: Fluid = param("1", "at the beginning of the step")
+    fluid: Fluid = param("1", "state of the fluid at the beginning of the step")
     given: jax.Array = param("Pa", "the pressure (V,)")
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: darcy.Guess | None = None) -> jax.Array:
-        """The known pressures, which do not depend on the end of the step."""
+        """Known pressures (V,) [Pa], which do not depend on the end of the step."""
         return self.given
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Energy of the sponge, and work of the fluid's pressure."""
+        """Energy [J] of the porous body, minus the work of the known fluid pressure."""
         density = volumetric_energy(self.porosity, J)
         return jnp.sum(mesh.weights * (density - interpolated(mesh, self.given) * J))

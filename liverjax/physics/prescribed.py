@@ -1,4 +1,4 @@
-"""Prescribed motion: nodes that are held, and nodes that are moved."""
+"""Prescribed motion: fixed nodes, and nodes with a given displacement."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ class Fixed:
 
 @struct
 class Displaced:
-    """Nodes with a prescribed motion: it grows linearly to `by` at the last step, or follows a history."""
+    """Nodes with a prescribed displacement. It grows linearly to `by` at the last step, or follows a history."""
 
     nodes: Indices = param("1", "node numbers (n,)", lower=0)
     by: Numbers | None = param("m", "displacement (3,), or one per node (n, 3), reached at the last step", default=None)
@@ -33,19 +33,19 @@ class Displaced:
 
 
 def check_axes(axes: object, name: str) -> None:
-    """Refuse a value that does not name axes.
+    """Check that a value names axes.
 
     Raises:
-        InputError: one sentence that begins with `name`.
+        InputError: another value. The message begins with `name`.
     """
     if not isinstance(axes, str) or not axes or set(axes) - set(AXES) or len(set(axes)) != len(axes):
         raise InputError(f"{name} axes = {axes!r} is not known: give some of the letters xyz")
 
 
 def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
-    """Degrees of freedom (V, 3): 1 if unknown, 0 if held or prescribed."""
+    """Mask (V, 3) of the degrees of freedom: 1 if unknown, 0 if fixed or prescribed."""
     if not any(isinstance(condition.nodes, jax.core.Tracer) for condition in (*fixed, *displaced)):
-        return jnp.asarray(free_places(mesh, fixed, displaced), mesh.points.dtype)  # no small programs to compile
+        return jnp.asarray(free_places(mesh, fixed, displaced), mesh.points.dtype)  # avoids compiling small programs
     mask = jnp.ones(mesh.points.shape, mesh.points.dtype)
     for condition in (*fixed, *displaced):
         axes = np.array([AXES.index(axis) for axis in condition.axes])
@@ -54,7 +54,7 @@ def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
 
 
 def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
-    """`free_degrees` as a host array (V, 3), for checks: True if unknown."""
+    """Mask (V, 3) of the degrees of freedom as a host array, for checks: True if unknown."""
     free = np.ones(mesh.points.shape, bool)
     for condition in (*fixed, *displaced):
         for axis in condition.axes:
@@ -67,7 +67,7 @@ def prescribed(mesh: TetMesh, displaced: tuple, time: Number, fraction: Number) 
 
     Args:
         time: time [s], for histories.
-        fraction: finished fraction of the run, for `by`.
+        fraction: completed fraction of the run, for `by`.
     """
     u = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for condition in displaced:

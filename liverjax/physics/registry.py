@@ -1,4 +1,4 @@
-"""The physics that act in a scene, in order, and the physics that scene files can add."""
+"""All physics that act in a scene, in their order, and the physics that scene files can add."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.physics.volumes.averaged import AveragedVolume
 from liverjax.physics.volumes.mixed import MixedVolume
 
-#: Physics that have a table in scene files. A new physics needs a line here.
+#: Physics with a table in scene files. Add every new physics of this kind here.
 NAMED: tuple[type[Physics], ...] = (
     ElasticSupport,
     SlidingSupport,
@@ -34,12 +34,12 @@ NAMED: tuple[type[Physics], ...] = (
 
 
 def law_at_rest(scene: Any) -> Law:
-    """The law of the body at rest. With a sponge it has no volumetric energy, unless the sponge has `keep_bulk`."""
+    """The law of the body without viscosity. With porosity it has no volumetric energy, except with `keep_bulk`."""
     return porosity.law_in_force(scene.porosity, scene.law)
 
 
 def physics_of(scene: Any) -> tuple[Physics, ...]:
-    """All physics that act in a `liverjax.scenes.scene.Scene`."""
+    """Return all physics that act in a `liverjax.scenes.scene.Scene`."""
     law, averaged, mixed = law_at_rest(scene), scene.solve.volumetric == "nodal", scene.solve.volumetric == "mixed"
     if averaged or mixed:
         law = isochoric_part(scene.law)

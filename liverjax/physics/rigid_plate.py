@@ -1,9 +1,10 @@
-"""A rigid plate: nodes that rotate about an axis as one body. The angle or the torque is given over time.
+"""A rigid plate: nodes that rotate about an axis as one body. The angle or the torque is given as a function of time.
 
-The nodes of the plate have only two motions: the rotation, and the displacement along the axis if it is free. The
-unknowns stay nodal vectors. The field b = e x (x - c) / R of the plate's nodes represents the rotation. Here x are the
-positions of the nodes at the beginning of a step, and R^2 is the sum of their squared distances from the axis. A field
-a b means the angle a / R. The positions follow circles exactly, so angles may be large.
+The nodes of the plate have only two motions: the rotation, and the displacement along the axis if this is free. The
+unknowns of the solver are still nodal vectors. The nodal field b = e x (x - c) / R represents the rotation. Here e is
+the direction of the axis and c a point of the axis. x are the positions of the plate's nodes at the beginning of a
+step, and R^2 is the sum of their squared distances from the axis. The nodal field a b, with a number a, represents a
+rotation by the angle a / R. The nodes move exactly on circles, so angles may be large.
 """
 
 from collections.abc import Callable
@@ -24,10 +25,10 @@ class RigidPlate(Physics):
     """Nodes that rotate about an axis as one body."""
 
     nodes: jax.Array = param("1", "node numbers (n,)", lower=0)
-    turn: Number = param("rad or N m", "angle or torque; a number, or at times of a history (T,), linear in between")
+    turn: Number = param("rad or N m", "angle or torque: one number, or values (T,) of a history, linear in between")
     times: Numbers | None = param(
         "s",
-        "increasing times of the history (T,); None: the turn is constant; a torque grows with load steps",
+        "increasing times of the history (T,); None: the turn is constant, but a torque grows with load steps",
         default=None,
     )
     axis: jax.Array = param("1", "direction of the axis (3,), of length 1", default=(0.0, 0.0, 1.0))
@@ -42,28 +43,28 @@ class RigidPlate(Physics):
     ties: ClassVar[bool] = True
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse wrong node numbers, a wrong axis and a wrong history."""
+        """Raise InputError for wrong node numbers, a wrong axis or a wrong history."""
         numbers, turn = np.asarray(self.nodes), np.asarray(self.turn)
         times = np.zeros(()) if self.times is None else np.asarray(self.times)
         if numbers.size < 2 or numbers.max() >= mesh.number_of_nodes:
             raise InputError(
-                f"{name} names fewer than two nodes or one beyond {mesh.number_of_nodes - 1}: renumber them"
+                f"{name} has fewer than two nodes, or a node number above {mesh.number_of_nodes - 1}: correct the nodes"
             )
         if abs(np.linalg.norm(np.asarray(self.axis)) - 1) > 1e-6:
             raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
         if times.shape != turn.shape or (times.ndim and (np.diff(times) <= 0).any()):
-            raise InputError(f"{name} needs ascending times and the same number of values of turn: correct its history")
+            raise InputError(f"{name} needs ascending times and one value of turn for each time: correct its history")
         arms = self.at_rest(mesh).arms(mesh.points)
         if not np.abs(np.asarray(arms)).max() > 1e-9 * np.ptp(np.asarray(mesh.points)):
-            raise InputError(f"{name} has all its nodes on its axis: name more nodes, or move the centre")
+            raise InputError(f"{name} has all its nodes on its axis: add nodes, or move the centre")
 
     def at_rest(self, mesh: TetMesh) -> "Plate":
-        """The plate's nodes in the reference positions."""
+        """The nodes of the plate in their reference positions."""
         X, zero = mesh.points[self.nodes], jnp.zeros((), mesh.points.dtype)
         return Plate(self, X, X, zero, zero)
 
     def tied(self, step: Step) -> "Plate":
-        """The plate's nodes during a step."""
+        """The nodes of the plate during a step."""
         before = after = jnp.asarray(self.turn)
         if self.times is None and self.by == "torque" and step.dt is None:
             # A torque grows with the load steps like other loads.
@@ -73,15 +74,15 @@ class RigidPlate(Physics):
         return Plate(self, step.mesh.points[self.nodes], step.x[self.nodes], before, after)
 
     def freeze(self, memory: None, step: Step) -> "Torque | None":
-        """The torque of the step; None if the angle is given, since an angle adds no force."""
+        """Force term of the torque, for one step. Returns None if the angle is given, since an angle adds no force."""
         if self.by == "angle":
             return None
         return Torque(plate=self.tied(step))
 
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "RigidPlate":
-        """The plate with the nodes that the richer mesh adds between its nodes.
+        """Return the plate with the nodes that the mesh of higher order adds between the nodes of the plate.
 
-        Cubic functions are not nodes: they have no position. A rigid motion does not need them.
+        Cubic functions are not nodes and have no position. A rigid motion of the plate does not contain them.
         """
         nodes = more(self.nodes)
         return replace(self, nodes=nodes) if mesh.order < 3 else replace(self, still=nodes[len(self.nodes) :])
@@ -91,7 +92,11 @@ class RigidPlate(Physics):
         return free if self.still is None else free._replace(mask=free.mask.at[self.still].set(0.0))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """The plate is held across its axis; along it if `lifts` is false; against rotation if the angle is given."""
+        """Return nodes and the directions in which the plate constrains them.
+
+        These are two directions perpendicular to the axis. The direction of the axis is added if `lifts` is false, and
+        the direction of rotation is added if the angle is given.
+        """
         nodes, arms = np.asarray(self.nodes), np.asarray(self.at_rest(mesh).arms(mesh.points))
         across = np.linalg.svd(np.asarray(self.axis)[None], full_matrices=True)[2][1:]
         first = [nodes[:1], nodes[:1]] + ([] if self.lifts else [nodes[:1]])
@@ -106,13 +111,13 @@ class Plate(NamedTuple):
     """The nodes of a plate during a step."""
 
     plate: RigidPlate
-    reference: jax.Array  # (n, 3) [m]
+    reference: jax.Array  # (n, 3) [m] reference positions
     carrier: jax.Array  # (n, 3) [m] positions at the beginning of the step, which define the field b
     before: jax.Array  # angle [rad] or torque [N m] at the beginning of the step
     after: jax.Array  # angle or torque at the end of the step
 
     def arms(self, x: jax.Array) -> jax.Array:
-        """e x (x - c) of the plate's nodes (n, 3) [m] in positions x (V, 3)."""
+        """Vectors e x (x - c) (n, 3) [m] of the plate's nodes at positions x (V, 3)."""
         return self._arms(x[self.plate.nodes])
 
     def _arms(self, x: jax.Array) -> jax.Array:
@@ -123,11 +128,11 @@ class Plate(NamedTuple):
 
     @property
     def radius(self) -> jax.Array:
-        """R [m], the root of the sum of squared distances from the axis."""
+        """Radius R [m]: the square root of the sum of the squared distances from the axis."""
         return jnp.linalg.norm(self._arms(self.reference))
 
     def angle(self, x: jax.Array) -> jax.Array:
-        """Angle [rad] of the plate in positions x (V, 3), between -pi and pi."""
+        """Angle [rad] of the plate at positions x (V, 3), between -pi and pi."""
         e, (old, new) = self._axis(x), (self._arms(self.reference), self.arms(x))
         return jnp.arctan2(jnp.sum(jnp.cross(old, new) @ e), jnp.sum(old * new))
 
@@ -140,7 +145,10 @@ class Plate(NamedTuple):
         return jnp.sum(self.arms(x) * f[self.plate.nodes])
 
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
-        """See `liverjax.physics.base.Tied`."""
+        """If the angle is given, set the mask (V, 3) to 0 at the plate's nodes.
+
+        If the plate can also move along its axis, this axis is written into `axes` (V, 3) at these nodes.
+        """
         if self.plate.by == "torque":
             return mask, axes
         nodes = self.plate.nodes
@@ -149,8 +157,11 @@ class Plate(NamedTuple):
         return mask.at[nodes].set(0.0), axes
 
     def rigid(self, x: jax.Array, velocity: jax.Array, acceleration: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """See `liverjax.physics.base.Tied`. Newmark's method for every node by itself would not find the acceleration
-        towards the axis: its error would change its sign in every step, and grow."""
+        """Replace velocity and acceleration (V, 3) of the plate's nodes by those of a rigid motion.
+
+        Newmark's method applied to each node separately would not find the acceleration towards the axis. The error
+        would change sign in every step, and grow.
+        """
         if self.plate.by == "angle":
             return velocity, acceleration
         nodes, axis, arms = self.plate.nodes, self._axis(x), self.arms(x)
@@ -165,7 +176,7 @@ class Plate(NamedTuple):
         return velocity, acceleration.at[nodes].set(growth * arms + towards + up)
 
     def spread(self, field: jax.Array, turn: Number, lift: Number) -> jax.Array:
-        """The field (V, 3) with the plate's rows computed from the amplitudes of its two motions."""
+        """The field (V, 3), with the rows of the plate's nodes computed from the amplitudes of the two motions."""
         rows = turn * self._arms(self.carrier) / self.radius
         if self.plate.lifts:
             rows = rows + lift * self._axis(field)[None] / len(self.reference) ** 0.5
@@ -178,7 +189,7 @@ class Plate(NamedTuple):
         return turn, jnp.sum(rows @ self._axis(field)) / len(self.reference) ** 0.5
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """The part of a field (V, 3) along the free motions. For forces it depends on the positions x (V, 3)."""
+        """Project a field (V, 3) onto the plate's free motions. For forces this depends on the positions x (V, 3)."""
         return self.spread(field, *self.amplitudes(field, self._arms(self.carrier) if x is None else self.arms(x)))
 
     def given(self, s: Number) -> jax.Array:
@@ -191,7 +202,7 @@ class Plate(NamedTuple):
         return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Positions (V, 3) [m] from a field, at fraction s of the step."""
+        """Positions (V, 3) [m] from a field with the plate's unknowns, at fraction s of the step."""
         turn, lift = self.amplitudes(field, self._arms(self.carrier))
         angle = turn / self.radius if self.plate.by == "torque" else self.given(s)
         return self.moved(field, angle, lift / len(self.reference) ** 0.5)
@@ -199,7 +210,8 @@ class Plate(NamedTuple):
     def moved(self, field: jax.Array, angle: Number, lift: Number) -> jax.Array:
         """The field (V, 3) with the positions of the plate's nodes at an angle [rad] and an axial displacement [m]."""
         axis, arms = self._axis(field)[None], self._arms(self.reference)
-        # The rotation adds to x - c: sin(a) times its arm, and cos(a) - 1 times its part across the axis.
+        # Rotation by the angle a (Rodrigues): r = x - c changes by sin(a) e x r, plus cos(a) - 1 times the part of r
+        # perpendicular to the axis e.
         rows = self.reference + jnp.sin(angle) * arms + (jnp.cos(angle) - 1) * jnp.cross(arms, axis)
         if self.plate.lifts:
             rows = rows + lift * axis
@@ -208,15 +220,15 @@ class Plate(NamedTuple):
 
 @struct
 class Torque(NodalForce):
-    """The torque of a plate during a step, as forces on its nodes along their circles."""
+    """Force term of the torque, for one step: forces on the plate's nodes, tangential to their circles."""
 
     plate: Plate = param("1", "its nodes")
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Minus the forces on the nodes; the moment of these forces is the torque."""
+        """Minus the forces (V, 3) [N] on the nodes. The moment of the forces about the axis is the torque."""
         rows = -self.plate.given(s) * self.plate.arms(x) / self.plate.radius**2
         return jnp.zeros_like(x).at[self.plate.plate.nodes].set(rows)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Minus torque times angle."""
+        """Energy [J]: minus torque times angle."""
         return -self.plate.after * self.plate.angle(x)

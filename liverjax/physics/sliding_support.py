@@ -13,7 +13,7 @@ from liverjax.mesh import selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Physics
 
-#: Nodes count as in one plane if their distance from it, over the extent of the nodes, is at most this.
+#: Nodes count as coplanar if their distance from the plane, divided by the extent of the nodes, is at most this.
 _FLAT = 1e-6
 
 
@@ -22,7 +22,7 @@ class SlidingSupport(Physics):
     """Nodes that do not move along the normal of a plane. The normal is a coordinate axis or any direction."""
 
     nodes: Indices = param("1", "node numbers (n,)", lower=0)
-    normal: Numbers | None = param("1", "of the plane (3,), of length 1; not used with an axis", default=None)
+    normal: Numbers | None = param("1", "unit normal of the plane (3,); not used with an axis", default=None)
     axis: str = static(default="", about="x, y or z if the normal is that axis", words=("", *selection.AXES))
 
     section: ClassVar[str] = "support"
@@ -33,53 +33,54 @@ class SlidingSupport(Physics):
         """Read [[support]] with `sliding = true`: the nodes define the plane."""
         if table["sliding"] is not True:
             raise InputError(
-                f"{name} sliding = {table['sliding']!r} is not true: write sliding = true, or leave it out"
+                f"{name} sliding = {table['sliding']!r} is not true: write sliding = true, or remove sliding"
             )
         nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
         return on_plane(mesh, nodes, name)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse wrong node numbers and a missing direction."""
+        """Raise InputError for wrong node numbers or a missing direction."""
         selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
         bounds.check_shape(f"{name}.normal", self.normal, (3,))
         if not self.axis and (self.normal is None or abs(np.linalg.norm(np.asarray(self.normal)) - 1) > 1e-6):
             raise InputError(f"{name} normal = {self.normal} must be of length 1: divide it by its length")
 
     def constrain(self, free: Free) -> Free:
-        """The free directions without the normal direction at the nodes."""
+        """Remove the normal direction at the nodes from the free directions."""
         if self.axis:
             return free._replace(mask=free.mask.at[self.nodes, selection.AXES.index(self.axis)].set(0.0))
         normals = jnp.zeros_like(free.mask) if free.normals is None else free.normals
         normal = jnp.asarray(self.normal, free.mask.dtype)[None]
-        # A node that is held along all axes of the normal is already held along the normal.
+        # A node that is fixed along all axes of the normal is already fixed along the normal.
         loose = jnp.max(free.mask[self.nodes] * (jnp.abs(normal) > 1e-12), axis=1, keepdims=True)
         return free._replace(normals=normals.at[self.nodes].set(loose * normal))
 
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "SlidingSupport":
-        """The support with the nodes that the richer mesh adds between its nodes."""
+        """The support with the nodes that the mesh of higher order adds between the nodes of the support."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held along the normal."""
+        """Return the nodes, each with the normal along which it is constrained."""
         nodes = np.asarray(self.nodes)
         normal = np.eye(3)[selection.AXES.index(self.axis)] if self.axis else np.asarray(self.normal)
         return nodes, np.tile(normal, (len(nodes), 1))
 
 
 def on_plane(mesh: TetMesh, nodes: np.ndarray, name: str = "support") -> SlidingSupport:
-    """A sliding support of nodes (n,) that lie in one plane. The normal is computed from the nodes.
+    """Create a sliding support of nodes (n,) that lie in one plane. The normal is computed from the nodes.
 
     Raises:
-        InputError: nodes that span no plane, or that do not lie in one plane.
+        InputError: the nodes do not span a plane, or do not lie in one plane.
     """
     points = np.asarray(mesh.points)[nodes]
     size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[1:]
     if len(points) < 3 or size[1] <= _FLAT * size[0]:
-        raise InputError(f"{name} where meets nodes that span no plane: widen it to a whole face")
+        raise InputError(f"{name} where selects nodes that do not span a plane: enlarge the region to a whole face")
     off = np.abs((points - points.mean(axis=0)) @ axes[2]).max()
     if off > _FLAT * size[0]:
         raise InputError(
-            f"{name} where meets nodes up to {off:.3g} m off one plane: choose a plane part of the surface, or several"
+            f"{name} where selects nodes up to {off:.3g} m off one plane: select a plane part of the surface, or "
+            "write several supports"
         )
     numbers = jnp.asarray(nodes, jnp.int32)
     along = np.flatnonzero(np.abs(np.abs(axes[2]) - 1) < _FLAT**2 + 1e-12)

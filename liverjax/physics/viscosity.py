@@ -1,14 +1,16 @@
 """Prony viscohyperelasticity (book chapter, section 4.2): S_v = S_h - sum_k gamma_k.
 
-The memory of mode k is the symmetric tensor gamma_k. Two schemes advance it. Both have the form gamma^n = a S^n + c
-S^(n-1) + b gamma^(n-1):
+S_v is the second Piola-Kirchhoff stress of the viscoelastic body, and S_h is the stress of the law. The memory of mode
+k is the symmetric tensor gamma_k. The recursion is the update of this memory from step n-1 to step n: gamma^n = a S^n +
+c S^(n-1) + b gamma^(n-1), with the stress S that relaxes. There are two schemes, with the time step dt, and with the
+ratio g and the relaxation time tau of the mode:
 
 * ``"exponential"``: exact if the stress is linear over the step. e = exp(-dt/tau), q = (1 - e) tau/dt, a = g (1 - q),
-  c = g (q - e), b = e. It is of second order in dt.
-* ``"backward_euler"``: as printed in the chapter, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). It is of first order
-  in dt. The old name "chapter" is accepted.
+  c = g (q - e), b = e. This scheme is of second order in dt.
+* ``"backward_euler"``: as printed in the chapter, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). This scheme is of
+  first order in dt. The old name "chapter" is accepted.
 
-The memory advances once per accepted step. During a step `recall` is constant.
+The memory is updated once per accepted step. Its contribution to the stress (`recall`) is constant during a step.
 """
 
 from typing import Any, NamedTuple
@@ -44,25 +46,27 @@ PARTS = ("all", "isochoric")
 
 @struct
 class Prony:
-    """alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): the stress relaxes from the law's stress to 1 - sum g_k of it."""
+    """Prony series alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): the stress relaxes to its fraction 1 - sum_k g_k."""
 
-    ratios: Any = param("1", "g_k, the part of the stress that mode k relaxes (N,), or (N, E)", lower=0.0, upper=1.0)
+    ratios: Any = param("1", "g_k, fraction that relaxes in mode k (N,), or per element (N, E)", lower=0.0, upper=1.0)
     relaxation_times: Any = param("s", "tau_k (N,), or one per element (N, E)", above=0.0)
     part: str = static(
         default="all",
-        about="all: the whole stress relaxes (as printed); isochoric: its isochoric part (Fig. 3)",
+        about="all: the whole stress relaxes (as printed in the chapter); isochoric: its isochoric part (Fig. 3)",
         words=PARTS,
     )
-    scheme: str = static(default="exponential", about="exponential or backward_euler (as printed)", words=SCHEMES)
+    scheme: str = static(
+        default="exponential", about="exponential or backward_euler (as in the chapter)", words=SCHEMES
+    )
 
     def __post_init__(self) -> None:
-        """The old name of a scheme becomes the new one."""
+        """Replace the old name of a scheme by the new one."""
         if self.scheme == "chapter":
             object.__setattr__(self, "scheme", "backward_euler")
 
 
 class History(NamedTuple):
-    """Memory of every element at the end of a step; arrays are (…, Q, E) if elements have Q points."""
+    """Memory of every element at the end of a step. Arrays are (…, Q, E) if elements have Q integration points."""
 
     gamma: jax.Array  # (N, 6, E) [Pa]
     stress: jax.Array | None  # S^n (6, E) [Pa]; backward Euler does not need it
@@ -72,14 +76,14 @@ class Recall(NamedTuple):
     """Contribution of the memory to the stress in a step. It is constant during Newton's iterations."""
 
     past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
-    now: jax.Array  # 1 - sum_k a_k, () or with the axes of arrays over the points
+    now: jax.Array  # 1 - sum_k a_k: one number (), or an array that broadcasts over the integration points
 
 
 def check_viscosity(prony: Prony, law: Law) -> None:
-    """Refuse a viscosity that no step can use; host side.
+    """Check on the host that a step can use this viscosity.
 
     Raises:
-        InputError: unknown scheme or part, lengths that differ, values out of bounds, ratios with a sum of 1 or more,
+        InputError: unknown scheme or part, lengths that differ, values out of bounds, a sum of ratios of 1 or more,
             isochoric relaxation of a law without an isochoric part.
     """
     check_series(prony)
@@ -87,7 +91,7 @@ def check_viscosity(prony: Prony, law: Law) -> None:
 
 
 def check_part(part: str, law: Law, section: str) -> None:
-    """Refuse a part that the law does not have. Numbers are not checked.
+    """Check that the law has the part that relaxes. Numbers are not checked.
 
     Raises:
         InputError: isochoric relaxation of a law without an isochoric part.
@@ -100,10 +104,10 @@ def check_part(part: str, law: Law, section: str) -> None:
 
 
 def check_series(prony: Prony) -> None:
-    """Refuse ratios and times that form no Prony series; host side. If they are traced, only their number is checked.
+    """Check on the host that ratios and times form a Prony series. If they are traced, only their number is checked.
 
     Raises:
-        InputError: lengths that differ, values out of bounds, ratios with a sum of 1 or more.
+        InputError: lengths that differ, values out of bounds, a sum of ratios of 1 or more.
     """
     bounds.check_fields(prony, "viscosity")
     both = (prony.ratios, prony.relaxation_times)
@@ -111,7 +115,7 @@ def check_series(prony: Prony) -> None:
         if not isinstance(values, (tuple, list)) and not np.ndim(values):
             raise InputError(f"viscosity.{key} = {values} is one number: give one per mode, e.g. [{values}]")
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(both)):
-        # NumPy cannot tell the shape of a tuple of traced numbers.
+        # NumPy cannot find the shape of a tuple of traced numbers.
         ratios, times = (len(v) if isinstance(v, (tuple, list)) else (*np.shape(v), 1)[0] for v in both)
         if ratios != times:
             raise InputError(f"viscosity has {ratios} ratios and {times} relaxation_times: give one each per mode")
@@ -125,7 +129,7 @@ def check_series(prony: Prony) -> None:
 
 
 def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """a, b and c of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1) for a step dt [s], in the shape of the ratios."""
+    """Coefficients a, b, c of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1), in the shape of the ratios; dt in s."""
     g, tau = jnp.asarray(prony.ratios), jnp.asarray(prony.relaxation_times)
     r = dt / tau
     if prony.scheme == "backward_euler":
@@ -135,24 +139,27 @@ def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array
 
 
 def lasting(prony: Prony, order: int = 1) -> jax.Array:
-    """The fraction of the stress that never relaxes.
+    """Fraction of the stress that never relaxes: one number (), or one per element (E,).
 
-    It is one number (), or one per element; if `order` is above 1, with an axis for the points.
+    For elements of an `order` above 1 the shape is (1, E), so that it broadcasts over the integration points.
     """
     left = 1 - jnp.sum(jnp.asarray(prony.ratios), axis=0)
     return left[None] if left.ndim and order > 1 else left
 
 
 def _beside(numbers: jax.Array, ndim: int) -> jax.Array:
-    """Numbers (N,) or (N, E) with axes added, so that they broadcast with arrays (N, 6, …, E) of `ndim` dimensions."""
+    """Add axes to numbers (N,) or (N, E), so that they broadcast with arrays (N, 6, …, E) of `ndim` dimensions."""
     if numbers.ndim == 1:
         return numbers[(slice(None), *(None,) * (ndim - 1))]
     return numbers[(slice(None), *(None,) * (ndim - 2))]
 
 
 def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """1 - q and q - e without cancellation. Below r = 1 the Taylor series of 1 - q is used (truncated at 1/20!)."""
-    # Minimum and maximum would halve the derivative at r = 1, where the time step is equal to a relaxation time.
+    """Weights 1 - q and q - e of the exponential scheme, for r = dt/tau, without cancellation.
+
+    Below r = 1 the Taylor series of 1 - q is used (truncated at 1/20!).
+    """
+    # `minimum` and `maximum` would halve the derivative at r = 1 (time step equal to a relaxation time).
     small, large = jnp.where(r < 1, r, 1.0), jnp.where(r < 1, 1.0, r)
     series = jnp.zeros_like(r)
     for k in range(18, 0, -1):
@@ -163,10 +170,10 @@ def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax.Array:
-    """Complex ratios gamma_k / S_h in a steady cycle at angular frequency omega [rad/s], of shape (N, ...).
+    """Complex ratios gamma_k / S_h (N, ...) in steady vibration at the angular frequency omega [rad/s].
 
-    With `dt` [s] it is the exact ratio for the discrete recursion. Without `dt` it is the ratio in continuous time,
-    g/(1 + i omega tau). The complex modulus is G*/G0 = 1 - the sum of the ratios over the modes.
+    With `dt` [s] the ratios are exact for the discrete recursion. Without `dt` they are the ratios in continuous time,
+    g/(1 + i omega tau). The complex modulus is G*/G0 = 1 minus the sum of the ratios over the modes.
     """
     omega = jnp.asarray(omega)[None]
     column = (-1,) + (1,) * (omega.ndim - 1)
@@ -180,20 +187,20 @@ def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax
 
 
 def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: DTypeLike = float) -> History:
-    """Memory of a body at rest: zeros, for E points or for the shape (Q, E)."""
+    """Memory of a body at rest: zeros, for E integration points or for points of the shape (Q, E)."""
     shape = (points,) if isinstance(points, int) else points
     gamma = jnp.zeros((jnp.asarray(prony.ratios).shape[0], 6, *shape), dtype)
     return History(gamma, None if prony.scheme == "backward_euler" else jnp.zeros((6, *shape), dtype))
 
 
 def relaxed_history(prony: Prony, stress: jax.Array) -> History:
-    """Memory of a body that has been held under `stress` (6, …) [Pa] until it has relaxed completely."""
+    """Memory of a body after complete relaxation. `stress` (6, …) [Pa] is the relaxing part of the law's stress."""
     gamma = _beside(jnp.asarray(prony.ratios), 1 + stress.ndim) * stress[None]
     return History(gamma, None if prony.scheme == "backward_euler" else stress)
 
 
 def recall(prony: Prony, history: History, dt: Array) -> Recall:
-    """The constant part of the next step's stress, from the memory at its beginning."""
+    """Contribution of the memory to the stress in the next step, from the memory at the beginning of this step."""
     a, b, c = coefficients(prony, dt)
     if a.ndim == 2:
         return _recall_by_element(a, b, c, history)
@@ -204,7 +211,7 @@ def recall(prony: Prony, history: History, dt: Array) -> Recall:
 
 
 def _recall_by_element(a: jax.Array, b: jax.Array, c: jax.Array, history: History) -> Recall:
-    """`recall` with coefficients (N, E)."""
+    """Contribution of the memory as in `recall`, with one value (N, E) of the coefficients per element."""
     ndim = history.gamma.ndim
     past = jnp.sum(_beside(b, ndim) * history.gamma, axis=0)
     if history.stress is not None:
@@ -225,16 +232,16 @@ def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Number) -> 
 
 
 def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
-    """The second Piola-Kirchhoff stress (6, E) [Pa] that relaxes: S_h, or its isochoric part."""
+    """Second Piola-Kirchhoff stress (6, E) [Pa] that relaxes: S_h, or its isochoric part."""
     s = invariant_terms.state(relaxing(prony, law), F)
     S = invariant_terms.second_piola(F, invariant_terms.stress(s))
     return jnp.stack([S[i][j] for i, j in SIX])
 
 
 def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
-    """P_v = (1 - sum a) P_h - F past.
+    """First Piola-Kirchhoff stress P_v = (1 - sum a) P_h - F past [Pa], with `past` from the memory.
 
-    With part = "isochoric", P_h is the isochoric stress, and the complete volumetric stress is added.
+    With part = "isochoric", P_h is the isochoric stress of the law, and the complete volumetric stress is added.
     """
     P = invariant_terms.first_piola(relaxing(prony, law), F)
     remembered = matmul(F, memory.past)
@@ -249,7 +256,7 @@ def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
 def blocks(
     prony: Prony, memory: Recall, law: Law, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
 ) -> list[Matrix]:
-    """Derivative of `first_piola` in the form of `invariant_terms.blocks`: (1 - sum a) K_h - (D_i . past D_j) Id."""
+    """Stiffness blocks of `first_piola`: (1 - sum a) K_h - (D_i . past D_j) Id. The form is as in `invariant_terms`."""
     K = invariant_terms.blocks(invariant_terms.state(relaxing(prony, law), F), D, pairs)
     K = [scale_matrix(memory.now, block) for block in K]
     result = []
@@ -272,15 +279,15 @@ def relaxing(prony: Prony, law: Law) -> Law:
 
 @struct
 class Viscoelasticity(Physics):
-    """A solid whose law relaxes."""
+    """A solid with a law that relaxes (Prony series)."""
 
     law: Law = param("1", "the instantaneous law")
     prony: Prony = param("1", "how it relaxes")
 
     def begin(self, start: Start) -> History:
-        """A memory of zeros.
+        """Memory at the beginning of a run: zeros.
 
-        If the body has just been moved to its positions, the memory has the stress at these positions.
+        If the body was just moved to its positions, the stress S^n in the memory is the stress at these positions.
         """
         memory = initial_history(self.prony, start.mesh.weights.shape, start.x.dtype)
         if memory.stress is None or not start.moved:
@@ -292,7 +299,7 @@ class Viscoelasticity(Physics):
         return memory._replace(stress=relaxing_stress(self.prony, self.law, F))
 
     def freeze(self, memory: History, step: Step) -> "Viscoelastic":
-        """The law and its memory for the step."""
+        """Force term of the relaxing law, for one step."""
         return Viscoelastic(law=self.law, prony=self.prony, recall=recall(self.prony, memory, step.dt), dt=step.dt)
 
     def advance(self, memory: History, acting: "Viscoelastic", end: End) -> History:
@@ -302,7 +309,7 @@ class Viscoelasticity(Physics):
 
 @struct
 class Viscoelastic(Solid):
-    """A relaxing law during a step."""
+    """Force term of a relaxing law, for one step."""
 
     law: Law = param("1", "the instantaneous law")
     prony: Prony = param("1", "how it relaxes")
@@ -310,15 +317,18 @@ class Viscoelastic(Solid):
     dt: jax.Array = param("s", "time step")
 
     def stress(self, F: Matrix) -> Matrix:
-        """See `first_piola`."""
+        """First Piola-Kirchhoff stress [Pa], computed by `first_piola`."""
         return first_piola(self.prony, self.recall, self.law, F)
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
-        """See `blocks` of this module."""
+        """Blocks of the stiffness, computed by the function `blocks` of this module."""
         return blocks(self.prony, self.recall, self.law, F, D, pairs)
 
     def energy(self, F: Matrix) -> jax.Array:
-        """Incremental potential: (1 - sum a) W - past : C/2. If U does not relax, the complete U is added."""
+        """Incremental potential (1 - sum a) W - past : C/2 [Pa], with the strain energy W and C = F^T F.
+
+        If the volumetric energy U does not relax, the complete U is added.
+        """
         law, past = relaxing(self.prony, self.law), self.recall.past
         C = right_cauchy_green(F)
         stored = sum(past[i][j] * C[i][j] for i in range(3) for j in range(3))

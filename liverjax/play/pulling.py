@@ -1,4 +1,4 @@
-"""A scene that is run step by step, while a spring pulls at one of its nodes.
+"""A scene that is run step by step, while a spring pulls on one of its nodes.
 
 The spring is a `Ligament`. Only its numbers change from step to step, so that one compiled program is enough.
 """
@@ -21,11 +21,11 @@ from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import State, initial_state
 from liverjax.simulation.run import prepared, simulate_part
 
-#: Number of steps of a run without end.
+#: Number of steps of a run that has no planned end.
 STEPS = 10**9
-#: Rest length of the spring, over the size of the body: a spring of length 0 would have no direction.
+#: Rest length of the spring, divided by the size of the body. A spring of length 0 would have no direction.
 SLACK = 1e-3
-#: Stiffness of the spring while nobody pulls, over its stiffness during a pull.
+#: Stiffness of the spring while nobody pulls, divided by its stiffness during a pull.
 NOTHING = 1e-12
 
 
@@ -38,30 +38,31 @@ class Playing(NamedTuple):
     step: int  # number of finished steps
     size: float  # diagonal of the body's box [m]
     nodes: np.ndarray  # (n,) node numbers of the surface
-    triangles: np.ndarray  # (m, 3) numbers in `nodes`
+    triangles: np.ndarray  # (m, 3) triangles of the surface, as indices into `nodes`
     positions: np.ndarray  # (V, 3) [m]
-    code: int = status.CONVERGED  # of the last step
+    code: int = status.CONVERGED  # status of the last step
 
     @property
     def time(self) -> float:
-        """Time of the body [s]; in a scene without time, the number of the step."""
+        """Simulated time [s], or the number of the step in a scene without time."""
         dt = self.scene.solve.dt
         return self.step * (1.0 if dt is None else float(dt))
 
     @property
     def stiffness(self) -> float:
-        """Stiffness [N/m] of the spring during a pull: shear modulus times a twentieth of the size."""
+        """Stiffness [N/m] of the spring during a pull: shear modulus times a twentieth of the body's size."""
         return float(np.mean(np.asarray(self.scene.law.shear_modulus()))) * self.size / 20
 
 
 def at_rest(scene: Scene) -> Playing:
-    """The body at rest in its reference shape, and its compiled program.
+    """Return the body before the first step, and its compiled program. A scene with time starts in its initial state;
+    a scene without time starts after its load steps.
 
     Raises:
-        InputError: a harmonic scene, or what `simulate` refuses.
+        InputError: the scene is harmonic, or `simulate` cannot run it.
     """
     if scene.solve.kind == "harmonic":
-        raise InputError("[solve] kind = 'harmonic' has no time: play with a static or a dynamic scene")
+        raise InputError("[solve] kind = 'harmonic' cannot be used here: give a static or a dynamic scene")
     points = np.asarray(scene.mesh.points)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     spring = Ligament(
@@ -81,7 +82,8 @@ def at_rest(scene: Scene) -> Playing:
 
 
 def _with_histories(scene: Scene) -> Scene:
-    """The scene with a history for motions and forces that otherwise grow until the last step: here is no last step."""
+    """Return the scene with a history for motions and forces that otherwise grow until the last step, because here
+    there is no last step."""
     if scene.solve.dt is None:
         return scene
     table = {"times": scene.solve.steps * scene.solve.dt * jnp.array([0.0, 1.0]), "history": jnp.array([0.0, 1.0])}
@@ -95,27 +97,27 @@ def _with_histories(scene: Scene) -> Scene:
 
 
 def _after_load_steps(scene: Scene) -> State:
-    """The body after all load steps of a scene without time."""
+    """Return the state of the body after all load steps of a scene without time."""
     count = scene.solve.steps
     program = compiled(partial(simulate_part, count=count), scene, initial_state(scene), 1.0)
     result, state = program(scene, initial_state(scene), 1.0)
     for step, code in enumerate(np.asarray(result.status), 1):
         if code not in (status.CONVERGED, status.ONE_STEP):
-            raise InputError(f"load step {step} of {count}, before anyone pulls: {status.advice(code)}")
+            raise InputError(f"load step {step} of {count} failed before the first pull: {status.advice(code)}")
     return state
 
 
 def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = None, stiffness: float = 0.0) -> Playing:
-    """The body after one more step. If the step fails, only the code changes.
+    """Return the body after one more step. If the step fails, only `code` changes.
 
     Args:
-        playing: the body before.
-        node: number in the mesh of the node that is pulled; None: no pull.
+        playing: the body before the step.
+        node: mesh number of the node that is pulled. If it is None, no node is pulled.
         to: end of the spring (3,) [m].
         stiffness: stiffness of the spring [N/m].
 
     Raises:
-        InputError: no such node, or an end or a stiffness that is not usable.
+        InputError: the node does not exist, or the end or the stiffness cannot be used.
     """
     *others, spring = playing.scene.physics
     if node is None:
@@ -128,7 +130,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
         spring = replace(
             spring, nodes=jnp.full((1, 1), node, jnp.int32), to=jnp.asarray(end), stiffness=jnp.asarray(stiffness)
         )
-    # In the precision of the compiled program.
+    # The compiled program needs arrays of its own precision.
     spring = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), spring, playing.scene.physics[-1])
     scene = replace(playing.scene, physics=(*others, spring))
     first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # STEPS means the full load
@@ -141,7 +143,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
 
 
 def _end_of_spring(playing: Playing, node: int, to: Any, stiffness: float) -> np.ndarray:
-    """The end (3,) [m] of the spring, checked."""
+    """Check node, end and stiffness, and return the end (3,) [m] of the spring."""
     if not isinstance(node, int) or not 0 <= node < len(playing.positions):
         raise InputError(f"node = {node!r} is not in the mesh: give 0 to {len(playing.positions) - 1}")
     try:
@@ -149,7 +151,7 @@ def _end_of_spring(playing: Playing, node: int, to: Any, stiffness: float) -> np
     except (TypeError, ValueError):
         end = np.empty(0)
     if end.shape != (3,) or not np.all(np.isfinite(end)):
-        raise InputError(f"to = {to!r} is not a place: give three numbers in m")
+        raise InputError(f"to = {to!r} is not a position: give three numbers in m")
     if not (isinstance(stiffness, int | float) and np.isfinite(stiffness) and stiffness > 0):
         raise InputError(f"stiffness = {stiffness!r} must be above 0 N/m: give e.g. {playing.stiffness:.3g}")
     return end

@@ -1,4 +1,5 @@
-"""A server for the body in a browser: a page, the surface, and one step per picture. Only this machine has access."""
+"""A local web server that shows the body in a browser. It serves a page and the surface of the body, and computes one
+step per picture. Other machines have no access."""
 
 import json
 import threading
@@ -37,7 +38,7 @@ class Answer(BaseHTTPRequestHandler):
     server: PlayServer
 
     def do_GET(self) -> None:
-        """The page, or the surface as JSON."""
+        """Send the page, or the surface as JSON."""
         if self.path == "/":
             page = resources.files("liverjax.play").joinpath("page.html").read_bytes()
             self._send(200, "text/html; charset=utf-8", page)
@@ -47,7 +48,7 @@ class Answer(BaseHTTPRequestHandler):
             self._send(404, "text/plain", b"there is /, /surface, /step and /rest")
 
     def do_POST(self) -> None:
-        """Make a step, or go back to the beginning. The answer is float32 positions (n, 3) of the surface."""
+        """Compute a step, or go back to the beginning. Send the positions (n, 3) of the surface nodes as float32."""
         try:
             asked = json.loads(self.rfile.read(int(self.headers.get("Content-Length") or 0)) or b"{}")
         except ValueError:
@@ -72,21 +73,21 @@ class Answer(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Print nothing: otherwise there would be thirty lines per second."""
+        """Print nothing. Otherwise the server would print thirty lines per second."""
 
 
 def stepped(playing: Playing, asked: Content) -> Playing:
-    """The body after a step that a page has requested."""
+    """Return the body after a step that a page has requested."""
     return pulled(playing, asked.get("node"), asked.get("to"), asked.get("stiffness", playing.stiffness))
 
 
 def on_surface(playing: Playing) -> np.ndarray:
-    """Positions of the surface's nodes (n, 3), float32 [m]."""
+    """Return the positions of the surface nodes (n, 3), float32 [m]."""
     return playing.positions[playing.nodes].astype("<f4")
 
 
 def surface(playing: Playing) -> dict[str, object]:
-    """The fixed data of a page."""
+    """Return the data that a page needs once: nodes, triangles and positions of the surface, size, and stiffness."""
     return {
         "nodes": playing.nodes.tolist(),
         "triangles": playing.triangles.ravel().tolist(),

@@ -1,1 +1,2 @@
-"""Reduced models: motions of a scene as sums of a few modes, stresses at a few points, and the error of both."""
+"""Reduced models: the motion of a scene is a sum of a few modes, stresses are evaluated at a few points, and the error
+of both approximations is estimated."""

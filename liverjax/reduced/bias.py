@@ -1,9 +1,9 @@
-"""Bias of parameters that were identified with a reduced model, relative to an identification with the full model.
+"""Bias of parameters that were identified with a reduced model instead of the full model.
 
-The reduced model is fitted to data y: at the parameters p its result u(p) is closest to y. At p the full model has the
-result u(p) + d, and one full run gives d. The full model fits the same data at p - b. To first order J b = d in the
-least-squares sense, with the derivative J of u. So b is the bias that the reduced model causes, and p - b has no such
-bias to first order.
+Let p be the parameters for which the result u(p) of the reduced model is closest to the data. At p the full model has
+the result u(p) + d, and one full run gives d. The full model fits the same data best at p - b. To first order, b is the
+least-squares solution of J b = d, with the derivative J of u with respect to p. So b is the bias that the reduced model
+causes, and p - b has no such bias to first order.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,17 +23,18 @@ from liverjax.simulation.run import simulate
 def reduced_bias(
     model: ReducedModel, scene: Scene, values: Mapping[str, Any], observed: Callable[[jax.Array], jax.Array]
 ) -> dict[str, np.ndarray]:
-    """Bias of identified parameters, in their units and shapes.
+    """Return the bias of identified parameters, in the units and shapes of the parameters.
 
-    Subtract it from them. It needs one full run; host side.
+    Subtract the bias from the parameters to correct them. The function needs one full run and cannot be traced.
 
     Args:
         model, scene: as in `simulate_reduced`.
         values: dotted names -> values that were identified with the model.
-        observed: the function of positions (T, V, 3) [m] that was fitted to data, with the weights of the fit.
+        observed: the function of positions (T, V, 3) [m] that was fitted to data, including the weights of the fit.
 
     Raises:
-        InputError: as `simulate_reduced`; a full run that fails.
+        InputError: `simulate_reduced` cannot be used.
+        RuntimeError: the full run fails.
     """
     flat, shaped = ravel_pytree({name: jnp.asarray(value, float) for name, value in values.items()})
 

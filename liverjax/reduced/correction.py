@@ -1,16 +1,17 @@
-"""Correction of the error of modes and points, learnt from the full runs of the training: a closure of the reduced
-model.
+"""Correction of the error of modes and points (a closure of the reduced model), learnt from the full training runs.
 
-The reduced model is run with the rows of its training, for which full runs exist. The difference of both is represented
-by a sum of fields. The coefficient of each field is a polynomial of the coordinates: linear in all coordinates, and
-quadratic in the first few. In scenes with time, the rates of the coordinates are terms, too. The factors are found by
-least squares with a small ridge (closures of reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys.
-Fluids 33, 091301). The differences of a run are weighted by 1 over its largest displacement.
+The reduced model is run with the parameter sets of its training, for which full runs exist. The difference between the
+full and the reduced motion is approximated by a sum of fields. The coefficient of each field is a polynomial of the
+reduced coordinates: linear in all coordinates, and quadratic in the first few. In scenes with time, the time
+derivatives of the coordinates are also terms of the polynomial. The factors of the terms are found by least squares
+with a small ridge penalty (closures of reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys. Fluids
+33, 091301). The differences of each run are divided by the largest displacement of this run.
 
-Groups of runs are left out in turn. The errors of these runs decide how many coordinates have products. The same runs
-give the error of the corrected motion: its logarithm is linear in the logarithms of three numbers, which are known
-without a full run. The numbers are the size of the correction, the largest displacement, and the leverage of the terms.
-The leverage is the variance of the least-squares prediction over the variance of the data (Hoaglin, Welsch 1978).
+In a cross-validation, groups of runs are left out in turn. The errors of the left-out runs determine how many
+coordinates have quadratic terms. These errors also give a model of the error of the corrected motion. In this model,
+the logarithm of the error is linear in the logarithms of three numbers, which are known without a full run: the size of
+the correction, the largest displacement, and the leverage of the terms. The leverage is the variance of the
+least-squares prediction divided by the variance of the data (Hoaglin, Welsch 1978).
 """
 
 from functools import partial
@@ -25,45 +26,54 @@ from liverjax.tensors.principal_fields import principal_fields
 
 #: Number of groups of runs that are left out in turn, and minimum number of runs for a correction.
 GROUPS, FEWEST_RUNS = 12, 6
-#: Tried numbers of coordinates with products. At most `RATES` coordinates have products with rates.
+#: PRODUCTS: numbers of coordinates with quadratic terms that are tried. RATES: maximum number of coordinates that are
+#: multiplied by time derivatives.
 PRODUCTS, RATES = (0, 6, 12, 20), 8
-#: The ridge, relative to the mean squares of the terms; fraction of the differences that the fields may leave out;
-#: maximum number of fields.
+#: RIDGE: ridge penalty, relative to the mean squares of the terms. OUTSIDE: fraction of the differences that the fields
+#: may leave out. MOST_FIELDS: maximum number of fields.
 RIDGE, OUTSIDE, MOST_FIELDS = 1e-6, 0.02, 150
 #: Maximum number of differences from which the fields are made.
 FIELD_STATES = 1500
-#: Exponents of the stated error if there are too few runs to determine them: a constant times the root of the leverage.
+#: Prior values of the exponents of the stated error, for too few runs. Then the stated error is a constant times the
+#: square root of the leverage.
 FEW_RUNS_EXPONENTS = np.array([0.0, -1.0, 0.5])
-#: Weight of these exponents, expressed as a number of runs.
+#: Weight of these prior values, expressed as a number of runs.
 FEW_RUNS = 10.0
 
 
 @struct
 class Correction:
-    """Polynomials with k terms for m fields, and numbers that give the remaining error."""
+    """Polynomials with k terms for the coefficients of m fields, and numbers that determine the stated error."""
 
     fields: jax.Array = param("1", "(m, V, 3), orthonormal with the lumped volumes of the nodes")
     factors: jax.Array = param("m^2.5", "factors of every term in every field (k, m)")
-    inverse: jax.Array = param("1", "inverse of the normal equations of the terms (k, k)")
+    inverse: jax.Array = param("1", "inverse of the normal matrix of the terms (k, k)")
     scale: jax.Array = param("m", "size of the first coordinate")
-    statement: jax.Array = param("1", "logarithm of the stated error: constant and exponents (4,), see `_logarithms`")
-    left: jax.Array = param("1", "error of each left-out run, over its largest displacement (R,)")
-    ratios: jax.Array = param("1", "stated error over true error of each left-out run (R,)")
-    products: int = static(default=0, about="number of coordinates that have products")
+    statement: jax.Array = param("1", "constant and exponents (4,) of the stated error, see `_logarithms`")
+    left: jax.Array = param("1", "error of each left-out run, divided by its largest displacement (R,)")
+    ratios: jax.Array = param("1", "stated error divided by true error of each left-out run (R,)")
+    products: int = static(default=0, about="number of coordinates with quadratic terms")
 
 
 class Learnt(NamedTuple):
-    """Runs from which a correction is learnt."""
+    """Training runs from which a correction is learnt."""
 
     q: np.ndarray  # coordinates of the reduced runs (R, T, n) [m]
     missing: np.ndarray  # full minus reduced motion (R, T, V, 3) [m]
     moved: np.ndarray  # largest displacement of each run (R,) [m]
     volumes: np.ndarray  # lumped volumes of the nodes (V,) [m^3]
-    dt: Number | None  # [s], None without time
+    dt: Number | None  # time step [s], None without time
 
 
 def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.Array:
-    """Terms (T, k) of the polynomial at coordinates q (T, n) of a run that begins at rest."""
+    """Return the terms (T, k) of the polynomial at the coordinates q (T, n) of a run that begins at rest.
+
+    Args:
+        q: coordinates (T, n) [m].
+        scale: size of the first coordinate [m].
+        products: number of coordinates with quadratic terms.
+        dt: time step [s], None without time.
+    """
     x = q / scale
     i, j = np.triu_indices(min(products, x.shape[-1]))
     found = [jnp.ones_like(x[:, :1]), x, x[:, i] * x[:, j]]
@@ -75,17 +85,18 @@ def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.
 
 
 def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """The correction of the motion of the nodes: (T, V, 3) [m]."""
+    """Return the correction (T, V, 3) [m] of the motion of the nodes."""
     return jnp.tensordot(terms(q, own.scale, own.products, dt) @ own.factors, own.fields, axes=1)
 
 
 def size_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Maximum distance (T,) [m] by which the correction moves a node, up to each step."""
+    """Return the maximum distance (T,) [m] by which the correction moves a node, up to each step."""
     return jax.lax.cummax(_largest_of_steps(correction_at(own, q, dt)))
 
 
 def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None) -> jax.Array:
-    """Stated maximum distance (T,) [m] of a node from the full model up to each step, after the correction.
+    """Return the stated error (T,) [m] of the corrected motion: the maximum distance of a node from its position in the
+    full model, up to each step.
 
     Args:
         own: `Correction`.
@@ -106,25 +117,27 @@ def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None
 
 
 def _largest_of_steps(u: jax.Array) -> jax.Array:
-    """Maximum length (T,) of vectors (T, V, 3) at each step."""
+    """Return the maximum length (T,) of the vectors u (T, V, 3) at each step."""
     square = jnp.max(jnp.sum(u**2, axis=-1), axis=-1)
     # The square root has no derivative at zero.
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def _leverage(a: jax.Array, inverse: jax.Array) -> jax.Array:
-    """Variance (T,) of the least-squares prediction at terms a (T, k), over the variance of the data."""
+    """Return the variance (T,) of the least-squares prediction at terms a (T, k), divided by the variance of the
+    data."""
     return jnp.sum((a @ inverse) * a, axis=1)
 
 
 def _logarithms(corrected: jax.Array, moved: jax.Array, leverage: jax.Array) -> jax.Array:
-    """Logarithms (R, 3) of the relative correction, the displacement and the leverage; they give the stated error."""
+    """Return the logarithms (R, 3) of relative correction, displacement and leverage, from which the stated error is
+    computed."""
     tiny = jnp.finfo(moved.dtype).tiny
     return jnp.log(jnp.maximum(jnp.stack([corrected / moved, moved, leverage], axis=1), tiny))
 
 
 class _LeftOut(NamedTuple):
-    """Errors of every run (R,), with the polynomial that is learnt without the group of this run."""
+    """Errors of every run (R,) with a correction that is learnt without the group of this run."""
 
     off: np.ndarray  # maximum error [m]
     corrected: np.ndarray  # maximum correction [m]
@@ -132,7 +145,8 @@ class _LeftOut(NamedTuple):
 
 
 def learnt_correction(runs: Learnt) -> Correction | None:
-    """The correction with the smallest errors of left-out runs; None with too few runs or if no correction helps."""
+    """Return the correction with the smallest errors of left-out runs. Return None if there are too few runs or if no
+    correction reduces these errors."""
     R = len(runs.q)
     if R < FEWEST_RUNS or not np.any(runs.q):
         return None
@@ -171,7 +185,15 @@ def learnt_correction(runs: Learnt) -> Correction | None:
 def _left_out(
     A: np.ndarray, sums: "_LeastSquares", group: np.ndarray, missing: np.ndarray, fields: np.ndarray
 ) -> _LeftOut:
-    """Errors of every run, with the polynomial that is learnt without its group. A (R, T, k) are the terms."""
+    """Return the errors of every run, with a correction that is learnt without the group of this run.
+
+    Args:
+        A: terms (R, T, k).
+        sums: normal equations of all groups.
+        group: group of each run (R,).
+        missing: full minus reduced motion (R, T, V, 3) [m].
+        fields: fields of the correction (m, V, 3).
+    """
     found = np.zeros((3, len(A)))
     for g in range(len(sums.squares)):
         own = group == g
@@ -183,10 +205,12 @@ def _left_out(
 
 
 def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Constant and exponents (4,) of the stated error, and the ratios (R,) of stated and true errors of left-out runs.
+    """Return constant and exponents (4,) of the stated error, and the ratios (R,) of stated to true error for the
+    left-out runs.
 
-    The exponents come from least squares of logarithms; with few runs they stay close to `FEW_RUNS_EXPONENTS`. The
-    constant is chosen so that the ratios are as far above 1 as below 1 (quantiles of 1 % and 99 %).
+    The exponents come from a least-squares fit of the logarithms. With few runs they stay close to
+    `FEW_RUNS_EXPONENTS`. The constant is chosen so that the 1 % and 99 % quantiles of the ratio have the same distance
+    from 1 in the logarithm.
     """
     x = np.asarray(_logarithms(*(jnp.asarray(a) for a in (out.corrected, moved, out.leverage))))
     y = np.log(np.maximum(out.off / moved, np.finfo(float).tiny)) - x @ FEW_RUNS_EXPONENTS
@@ -199,25 +223,27 @@ def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _farthest(u: np.ndarray) -> np.ndarray:
-    """Maximum length (R,) of vectors (R, T, V, 3) in each run."""
+    """Return the maximum length (R,) of the vectors u (R, T, V, 3) in each run."""
     return np.linalg.norm(u, axis=-1).max(axis=(1, 2))
 
 
 def _error_fields(weighted: np.ndarray) -> np.ndarray:
-    """Orthonormal fields (m, 3 V) for differences (N, 3 V); both are multiplied by the roots of the volumes."""
+    """Return orthonormal fields (m, 3 V) for differences (N, 3 V). Both are multiplied by the square roots of the nodal
+    volumes."""
     return principal_fields(weighted[:: max(1, len(weighted) // FIELD_STATES)], OUTSIDE)[:MOST_FIELDS]
 
 
 class _LeastSquares(NamedTuple):
-    """Normal equations for the factors, one set for each group of runs."""
+    """Normal equations for the factors, one set for each of g groups of runs."""
 
-    squares: np.ndarray  # (g, k, k)
-    products: np.ndarray  # (g, k, m)
-    size: np.ndarray  # of the terms (k,)
-    states: int
+    squares: np.ndarray  # normal matrices (g, k, k)
+    products: np.ndarray  # right sides (g, k, m)
+    size: np.ndarray  # root mean square of each term (k,)
+    states: int  # number of states in all runs
 
     def without(self, *groups: int) -> tuple[np.ndarray, np.ndarray]:
-        """Factors (k, m) from all runs except some groups, and the inverse (k, k) of their normal matrix."""
+        """Return the factors (k, m) from all runs except some groups, and the inverse (k, k) of the normal matrix of
+        these runs."""
         kept = np.setdiff1d(np.arange(len(self.squares)), groups)
         H = self.squares[kept].sum(axis=0) + RIDGE * self.states * np.eye(len(self.size))
         inverse = np.linalg.inv(H) / np.outer(self.size, self.size)
@@ -225,7 +251,8 @@ class _LeastSquares(NamedTuple):
 
 
 def _least_squares(A: np.ndarray, parts: np.ndarray, moved: np.ndarray, group: np.ndarray) -> _LeastSquares:
-    """Normal equations of terms A (R, T, k) and parts (R, T, m), weighted by 1 over the largest displacement (R,)."""
+    """Return the normal equations of the terms A (R, T, k) for the field coefficients `parts` (R, T, m). Each run is
+    weighted by the inverse of its largest displacement `moved` (R,)."""
     size = np.sqrt(np.mean(A**2, axis=(0, 1)))
     size = np.where(size > 0, size, 1.0)
     weight = (1 / moved / np.sqrt(np.mean(1 / moved**2)))[:, None, None]

@@ -1,19 +1,19 @@
-"""Estimated error of a reduced run: the residual on the whole mesh, and the motion that this residual would cause.
+"""Estimated error of a reduced run, from the out-of-balance forces on the full mesh and the motion that they cause.
 
-The equations of the full model are evaluated along the reduced motion, step by step, with the memories of all elements.
-The out-of-balance forces r cause the error e. To first order e follows the linear equations of the same body,
+The equations of the full model are evaluated for the reduced motion, step by step, with the viscous memory of all
+elements. The out-of-balance forces r determine the error e of the motion. To first order, e follows the linear
+equations of the same body,
 
     M a(e) + K e - memory(e) = -r,
 
-with the stiffness K of the reference shape and the same recursions in time. The matrix of the left side is factorised
-once per run. So a step needs the forces of the full mesh and one solve, but no iterations of Newton's method. In
-statics the energy norm of e is the dual norm of r. The estimate leaves out terms of second order in e, and the change
-of the stiffness with the deformation.
+with the mass matrix M, the acceleration a, the stiffness K of the reference shape and the same recursion (the update of
+the viscous memory from step to step). The matrix of the left side is factorised once per run. So a step needs the
+forces of the full mesh and one linear solve, but no Newton iterations. In statics the energy norm of e is the dual norm
+of r. The estimate neglects terms of second order in e and the change of the stiffness with the deformation.
 
-In a porous scene the pressures of the full mesh are computed along the reduced motion, so that only forces are out of
-balance. These forces cause errors of motion and pressure (`liverjax.reduced.physics.fluid_error`). The error of the
-pressure is the difference of the reduced pressure and the computed one, plus the part that the error of the motion
-causes.
+In a porous scene, the pressures of the full mesh are computed for the reduced motion, so that only the forces are out
+of balance. These forces correspond to errors of motion and pressure (`liverjax.reduced.physics.fluid_error`). The error
+of the reduced pressure is the reduced pressure minus the computed pressure, minus the change of pressure due to e.
 """
 
 from collections.abc import Callable
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 
 class _Body(NamedTuple):
-    """The linear body for the error: sparse matrices (f, f) of the free degrees of freedom."""
+    """Sparse matrices (f, f) of the linear equations for the error, for the f free degrees of freedom."""
 
     relaxing: jax.Array  # stiffness of the part that relaxes [N/m]
     rest: Any  # stiffness of the part that does not relax, or None
@@ -61,7 +61,9 @@ class _Body(NamedTuple):
 
 
 def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ReducedResult:
-    """The result with estimated errors (T,) [m] and [Pa], and with reactions (T, V, 3) [N]; host side, for one run.
+    """Return the result with estimated errors (T,) of motion [m] and pressure [Pa], and with reactions (T, V, 3) [N].
+
+    The function is for one run and cannot be traced.
 
     Args:
         model, scene, result: as in `simulate_reduced`.
@@ -78,9 +80,9 @@ def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> R
 
 @jax.jit
 def _out_of_balance(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Out-of-balance forces and reactions (T, V, 3) [N] of the full model along given positions (T, V, 3).
+    """Return out-of-balance forces and reactions (T, V, 3) [N] of the full model for given positions x (T, V, 3) [m].
 
-    The third result is the fluid's pressure there (T, V) [Pa].
+    The third result is the pressure (T, V) [Pa] of the fluid for these positions, or None without a fluid.
     """
     sizes = force_sizes(scene)
 
@@ -117,7 +119,8 @@ def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
 
 
 def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Motions (T, V, 3) [m] and pressures (T, V) [Pa] of the linear body under minus the residuals (T, V, 3) [N]."""
+    """Return displacements (T, V, 3) [m] and pressures (T, V) [Pa] of the linear body under the forces -residuals
+    (T, V, 3) [N]. The pressures are None without a fluid."""
     import scipy.sparse
 
     free = np.flatnonzero(np.asarray(free_directions(scene).mask).ravel())
@@ -154,7 +157,7 @@ def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid | None
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """The solver of `coupled_solver`; without a fluid, a solver with K only."""
+    """Return the solver of `coupled_solver`, or a solver for the matrix K alone if there is no fluid."""
     from scipy.sparse.linalg import splu
 
     if fluid is not None:
@@ -164,7 +167,7 @@ def _solver(
 
 
 def _recursion(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coefficients a, b, c (N,) of the viscosity; empty arrays without viscosity."""
+    """Return the coefficients a, b, c (N,) of the recursion for N Prony terms; empty arrays without viscosity."""
     if scene.viscosity is None:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     a, b, c = coefficients(scene.viscosity, scene.solve.dt)

@@ -1,4 +1,4 @@
-"""Reduced models on disk: one HDF5 file with modes, points, weights and their origin."""
+"""Write and read reduced models: one HDF5 file with modes, points, weights, and data of the scene and program."""
 
 import json
 from pathlib import Path
@@ -16,20 +16,20 @@ from liverjax.reduced.model import PressureModes, ReducedModel
 if TYPE_CHECKING:
     import h5py
 
-#: Arrays of a correction.
+#: Names of the arrays of a correction.
 _LEARNT = ("fields", "factors", "inverse", "scale", "statement", "left", "ratios")
 _UNITS = {"modes": "1", "slopes": "1/m", "weights": "m^3", "points": "1"}
-#: Arrays of modes of the pressure.
+#: Names and units of the arrays of the pressure modes.
 _PRESSURES = {"modes": "1", "values": "1", "parts": "1", "slopes": "1/m"}
 
 
 def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") -> None:
-    """Write a reduced model.
+    """Write a reduced model to an HDF5 file.
 
     Args:
         model: `ReducedModel`.
-        file: HDF5 file, replaced if it exists.
-        scene_text: content of the scene file from which the model was made; it is stored in the file.
+        file: HDF5 file, which is replaced if it exists.
+        scene_text: content of the scene file from which the model was made. This text is stored in the HDF5 file.
     """
     import h5py
 
@@ -57,12 +57,12 @@ def load_reduced(file: str | Path) -> ReducedModel:
     """Read a reduced model that `save_reduced` wrote.
 
     Raises:
-        InputError: no file, a file of another kind, or a damaged file.
+        InputError: the file does not exist, is damaged, or is not a reduced model.
     """
     import h5py
 
     if not Path(file).is_file():
-        raise InputError(f"{file}: there is no such reduced model: make one with python -m liverjax reduce")
+        raise InputError(f"{file}: this file does not exist: make a reduced model with python -m liverjax reduce")
     try:
         with h5py.File(file, "r") as stored:
             arrays = {name: stored[name][()] for name in _UNITS}
@@ -83,7 +83,7 @@ def load_reduced(file: str | Path) -> ReducedModel:
 
 
 def _wrong(model: ReducedModel) -> str:
-    """A text on the first array that has a wrong shape or is not finite; an empty text if there is none."""
+    """Return a text about the first array with a wrong shape or with values that are not finite, or an empty text."""
     n, V, S = *jnp.shape(model.modes)[:2], *jnp.shape(model.weights)[:1]
     shapes: dict[str, tuple] = {"modes": (n, V, 3), "slopes": (9, S, n), "weights": (S,), "points": (S,)}
     arrays = {name: getattr(model, name) for name in shapes}
@@ -115,7 +115,7 @@ def _correction(stored: "h5py.File") -> Correction | None:
 
 
 def _pressures(stored: "h5py.File") -> PressureModes | None:
-    """Read the modes of the pressure from an open file; None if the file has no such modes."""
+    """Read the pressure modes from an open file; None if the file has no pressure modes."""
     if "pressures" not in stored:
         return None
     return PressureModes(**{name: jnp.asarray(stored["pressures"][name][()]) for name in _PRESSURES})

@@ -1,9 +1,11 @@
-"""A reduced model: modes of motion, and weighted points of elements at which stresses are evaluated.
+"""A reduced model: modes of motion, and a weighted selection of integration points at which stresses are evaluated.
 
-Positions are x = X + u_D(t) + sum_k q_k phi_k, with the prescribed motion u_D. The modes phi_k are 0 where the body is
-held or moved. The energy is W(q) = sum_p w_p W(F_p(q)) over the sampled points p, with weights w_p >= 0. The gradient
-of W, sum_p w_p P(F_p) : grad phi_k, is the reduced force. So the sum over points keeps the structure of the full model
-(energy-conserving sampling and weighting: Farhat, Avery, Chapman, Cortial 2014; here with points instead of elements).
+Positions are x = X + u_D(t) + sum_k q_k phi_k, with the reference positions X, the prescribed displacement u_D and the
+reduced coordinates q_k. The modes phi_k are 0 where the body is fixed or moved. The energy is W(q) = sum_p w_p
+W(F_p(q)), the sum over the sampled points p with deformation gradients F_p and weights w_p >= 0. The derivative of W
+with respect to q_k, sum_p w_p P(F_p) : grad phi_k with the first Piola-Kirchhoff stress P, is the reduced force. So the
+reduced forces have an energy, as in the full model (energy-conserving sampling and weighting: Farhat, Avery, Chapman,
+Cortial 2014; here with points instead of elements).
 """
 
 import hashlib
@@ -34,57 +36,59 @@ from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.tensors.matrices import Matrix, deformation_gradient
 from liverjax.tensors.places import taken
 
-#: A parameter may be outside of its range by this fraction of the range's width.
+#: A parameter may be outside of its training range by this fraction of the width of the range.
 BEYOND = 0.5
-#: Parts of a scene with numbers that determine its motion.
+#: Parts of a scene that contain numbers with an effect on the motion.
 _PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction", "physics")
-#: Names of numbers that may differ: they can lead through states that also occur in the rows.
+#: Names of numbers that may differ from the training, because other histories can lead to states of the training.
 _FREE = ("times", "history")
 
 
 @struct
 class PressureModes:
-    """m modes of the fluid's pressure and their values at the points. The modes are 0 where the body is drained."""
+    """The m modes of the fluid pressure, with their values at the S points. The modes are 0 where the body is
+    drained."""
 
     modes: jax.Array = param("1", "(m, V), orthonormal with the lumped volumes of the vertices")
     values: jax.Array = param("1", "values at the points (S, m)")
-    parts: jax.Array = param("1", "at the vertices of each point's element, times the root of their part (m, 4, S)")
+    parts: jax.Array = param("1", "vertex values of each point's element, times roots of shape functions (m, 4, S)")
     slopes: jax.Array = param("1/m", "gradients at the points (m, 3, S)")
 
 
 @struct
 class ReducedModel:
-    """n modes and S points of one scene. Parameters of its law and viscosity, and its loads, can be changed."""
+    """A reduced model of one scene with n modes and S points. The loads of the scene and the parameters of its law and
+    viscosity can be changed."""
 
     modes: jax.Array = param("1", "(n, V, 3), orthonormal with the lumped volumes of the nodes")
     slopes: jax.Array = param("1/m", "gradients of the modes at the points (9, S, n), row by row")
     weights: jax.Array = param("m^3", "reference volume that a point represents (S,), not negative")
-    points: jax.Array = param("1", "number q E + e of point q of element e (S,)")
-    ranges: dict[str, Any] = param("1", "parameters of the training: name -> lowest and highest value")
+    points: jax.Array = param("1", "number q E + e of integration point q in element e of E (S,)")
+    ranges: dict[str, Any] = param("1", "name of each training parameter -> lowest and highest value")
     correction: Correction | None = param("1", "correction of the error of modes and points, or None", default=None)
-    pressures: PressureModes | None = param("1", "of a porous scene", default=None)
+    pressures: PressureModes | None = param("1", "pressure modes of a porous scene", default=None)
     identity: str = static(default="", about="digest of the scene for which the model is made")
-    others: str = static(default="", about="digests of the numbers that the rows did not vary, as JSON text")
+    others: str = static(default="", about="digests of the numbers that are equal in all training runs, as JSON")
 
     @property
     def number_of_modes(self) -> int:
-        """Number n of modes: the unknowns of a step."""
+        """Number n of modes, which is the number of unknowns of a step."""
         return self.modes.shape[0]
 
 
 def flat_gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Gradient of a field x (V, 3) at all points of the mesh: (9, Q E), row by row."""
+    """Return the gradient (9, Q E) of a field x (V, 3) at all integration points of the mesh, row by row."""
     F = deformation_gradient(mesh, x)
     return jnp.stack([entry for row in F for entry in row]).reshape(9, -1)
 
 
 def as_matrix(flat: jax.Array) -> Matrix:
-    """A tuple matrix from its nine entries (9, S)."""
+    """Return a 3 x 3 matrix as nested tuples, from its nine entries (9, S)."""
     return tuple(tuple(flat[3 * i + j] for j in range(3)) for i in range(3))
 
 
 def pressure_modes(mesh: TetMesh, modes: jax.Array) -> PressureModes:
-    """Modes (m, V) of the vertices, with their values at all points."""
+    """Return the pressure modes with these vertex values (m, V), and their values at all integration points."""
     L = jnp.full((4, 1), 0.25) if mesh.order == 1 else jnp.asarray(basis(mesh.order).L)
 
     def at_points(mode: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -99,7 +103,13 @@ def pressure_modes(mesh: TetMesh, modes: jax.Array) -> PressureModes:
 
 
 def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None = None) -> ReducedModel:
-    """The model with modes (n, V, 3), and modes (m, V) of pressures, and with all points: Galerkin's projection."""
+    """Return the reduced model with all integration points (Galerkin projection of the full model).
+
+    Args:
+        scene: `Scene`.
+        modes: modes of the motion (n, V, 3).
+        pressures: modes of the pressure (m, V), None without a fluid.
+    """
     mesh = scene.mesh
     slopes = jnp.moveaxis(jax.lax.map(lambda mode: flat_gradient(mesh, mode), modes), 0, -1)
     w = mesh.weights.ravel()
@@ -115,7 +125,8 @@ def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None 
 
 
 def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
-    """The physics in the elements of the full model, with the parameters of the law at the sampled points."""
+    """Return the elasticity or viscoelasticity of the full model, with the parameters of the law at the sampled
+    points."""
     E = scene.mesh.number_of_elements
     law = law_of_elements(law_at_rest(scene), scene.region, E)
     elements = model.points % E
@@ -125,9 +136,10 @@ def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
 
 
 def reduced_identity(scene: Scene) -> str:
-    """Digest of the mesh, of held, moved and drained nodes, and of the kinds of law, viscosity, porosity and run.
+    """Return a digest of the mesh, the fixed, moved and drained nodes, and the kinds of law, viscosity, porosity,
+    supports and run.
 
-    It does not depend on the parameters.
+    The digest does not depend on the parameters.
     """
     whole = hashlib.sha256()
     for array in (scene.mesh.points, scene.mesh.tetrahedra):
@@ -146,42 +158,48 @@ def reduced_identity(scene: Scene) -> str:
 
 
 def refuse_unknown_physics(scene: Scene) -> None:
-    """Refuse a scene with physics that reduced models do not have.
+    """Raise InputError if the scene has parts that reduced models do not support.
 
     Raises:
-        InputError: viscosity or laws of regions, inlets of a fluid, physics other than supports, a loaded mesh,
-            pressures that follow the surface, averaged or mixed volumes, consistent mass, other precision or Newton.
+        InputError: the scene has viscosity or other laws of regions, inlets of a fluid, physics objects other than
+            supports, a loaded mesh, or pressures that follow the surface. Or it has averaged or mixed volumes, a
+            consistent mass, a precision other than "float64", or a setting of newton other than "converged".
     """
     if any(region.viscosity for region in scene.region):
-        raise InputError("a reduced model has one viscosity: leave the viscosity of regions out, or run the full model")
+        raise InputError("a reduced model has one viscosity: remove the viscosity of regions, or run the full model")
     if len(laws_of(scene.law, scene.region)) > 1:
         raise InputError(
-            "a reduced model has one kind of law: give regions other parameters of it, or run the full model"
+            "a reduced model has one kind of law: use this law with other parameters in regions, or run the full model"
         )
     if scene.porosity is not None and scene.porosity.inlet:
-        raise InputError("a reduced model has no [[porosity.inlet]]: leave it out, or run the full model")
+        raise InputError("a reduced model cannot have [[porosity.inlet]]: leave it out, or run the full model")
     if scene.points_are == "loaded":
-        raise InputError('[mesh] is = "loaded" is not for reduced models: take the scene of lj.unloaded(scene)')
+        raise InputError('[mesh] is = "loaded" cannot be used with reduced models: use the scene of lj.unloaded(scene)')
     refuse_other_physics(scene)
     if follows(scene.traction):
-        raise InputError("a reduced model has no pressure that follows the body: give traction.value instead")
+        raise InputError("a reduced model cannot have a pressure that follows the body: give traction.value instead")
     if scene.solve.volumetric != "element":
-        raise InputError(f"[solve] volumetric = {scene.solve.volumetric!r} is not for reduced models: use 'element'")
+        raise InputError(
+            f"[solve] volumetric = {scene.solve.volumetric!r} does not work in reduced models: use 'element'"
+        )
     if scene.body is not None and scene.body.mass != "lumped":
-        raise InputError(f"[body] mass = {scene.body.mass!r} is not for reduced models: use 'lumped'")
+        raise InputError(f"[body] mass = {scene.body.mass!r} does not work in reduced models: use 'lumped'")
     if scene.solve.newton != "converged":
-        raise InputError(f"[solve] newton = {scene.solve.newton!r} is not for reduced models: use 'converged'")
+        raise InputError(f"[solve] newton = {scene.solve.newton!r} does not work in reduced models: use 'converged'")
     if scene.solve.precision != "float64":
-        raise InputError(f"[solve] precision = {scene.solve.precision!r} is not for reduced models: use 'float64'")
+        raise InputError(
+            f"[solve] precision = {scene.solve.precision!r} does not work in reduced models: use 'float64'"
+        )
     if scene.solve.kind == "static" and scene.viscosity is not None and scene.solve.dt is None:
         raise InputError("[viscosity] needs dt in [solve]: give a time step in s")
 
 
 def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
-    """Refuse a scene for which the model was not made.
+    """Raise InputError if the model was not made for this scene.
 
     Raises:
-        InputError: as `refuse_unknown_physics`, or another mesh, held nodes, law, viscosity, supports or kind of run.
+        InputError: `refuse_unknown_physics` raises it, or the mesh, the fixed nodes, or the kinds of law, viscosity,
+            supports or run differ.
     """
     refuse_unknown_physics(scene)
     if isinstance(scene.mesh.points, jax.core.Tracer):
@@ -189,24 +207,24 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
     own = reduced_identity(scene)
     if own != model.identity:
         raise InputError(
-            f"the reduced model was made for scene {model.identity}, and this is {own} (mesh, held nodes, law, "
+            f"the reduced model was made for scene {model.identity}, but this is {own} (mesh, fixed nodes, law, "
             "viscosity, supports or kind differ): run python -m liverjax reduce for this scene"
         )
 
 
 def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) -> str:
-    """Names and digests of the numbers that the rows do not vary, as JSON text.
+    """Return names and digests of the numbers of a scene that are the same in all training runs, as JSON text.
 
     Args:
         scene: `Scene`, not traced.
-        varied: dotted names -> one value of each number that the rows vary.
+        varied: dotted names -> one value of each number that differs between the training runs.
     """
     scene = with_parameters(scene, {name: np.zeros_like(np.asarray(value, float)) for name, value in varied.items()})
     found = {}
     for part in _PARTS:
         for path, leaf in jax.tree_util.tree_flatten_with_path(getattr(scene, part))[0]:
             words = [str(getattr(key, "name", getattr(key, "idx", key))) for key in path]
-            if part == "physics":  # with the names of a scene file: support.0
+            if part == "physics":  # the same names as in a scene file, for example support.0
                 part_of = scene.physics[: int(words[0]) + 1]
                 section = part_of[-1].section
                 words = [str(sum(own.section == section for own in part_of) - 1), *words[1:]]
@@ -221,18 +239,18 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
 
 
 def _course(scene: Scene) -> Content:
-    """Names and values of the settings for time."""
+    """Return names and values of the settings of time integration."""
     solve = scene.solve
     duration = None if solve.dt is None else float(solve.dt) * solve.steps
     return {"solve.integrator": solve.integrator, "solve.dt x solve.steps": duration}
 
 
 def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
-    """Refuse numbers that do not occur in the rows of the model. A traced scene passes.
+    """Raise InputError if the scene has numbers that do not occur in the training runs. A traced scene is not checked.
 
     Raises:
-        InputError: a varied number far outside of its range in the rows, or another number that differs from the scene
-            of the rows.
+        InputError: a number that was varied is far outside of its training range, or another number differs from the
+            training runs.
     """
     parts = [*(getattr(scene, part) for part in _PARTS), scene.solve.dt]
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((parts, model.ranges))):
@@ -241,9 +259,9 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
         value, (low, high) = np.asarray(numbers_at(scene, name), float), np.asarray(bounds)
         if np.any(np.maximum(low - value, value - high) > BEYOND * (high - low) + 1e-9 * np.abs(high)):
             raise InputError(
-                f"{name} = {np.array2string(value, precision=4)} is far out of its range in the model's rows, "
-                f"{np.array2string(low, precision=4)} to {np.array2string(high, precision=4)}, where nothing is known "
-                "of the error: take lj.reduced_error, or reduce with wider rows"
+                f"{name} = {np.array2string(value, precision=4)} is far outside the training range of the reduced "
+                f"model ({np.array2string(low, precision=4)} to {np.array2string(high, precision=4)}). The stated "
+                "error is not valid there: use lj.reduced_error, or train the model with a wider range"
             )
     if not model.others:
         return  # made by an earlier version
@@ -252,17 +270,18 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
         before, after = made.pop(name, None), own.pop(name)
         if before is not None and (after > before * (1 + 1e-6) if isinstance(after, float) else after != before):
             raise InputError(
-                f"{name} = {after} and the model's rows have {before}, so nothing is known of the error: take "
-                "lj.reduced_error, or reduce with such rows"
+                f"{name} = {after}, but the reduced model was trained with {before}, so its error is unknown: use "
+                "lj.reduced_error, or train a model for this value"
             )
     changed = sorted(name for name in made.keys() | own.keys() if made.get(name) != own.get(name))
     if changed:
         raise InputError(
-            f"{changed[0]} is not that of the model's rows, where nothing is known of the error: take "
-            "lj.reduced_error, or give it as a column of the rows"
+            f"{changed[0]} differs from the training of the reduced model, so its error is unknown: use "
+            "lj.reduced_error, or train a model with this number as a column of the rows"
         )
 
 
 def without_rows(model: ReducedModel) -> ReducedModel:
-    """The model without the data that only its error needs. Models that differ only in these data share one program."""
+    """Return the model without the data that only the error estimate needs. Models that differ only in these data use
+    the same compiled program."""
     return replace(model, correction=None, ranges={}, others="")

@@ -1,4 +1,4 @@
-"""Runs of a reduced model: loads, initial state, and the loop over the steps (`liverjax.reduced.step`)."""
+"""Run a reduced model: loads, initial state, and the loop over the steps (`liverjax.reduced.step`)."""
 
 from collections.abc import Callable
 from functools import partial
@@ -55,17 +55,19 @@ class ReducedResult:
     """Result of a reduced run: arrays over the T steps. `reduced_positions` gives the motion of the nodes."""
 
     times: jax.Array = param("s", "(T,); the number of the load step if there is no time")
-    coordinates: jax.Array = param("m", "of the modes (T, n)")
+    coordinates: jax.Array = param("m", "coordinates of the modes (T, n)")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
-    iterations: jax.Array = param("1", "(T,) of Newton's method")
-    residual: jax.Array = param("1", "(T,) of the reduced equations, over the size of all forces")
-    pressures: jax.Array | None = param("Pa", "coordinates of the pressure's modes (T, m)", default=None)
+    iterations: jax.Array = param("1", "(T,) iterations of Newton's method")
+    residual: jax.Array = param("1", "(T,) residual of the reduced equations, divided by the size of all forces")
+    pressures: jax.Array | None = param("Pa", "coordinates of the pressure modes (T, m)", default=None)
     error: jax.Array | None = param(
-        "m", "(T,) estimated maximum distance of a node from the full model; None: not estimated", default=None
+        "m", "(T,) estimated maximum distance of a node from the full model; None if not estimated", default=None
     )
-    reactions: jax.Array | None = param("N", "(T, V, 3) of the full model; only together with error", default=None)
+    reactions: jax.Array | None = param("N", "(T, V, 3) of the full model; None if error is None", default=None)
     pressure_error: jax.Array | None = param(
-        "Pa", "(T,) estimated maximum error of the fluid's pressure; only with error, if porous", default=None
+        "Pa",
+        "(T,) estimated maximum error of the fluid pressure; None if error is None, or without a fluid",
+        default=None,
     )
 
 
@@ -77,7 +79,7 @@ class _Given(NamedTuple):
 
 
 def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
-    """Loads and prescribed motion of all steps, and the load (n,) at the beginning of the run."""
+    """Return loads and prescribed motion of all steps, and the load (n,) at the beginning of the run."""
     mesh, solve, body = scene.mesh, scene.solve, scene.body
     weight = {} if body is None else {k: getattr(body, k) for k in ("density", "gravity", "times", "history")}
     loads = Loads(traction=scene.traction, **weight)
@@ -102,7 +104,7 @@ def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
 
 
 def _prescribed_steps(scene: Scene) -> jax.Array:
-    """Prescribed displacements (T, V, 3) [m] at the end of every step."""
+    """Return the prescribed displacements (T, V, 3) [m] at the end of every step."""
     mesh, solve = scene.mesh, scene.solve
     numbers = jnp.arange(1, solve.steps + 1, dtype=mesh.points.dtype)
     times = jnp.zeros_like(numbers) if solve.dt is None else solve.dt * numbers
@@ -110,7 +112,8 @@ def _prescribed_steps(scene: Scene) -> jax.Array:
 
 
 def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
-    """Deformation gradients of the prescribed motion at the points: (T, 9, S), or (1, 9, S) without motion."""
+    """Return the deformation gradients of the prescribed motion at the points, (T, 9, S), or (1, 9, S) without
+    motion."""
     mesh, solve = scene.mesh, scene.solve
 
     def moved(k: jax.Array) -> jax.Array:
@@ -118,15 +121,16 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
         u = prescribed(mesh, scene.displaced, time, k / solve.steps)
         return flat_gradient(mesh, mesh.points + u)[:, model.points]
 
-    if not scene.displaced:  # no node has moved
+    if not scene.displaced:  # no prescribed motion
         return jnp.tile(jnp.eye(3, dtype=mesh.points.dtype).reshape(9, 1), len(model.points))[None]
     return jax.lax.map(moved, jnp.arange(1, solve.steps + 1, dtype=mesh.points.dtype))
 
 
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
-    """The beginning of a run: coordinates, memory, fluid, motion at rest, an empty inverse, and the mass matrix.
+    """Return the initial state: coordinates, viscous memory, fluid, velocity and acceleration, a zero matrix in place
+    of the inverse tangent, and the mass matrix.
 
-    Without inertia, motion and mass are None.
+    Motion and mass are None without inertia.
     """
     n, S = model.number_of_modes, model.weights.shape[0]
     q = jnp.zeros(n, model.modes.dtype)
@@ -149,7 +153,8 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
 
 
 def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> jax.Array:
-    """Forces (n,) [N] of a given pressure at rest, as in `liverjax.simulation.equations.initial_state`."""
+    """Return the reduced forces (n,) [N] of a given initial pressure, as in
+    `liverjax.simulation.equations.initial_state`."""
     sponge = reduced_sponge(model, scene)
     flow = flowing(model, sponge, fluid, jnp.asarray(scene.solve.dt))
     p = pressure_coordinates(flow, flow.J)
@@ -157,9 +162,9 @@ def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> 
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
-    """A function for one step: (state before the step, loads) -> (state after the step, row of the result).
+    """Return a function for one step: (state before the step, loads) -> (state after the step, results of the step).
 
-    The state consists of coordinates, memory, fluid, motion and inverse.
+    The state consists of coordinates, viscous memory, fluid, velocity and acceleration, and inverse tangent.
     """
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
@@ -217,11 +222,11 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
 
     Args:
         model: `ReducedModel`, from `reduce_scene` or `load_reduced`.
-        scene: the scene for which the model was made. Parameters of law, regions, viscosity and body, loads and the
-            time step may differ.
+        scene: the scene for which the model was made. Loads, the time step, and the parameters of law, regions,
+            viscosity and body may differ.
 
     Raises:
-        InputError: another scene, or numbers that `simulate` also refuses.
+        InputError: the model was made for another scene, or the scene has numbers that are not allowed in `simulate`.
     """
     refuse_another_scene(model, scene)
     check_before_run(scene)
@@ -229,7 +234,7 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
 
 
 def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
-    """Positions (T, V, 3) [m] of the nodes, with or without the learnt correction of the model."""
+    """Return the positions (T, V, 3) [m] of the nodes, with or without the learnt correction of the model."""
     u = _free_motion(model if corrected else replace(model, correction=None), scene, result)
     if scene.displaced:
         u = u + _prescribed_steps(scene)
@@ -237,10 +242,10 @@ def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult, 
 
 
 def reduced_pressure(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
-    """Pressure (T, V) [Pa] of the fluid at the nodes of a porous scene.
+    """Return the pressure (T, V) [Pa] of the fluid at the nodes of a porous scene.
 
     Raises:
-        InputError: a scene without porosity.
+        InputError: the scene has no porosity.
     """
     if model.pressures is None or result.pressures is None:
         raise InputError("this reduced model has no pressures: its scene has no [porosity]")
@@ -248,7 +253,7 @@ def reduced_pressure(model: ReducedModel, scene: Scene, result: ReducedResult) -
 
 
 def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
-    """Displacements (T, V, 3) [m] of the nodes from modes and correction, without the prescribed motion."""
+    """Return the displacements (T, V, 3) [m] of the nodes from modes and correction, without the prescribed motion."""
     u = jnp.tensordot(result.coordinates, model.modes, axes=1)
     if model.correction is not None:
         u = u + correction_at(model.correction, result.coordinates, scene.solve.dt)
@@ -256,22 +261,23 @@ def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> ja
 
 
 def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
-    """Estimated maximum distance (T,) [m] of a node from the full model, up to each step.
+    """Estimate the maximum distance (T,) [m] of a node from its position in the full model, up to each step.
 
-    Other than `reduced_error`, it does not use the full mesh, and it may be differentiated, vmapped and jitted. The
-    error of the corrected motion is learnt from left-out runs. Without the correction the motion is less accurate, but
-    the size of the correction is a good estimate of its error (`experiments/TABLES.md` has both).
+    Unlike `reduced_error`, this function does not use the full mesh, and it may be differentiated, vmapped and jitted.
+    The error of the corrected motion is learnt from runs that were left out in a cross-validation. The uncorrected
+    motion is less accurate. Its error is estimated well by the size of the correction. `experiments/TABLES.md` compares
+    the two estimates.
 
     Args:
         model, scene, result: as in `simulate_reduced`.
         corrected: whether the estimate is for `reduced_positions` with the correction.
 
     Raises:
-        InputError: a model without a correction (made from too few rows, or no correction reduced the errors); numbers
-            that do not occur in the rows (a traced scene passes).
+        InputError: the model has no correction (too few training runs, or no correction reduced the errors); the scene
+            has numbers that do not occur in the training runs (a traced scene is not checked).
     """
     if model.correction is None:
-        raise InputError("this reduced model has no correction: make it from more rows, or take lj.reduced_error")
+        raise InputError("this reduced model has no correction: train it with more rows, or use lj.reduced_error")
     refuse_unseen_numbers(model, scene)
     if not corrected:
         return size_at(model.correction, result.coordinates, scene.solve.dt)

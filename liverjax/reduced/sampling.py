@@ -1,10 +1,9 @@
-"""Selection of points, and of non-negative weights with which these points give the reduced forces of the training
-runs.
+"""Select a few integration points, with non-negative weights, that give the reduced forces of the training runs.
 
-The contributions of all points to the reduced forces are a matrix G (rows, P). The forces are the sums of its rows. G
-is reduced to its largest singular vectors. Then the least-squares problem G xi = G 1 with xi >= 0 is solved by the
-method of Lawson and Hanson. Its solution has few entries above 0: at most as many points as singular vectors
-(Hernandez, Caicedo, Ferrer 2017).
+The contributions of all P integration points to the reduced forces form a matrix G. It has one row for each reduced
+force in each training state, and the sum of a row is this force. G is replaced by its most important singular vectors.
+Then the least-squares problem G xi = G 1 with xi >= 0 is solved by the method of Lawson and Hanson. The solution xi has
+few positive entries: at most as many points as singular vectors (Hernandez, Caicedo, Ferrer 2017).
 """
 
 from collections.abc import Callable, Mapping
@@ -35,42 +34,43 @@ from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.tensors.matrices import determinant
 from liverjax.tensors.principal_fields import principal_fields
 
-#: Maximum number of states with forces that are used: memory and time grow with it.
+#: Maximum number of states from which forces are used. Memory and time increase with this number.
 MOST_STATES = 240
-#: A state is left out if its forces cause a motion below this fraction of the largest coordinate: roundoff [1].
+#: A state is left out if its forces cause a motion below this fraction [1] of the largest coordinate (roundoff).
 LEAST_MOTION = 1e-9
 
 
 class Coordinates(NamedTuple):
     """Coordinates of R runs of T steps."""
 
-    q: np.ndarray | jax.Array  # of the modes (R, T, n) [m]
-    p: np.ndarray | jax.Array | None  # of the modes of the pressure (R, T, m) [Pa]
+    q: np.ndarray | jax.Array  # coordinates of the modes (R, T, n) [m]
+    p: np.ndarray | jax.Array | None  # coordinates of the pressure modes (R, T, m) [Pa]
 
 
 def sampled(
     whole: ReducedModel, scene: Scene, values: Mapping[str, Any], runs: Coordinates, tolerance: float
 ) -> ReducedModel:
-    """The model with few points, from a model with all points and the coordinates of runs of R rows.
+    """Return the model with few points, from a model with all points and the coordinates of R training runs.
 
-    States at rest are left out. States with an inverted element are left out, too, if the law has no force there.
+    States at rest are left out. States with an inverted element are also left out if the law has no finite stress
+    there.
 
     Args:
         whole: model from `with_all_points`.
         scene: `Scene`.
-        values: dotted names -> values (R, …).
+        values: dotted names -> values of the training runs (R, …).
         runs: coordinates of these runs.
-        tolerance: fraction of the motions that these forces cause that may be left out [1].
+        tolerance: reduced forces are converted to motions. This fraction of the motions may be left out [1].
     """
     compliance, rows, q = _reduced_compliance(whole, scene), [], runs.q
     for r, times in states_of(*q.shape[:2]):
         own = with_parameters(scene, {name: jnp.asarray(v[r]) for name, v in values.items()})
         p = None if runs.p is None else jnp.asarray(runs.p[r])
         forces, volumes = _contributions(whole, own, (jnp.asarray(q[r]), p), jnp.asarray(times))
-        # Forces are converted to motions, since forces of stiff modes are large but cause little motion.
+        # Forces are converted to motions, because forces on stiff modes are large but cause little motion.
         G = compliance @ np.asarray(forces)
         size = np.linalg.norm(G.sum(axis=2), axis=1)
-        # If the modes invert an element, some laws have no force there. A state at rest has no forces.
+        # In an inverted element, some laws have no finite stress. A state at rest has no forces.
         good = np.isfinite(G).all(axis=(1, 2)) & (size > LEAST_MOTION * np.abs(q).max())
         rows.append((G[good] / size[good, None, None]).reshape(-1, whole.weights.size))
         if volumes is not None:
@@ -81,16 +81,17 @@ def sampled(
 
 
 def _balances(volumes: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Rows (…, P) of both sides of the fluid's balance (2, K, m, P), as pressures.
+    """Return rows (…, P) of the matrix G for both sides of the fluid's volume balance (2, K, m, P), given as pressures.
 
-    They are divided by the norm of their sum over the points plus the norm of p (K, m).
+    Each row is divided by the scale of its state: the norm of the pressures from the change of volume, plus the norm of
+    p (K, m).
     """
     size = np.linalg.norm(volumes[0].sum(axis=2), axis=1) + np.linalg.norm(p, axis=1)
     return (volumes / np.where(size > 0, size, 1.0)[:, None, None]).reshape(-1, volumes.shape[-1])
 
 
 def _at(whole: ReducedModel, points: np.ndarray, weights: jax.Array) -> ReducedModel:
-    """The model at some of its points, with other weights."""
+    """Return the model at some of its points, with other weights."""
     fluid = whole.pressures
     if fluid is not None:
         fluid = replace(
@@ -100,10 +101,10 @@ def _at(whole: ReducedModel, points: np.ndarray, weights: jax.Array) -> ReducedM
 
 
 def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
-    """Runs, and for each run the steps of which forces are used.
+    """Return numbers of runs, and for each of them the numbers of the steps from which forces are used.
 
-    The steps are evenly spaced, with another first step in every run. So all times are used, even if each run gives few
-    steps: the first steps of a run have no large motion.
+    The steps are evenly spaced, with a different first step in every run. So all times are used, even if only few steps
+    of each run are used. The first steps of a run alone would contain no large motion.
     """
     chosen = np.unique(np.linspace(0, runs - 1, min(runs, MOST_STATES)).round().astype(int))
     each = min(steps, max(1, MOST_STATES // len(chosen)))
@@ -114,7 +115,7 @@ def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
 
 
 def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
-    """Inverse of the reduced stiffness of the reference shape (n, n) [m/N]."""
+    """Return the inverse (n, n) [m/N] of the reduced stiffness in the reference shape."""
     modes = np.asarray(whole.modes).reshape(whole.number_of_modes, -1)
     K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), scene.mesh.points)
     springs = reduced_springs(whole.modes, scene)
@@ -125,9 +126,10 @@ def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
 def _contributions(
     whole: ReducedModel, scene: Scene, run: tuple[jax.Array, jax.Array | None], times: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Contributions of each point to the reduced forces (K, n, P), at some times of a run.
+    """Return the contributions (K, n, P) [N] of each point to the reduced forces, at K steps `times` of a run.
 
-    `run` has its coordinates (T, n) and (T, m). In a porous scene the second result is the one of `_balance`.
+    `run` contains the coordinates of motion (T, n) and pressure (T, m) of the run. The second result is the result of
+    `_balance`, or None without a fluid.
     """
     solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
     F0, (q, p) = prescribed_gradients(whole, scene), run
@@ -155,13 +157,14 @@ def _contributions(
 def _balance(
     whole: ReducedModel, scene: Scene, gradient: Callable[[jax.Array], jax.Array], p: jax.Array, times: jax.Array
 ) -> jax.Array:
-    """Contributions of each point to both sides of the fluid's balance, as pressures (2, K, m, P).
+    """Return the contributions of each point to both sides of the fluid's volume balance, as pressures (2, K, m, P)
+    [Pa].
 
-    One side is the change of volume, the other one storage and flow.
+    One side is the change of volume. The other side is storage and flow.
 
     Args:
         whole, scene: as in `sampled`.
-        gradient: function (number of a step, from 0) -> deformation gradients (9, P) at the end of the step.
+        gradient: function (number of a step, from 0) -> deformation gradients (9, P) at the end of this step.
         p: coordinates of the pressure (T, m) [Pa].
         times: numbers of K steps.
     """
@@ -185,10 +188,11 @@ def _balance(
 
 
 def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Factors xi (P,) with G xi close to G 1. Few of them are above 0, and the total volume is nearly kept.
+    """Return non-negative factors xi (P,) with G xi close to G 1. Few factors are above 0, and the total volume is
+    nearly unchanged.
 
     Args:
-        G: contributions (rows, P).
+        G: contributions of the P points (rows, P).
         volumes: volumes of the points (P,).
         tolerance: fraction of G that may be left out [1].
     """
@@ -196,9 +200,9 @@ def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) ->
 
     if not len(G):
         raise InputError(
-            "the runs give no forces from which points can be chosen: give at least two rows with different parameters"
+            "the runs contain no forces for a selection of points: give at least two rows with different parameters"
         )
-    # The rows have length 1, so small singular vectors have the same weight as large ones.
+    # These rows have length 1, so singular vectors of small singular values have the same weight as the others.
     V = principal_fields(G, tolerance)
     V = np.concatenate([V, volumes[None] / np.linalg.norm(volumes)])
     return nnls(V, V.sum(axis=1), maxiter=20 * V.shape[1])[0]

@@ -1,12 +1,12 @@
-"""A static displacement as a sum of products: a field in space times one function of each parameter.
+"""A static displacement as a sum of products. Each product is a field in space times one function of each parameter:
 
     u(x, p_1 ... p_n) = sum over m of w_m(x) f_m1(p_1) ... f_mn(p_n)
 
 This is the form of proper generalised decomposition (chapter, section 3.3; Chinesta, Ladeveze, Cueto 2011, Arch.
-Comput. Methods Eng. 18, 395). Laws of soft tissue are not such products, so the terms are computed from full runs at a
-grid of parameters. The terms are found one after another, by alternating least squares on what the earlier terms leave
-out. After each term all fields w_m are computed again by least squares. The functions of a parameter are Chebyshev
-polynomials.
+Comput. Methods Eng. 18, 395). The equations of soft tissue do not separate in this way, so the terms are computed from
+full runs at a grid of parameters. The terms are found one after another: each term is fitted by alternating least
+squares to the remainder after the earlier terms. After each term all fields w_m are computed again by least squares.
+The functions of a parameter are Chebyshev polynomials.
 """
 
 import itertools
@@ -25,23 +25,23 @@ from liverjax.scenes.checks.numbers import check_numbers
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.simulation.batch import simulate_batch
 
-#: Maximum number of parameters, and of runs of the grid.
+#: Maximum number of parameters, and maximum number of runs of the grid.
 MOST_PARAMETERS, MOST_RUNS = 4, 2000
-#: Maximum number of sweeps of alternating least squares for a term, and the relative change at which they end.
+#: SWEEPS: maximum number of sweeps of alternating least squares for a term. SETTLED: relative change at which they end.
 SWEEPS, SETTLED = 50, 1e-6
 
 
 @struct
 class SeparatedModel:
-    """M terms of a displacement that depends on n parameters."""
+    """The M terms of a static displacement that depends on n parameters."""
 
     fields: jax.Array = param("m", "w (M, V, 3)")
-    functions: tuple[jax.Array, ...] = param("1", "of each parameter: coefficients of Chebyshev polynomials (M, k)")
+    functions: tuple[jax.Array, ...] = param("1", "for each parameter, coefficients of Chebyshev polynomials (M, k)")
     ranges: jax.Array = param("1", "lowest and highest value of each parameter (n, 2)")
     left_out: jax.Array = param(
-        "1", "fraction of the grid's displacements that the terms leave out, root of mean squares"
+        "1", "fraction of the displacements at the grid that the terms leave out (root mean square)"
     )
-    error: jax.Array = param("1", "at other runs (c,): maximum distance of a node over the largest displacement")
+    error: jax.Array = param("1", "maximum error of a node in c other runs, over the largest displacement (c,)")
     names: tuple[str, ...] = static(default=(), about="dotted names of the parameters")
 
 
@@ -53,18 +53,18 @@ def separate(
     most_terms: int = 50,
     checks: int = 8,
 ) -> SeparatedModel:
-    """The separated form of a static scene's displacement, and its error at other runs.
+    """Compute the separated form of a static scene's displacement, and its error in runs outside of the grid.
 
     Args:
-        scene: `Scene` without time. The displacement is the one of its last load step.
+        scene: `Scene` without time. The displacement at the last load step is used.
         ranges: dotted names (as in `with_parameters`) of one to four single numbers -> lowest and highest value.
-        points: number of grid points along each parameter; there are points ** n full runs.
-        tolerance: fraction of the grid's displacements that the terms may leave out.
+        points: number of grid points for each parameter. This needs points ** n full runs.
+        tolerance: fraction of the displacements at the grid that the terms may leave out.
         most_terms: maximum number of terms.
-        checks: number of runs at random parameters (seed 0) that give the error.
+        checks: number of runs at random parameters (seed 0) from which the error is computed.
 
     Raises:
-        InputError: a scene with time, unusable ranges, too many runs, a run that did not converge.
+        InputError: the scene has time, a range cannot be used, there are too many runs, or a run did not converge.
     """
     names, limits = _names_and_limits(scene, ranges, points)
     t = np.cos(np.pi * (np.arange(points) + 0.5) / points)  # Chebyshev's points in (-1, 1)
@@ -93,16 +93,17 @@ def separate(
 
 
 def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> jax.Array:
-    """Displacements (V, 3) [m] at one value of each parameter; may be differentiated, vmapped and jitted.
+    """Return the displacements (V, 3) [m] for one value of each parameter.
 
-    If a traced value is outside of the model's range, the displacements and their derivatives are NaN.
+    The function may be differentiated, vmapped and jitted. If a traced value is outside of the model's range, the
+    displacements and their derivatives are NaN.
 
     Raises:
-        InputError: a parameter without a value, a value without a parameter, or a value outside of the model's range.
+        InputError: a parameter has no value, a value has no parameter, or a value is outside of the model's range.
     """
     wrong = sorted(set(model.names) ^ set(values))
     if wrong:
-        raise InputError(f"the separated form is for {', '.join(model.names)}: leave out or give {wrong[0]}")
+        raise InputError(f"the parameters of this model are {', '.join(model.names)}: leave out or give {wrong[0]}")
     product = jnp.ones(model.fields.shape[0], model.fields.dtype)
     for name, function, (low, high) in zip(model.names, model.functions, model.ranges, strict=True):
         value = jnp.asarray(values[name], model.fields.dtype)
@@ -111,14 +112,14 @@ def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> 
                 f"{name} = {float(value):g} is outside of {float(low):g} to {float(high):g}: make the model with a "
                 "wider range"
             )
-        # Outside of the range polynomials grow fast, so that neither value nor derivative would be correct there.
+        # Polynomials grow fast outside of the range, so neither value nor derivative would be correct there.
         value = value * jnp.where((low <= value) & (value <= high), 1.0, jnp.nan)
         product = product * (function @ _chebyshev(2 * (value - low) / (high - low) - 1, function.shape[1]))
     return jnp.tensordot(product, model.fields, axes=1)
 
 
 def _chebyshev(t: jax.Array, number: int) -> jax.Array:
-    """The first Chebyshev polynomials at t: (number,)."""
+    """Return the values (number,) of the first Chebyshev polynomials at t."""
     out = [jnp.ones_like(t), t]
     for _ in range(number - 2):
         out.append(2 * t * out[-1] - out[-2])
@@ -128,20 +129,20 @@ def _chebyshev(t: jax.Array, number: int) -> jax.Array:
 def _names_and_limits(
     scene: Scene, ranges: Mapping[str, tuple[float, float]], points: int
 ) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names and limits (n, 2) of the parameters."""
+    """Check the ranges, and return names and limits (n, 2) of the parameters."""
     if scene.solve.kind != "static" or scene.solve.dt is not None:
-        raise InputError("a separated form is for a static answer: give a scene of kind 'static' without dt")
+        raise InputError("a separated form needs a static solution: give a scene of kind 'static' without dt")
     if scene.points_are == "loaded":
-        raise InputError('[mesh] is = "loaded" has no separated form: take the scene of lj.unloaded(scene)')
+        raise InputError('[mesh] is = "loaded" has no separated form: use the scene of lj.unloaded(scene)')
     if not 1 <= len(ranges) <= MOST_PARAMETERS:
         raise InputError(f"ranges has {len(ranges)} parameters: give 1 to {MOST_PARAMETERS}")
     if points < 2 or points ** len(ranges) > MOST_RUNS:
         raise InputError(
-            f"points = {points} means {points ** len(ranges)} runs: give 2 or more, {MOST_RUNS} runs at most"
+            f"points = {points} needs {points ** len(ranges)} runs: give 2 points or more, and {MOST_RUNS} runs at most"
         )
     for name, limits in ranges.items():
         if np.ndim(numbers_at(scene, name)) != 0:
-            raise InputError(f"{name} is not one number: name one of them, e.g. {name}.0")
+            raise InputError(f"{name} has several numbers: name one of them, e.g. {name}.0")
         if np.shape(limits) != (2,) or not np.all(np.isfinite(limits)) or not limits[0] < limits[1]:
             raise InputError(f"ranges[{name!r}] = {limits!r} is not a range: give the lowest and the highest value")
     for corner in itertools.product(*ranges.values()):
@@ -155,7 +156,7 @@ def _names_and_limits(
 
 
 def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np.ndarray:
-    """Displacements of the full model at every row: (N, V, 3) [m]."""
+    """Return the displacements (N, V, 3) [m] of the full model for every row of parameters (N, n)."""
     result = simulate_batch(scene, {name: rows[:, k] for k, name in enumerate(names)}).result
     bad = np.flatnonzero(np.any(np.asarray(result.status) != status.CONVERGED, axis=1))
     if len(bad):
@@ -170,14 +171,15 @@ def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np
 def _terms(
     known: np.ndarray, shape: tuple[int, ...], tolerance: float, most: int
 ) -> tuple[np.ndarray, list[np.ndarray], float]:
-    """Products of the terms at the grid (N, M), their factors, each (M, points), and the fraction that is left out.
+    """Return the products of the terms at the grid (N, M), the factors (M, points) for each parameter, and the fraction
+    that is left out.
 
     Args:
-        known: displacements at the grid (N, 3 V), times the roots of the volumes.
+        known: displacements at the grid (N, 3 V), times the square roots of the nodal volumes.
         shape: shape of the grid.
         tolerance, most: as `tolerance` and `most_terms` in `separate`.
     """
-    # Coordinates in the space that the runs span: at most one number for each run.
+    # Coordinates in the space that the N runs span, so each run has at most N coordinates.
     U, S, _ = np.linalg.svd(known, full_matrices=False)
     data = U * S
     size, left = np.linalg.norm(data), data
@@ -196,7 +198,7 @@ def _terms(
 
 
 def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
-    """Unit factors of the product that is closest to a tensor, for all axes except the last."""
+    """Return the product of vectors that is closest to a tensor: unit vectors for all axes except the last."""
     n = tensor.ndim
     # The iteration begins with the first singular vector of each axis.
     factors = [np.linalg.svd(np.moveaxis(tensor, a, 0).reshape(tensor.shape[a], -1))[0][:, 0] for a in range(n - 1)]
@@ -216,7 +218,7 @@ def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
 
 
 def _against(tensor: np.ndarray, factors: list[np.ndarray | None]) -> np.ndarray:
-    """The tensor contracted with all factors. Axes without a factor are kept."""
+    """Return the tensor contracted with the given factors. Axes with the factor None are not contracted."""
     out = tensor
     for a in reversed(range(tensor.ndim)):
         f = factors[a]

@@ -1,7 +1,8 @@
-"""A step of a reduced model: equations with stresses only at the sampled points, and their solution.
+"""Equations of one step of a reduced model, with stresses only at the sampled points, and the solution of these
+equations.
 
-Newton's method keeps an inverse from step to step and updates it with the changes of the forces (a quasi-Newton
-method). A new tangent is computed only if the residual decreases too little.
+Newton's method uses an inverse tangent from earlier steps, which is updated with the changes of the forces
+(quasi-Newton method). A new tangent is computed only if the residual decreases too little.
 """
 
 from collections.abc import Callable
@@ -42,27 +43,28 @@ class ReducedMotion(NamedTuple):
 
 
 class ReducedEquations(NamedTuple):
-    """The constants of a step."""
+    """Quantities that are constant during a step."""
 
     model: ReducedModel
-    acting: Solid
-    load: jax.Array
-    gradient: jax.Array
+    acting: Solid  # stress of the solid, with the viscous memory of the step before
+    load: jax.Array  # loads on the modes (n,) [N]
+    gradient: jax.Array  # deformation gradients of the prescribed motion (9, S)
     mass: jax.Array | None  # (n, n) [kg]
-    q: jax.Array  # at the beginning
+    q: jax.Array  # coordinates at the beginning of the step (n,) [m]
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
-    spread: jax.Array | None  # absolute values of the slopes (9, S, n) [1/m] if motion is prescribed
-    noise: jax.Array  # size of forces [N] with roundoff equal to the tolerance; the only scale without loads
-    fluid: Flowing | None  # of a porous scene
-    light: SinglePrecision
-    steepest: jax.Array  # root of the sum of squares of all slopes [1/m]
+    spread: jax.Array | None  # absolute values of the mode gradients (9, S, n) [1/m] if motion is prescribed
+    noise: jax.Array  # [N] forces of this size have a roundoff equal to the tolerance; the only scale without loads
+    fluid: Flowing | None  # fluid of a porous scene
+    light: SinglePrecision  # mode gradients in single precision
+    steepest: jax.Array  # root of the sum of squares of all mode gradients [1/m]
     springs: jax.Array | None = None  # stiffness of elastic supports (n, n) [N/m]
 
 
 def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
-    """Velocity and acceleration at q, as in `liverjax.physics.inertia.Moving.kinematics`."""
+    """Return velocity and acceleration for coordinates q at the end of the step, as in
+    `liverjax.physics.inertia.Moving.kinematics`."""
     assert e.motion is not None
     velocity = (q - e.q) / e.dt
     acceleration = (velocity - e.motion.velocity) / e.dt
@@ -75,19 +77,19 @@ def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
 
 
 def gradients_at(e: ReducedEquations, q: jax.Array) -> jax.Array:
-    """Deformation gradients (9, S) of the points at coordinates q (n,)."""
+    """Return the deformation gradients (9, S) of the points for coordinates q (n,)."""
     return e.gradient + e.model.slopes @ q
 
 
 def _stresses(solid: Solid, F: jax.Array) -> jax.Array:
-    """First Piola-Kirchhoff stress (9, S) at deformation gradients (9, S)."""
+    """Return the first Piola-Kirchhoff stress (9, S) [Pa] for deformation gradients F (9, S)."""
     return jnp.stack([jnp.broadcast_to(entry, F.shape[1:]) for row in solid.stress(as_matrix(F)) for entry in row])
 
 
 def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
-    """Roundoff of the forces of a stretch along x, over the tolerance [N].
+    """Return the roundoff of the forces of a unit stretch along x, divided by the tolerance [N].
 
-    It corresponds to `liverjax.simulation.equations.Equations.noise`.
+    It has the same purpose as `liverjax.simulation.equations.Equations.noise`: a scale for residuals without loads.
     """
     own = solid_at_points(model, replace(scene, viscosity=None))
     assert isinstance(own, Elasticity)
@@ -98,13 +100,14 @@ def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _residual(e: ReducedEquations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces (n,) and the size of all forces, at q and its deformation gradients F (9, S)."""
+    """Return out-of-balance forces (n,) and the size of all forces, for coordinates q and their deformation gradients F
+    (9, S)."""
     P = _point_forces(e, F)
     return _unbalanced(e, q, P, _added_up(e, P))
 
 
 def _point_forces(e: ReducedEquations, F: jax.Array) -> jax.Array:
-    """Stresses times weights (9, S) [N m] of the points."""
+    """Return stress times weight (9, S) [N m] at every point."""
     P = _stresses(e.acting, F)
     if e.fluid is not None:
         p = pressure_coordinates(e.fluid, determinant(as_matrix(F)))
@@ -113,15 +116,22 @@ def _point_forces(e: ReducedEquations, F: jax.Array) -> jax.Array:
 
 
 def _added_up(e: ReducedEquations, P: jax.Array) -> jax.Array:
-    """Forces (n,) [N] on the modes, from the forces of the points (9, S)."""
+    """Return the forces (n,) [N] on the modes, from stress times weight at the points (9, S)."""
     return jnp.tensordot(P, e.model.slopes, axes=2)
 
 
 def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces (n,) and the size of all forces, from the points' forces (9, S) and their sum (n,)."""
+    """Return out-of-balance forces (n,) [N] and the size of all forces [N].
+
+    Args:
+        e: constants of the step.
+        q: coordinates (n,) [m].
+        P: stress times weight at the points (9, S) [N m].
+        internal: forces of P on the modes (n,) [N].
+    """
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:
-        # Without loads the forces of the points cancel at the solution: the sum of their sizes is then the scale.
+        # Without loads, the forces of the points cancel at the solution. So the sum of their sizes is the scale.
         size = size + jnp.linalg.norm(jnp.tensordot(jnp.abs(P), e.spread, axes=2))
     if e.springs is not None:
         pull = e.springs @ q
@@ -133,7 +143,8 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
 
 
 def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
-    """Derivative of the residual, from the blocks of elements with the axes as shape vectors."""
+    """Return the derivative of the residual with respect to q. The moduli are the stiffness blocks of elements with the
+    unit vectors in place of the gradients of the shape functions."""
     F = gradients_at(e, q)
     blocks = e.acting.blocks(as_matrix(F), list(IDENTITY), _PAIRS)
     if e.fluid is not None:
@@ -156,7 +167,7 @@ def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
 
 
 class _Found(NamedTuple):
-    """The end of a step, and the inverse with which the next step begins."""
+    """The state at the end of a step, and the inverse tangent for the beginning of the next step."""
 
     q: jax.Array
     residual: jax.Array
@@ -165,34 +176,35 @@ class _Found(NamedTuple):
 
 
 class _ReducedIterate(NamedTuple):
-    """State of the iterations of a step."""
+    """State of the iterations within a step."""
 
     q: jax.Array
-    F: jax.Array  # (9, S)
-    P: jax.Array  # forces of the points (9, S)
-    internal: jax.Array  # their sum on the modes (n,)
-    r: jax.Array
+    F: jax.Array  # deformation gradients (9, S)
+    P: jax.Array  # stress times weight at the points (9, S) [N m]
+    internal: jax.Array  # forces of P on the modes (n,) [N]
+    r: jax.Array  # out-of-balance forces (n,) [N]
     size: jax.Array  # norm of r, relative to the size of all forces
-    rounded: jax.Array  # bound on the error of `size` by single precision
-    inverse: jax.Array  # of the tangent, exact or approximate (n, n) [m/N]
-    fresh: jax.Array  # the inverse is the inverse of the tangent at q
-    slow: jax.Array  # the last iteration reduced the residual too little
+    rounded: jax.Array  # bound of the error of `size` due to single precision
+    inverse: jax.Array  # exact or approximate inverse of the tangent (n, n) [m/N]
+    fresh: jax.Array  # whether `inverse` is the inverse of the tangent at q
+    slow: jax.Array  # whether the last iteration reduced the residual too little
     iterations: jax.Array
-    tangents: jax.Array
+    tangents: jax.Array  # number of computed tangents
 
 
-#: If an iteration leaves more than this fraction of the residual, a new tangent is made. It costs ten iterations.
+#: If an iteration leaves more than this fraction of the residual, a new tangent is computed, at the cost of ten
+#: iterations.
 _LITTLE_GAIN = 0.95
-#: If the error by single precision exceeds this fraction of the tolerance, forces are computed again in double
+#: If the error due to single precision exceeds this fraction of the tolerance, forces are computed again in double
 #: precision.
 _DOUBT = 0.1
 
 
 def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Array:
-    """The inverse, updated to the change of the forces along the last motion. It stays symmetric and positive.
+    """Return the inverse tangent, updated with the change of the forces due to the last motion.
 
-    This is the update of Broyden, Fletcher, Goldfarb and Shanno (1970). If the forces decrease along the motion, no
-    positive inverse fits, and the old one is kept.
+    This is the update of Broyden, Fletcher, Goldfarb and Shanno (1970), which keeps the inverse symmetric and positive
+    definite. If the forces decrease along the motion, no positive definite inverse fits, and the old one is kept.
     """
     work, towards = moved @ change, inverse @ change
     seen = work > 1e-8 * jnp.linalg.norm(moved) * jnp.linalg.norm(change)
@@ -202,7 +214,7 @@ def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Arr
 
 
 def _in_double_precision(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
-    """The iterate with forces computed from its coordinates and gradients in double precision."""
+    """Return the iterate with forces that are computed in double precision from its deformation gradients."""
     P = _point_forces(e, at.F)
     internal = _added_up(e, P)
     r, size = _relative_residual(e, at.q, P, internal)
@@ -221,9 +233,10 @@ def _upright(F: jax.Array) -> jax.Array:
 
 
 def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
-    """One iteration with the present inverse, which is then updated with the new forces.
+    """Return the iterate after one iteration with the present inverse. The inverse is updated with the new forces.
 
-    Changes of gradients and forces are small, so single precision is enough for them. It takes half the time.
+    Changes of deformation gradients and forces are small, so they are computed in single precision, which takes half
+    the time.
     """
     dq = at.inverse @ at.r
     dF = (e.light.slopes @ dq.astype(jnp.float32)).astype(dq.dtype)
@@ -237,11 +250,11 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
     more = jnp.tensordot(change.astype(jnp.float32), e.light.slopes, axes=2).astype(dq.dtype)
     internal = at.internal + more
     r, size = _relative_residual(e, q, P, internal)
-    # A bound on the roundoff of the products in r, relative to the size of all forces.
+    # A bound of the roundoff of the matrix products in r, relative to the size of all forces.
     lost = float(jnp.finfo(jnp.float32).eps) * e.steepest * jnp.linalg.norm(change) * size
     rounded = at.rounded + lost / jnp.maximum(jnp.linalg.norm(r), jnp.finfo(r.dtype).tiny)
     inverse = _updated(at.inverse, -part * dq, r - at.r)
-    # With an old inverse |r| may grow: then the step is not taken.
+    # With an old inverse |r| may grow. Then the iteration is rejected.
     before, after = jnp.linalg.norm(at.r), jnp.linalg.norm(r)
     good = at.fresh | (after < before)
     no = jnp.array(False)
@@ -252,9 +265,16 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, inverse: jax.Array) -> _Found:
-    """The coordinates at the end of a step. `inverse` is the one of the previous step; zeros: there is none yet.
+    """Return the coordinates at the end of a step.
 
-    The derivatives are the derivatives of the solution.
+    Derivatives of this function are those of the exact solution, not those of the iterations.
+
+    Args:
+        newmark: whether the time integrator is Newmark's method.
+        most: maximum number of tangents.
+        e: constants of the step.
+        tolerance: of the relative residual.
+        inverse: inverse tangent of the previous step (n, n) [m/N]; zeros in the first step.
     """
     arrays, tree = jax.tree.flatten((e, tolerance, inverse))
 
@@ -266,10 +286,10 @@ def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, i
 
 
 def _lane_by_lane(function: Callable) -> Callable:
-    """The function of arrays, for which vmap runs its lanes one after another.
+    """Return a version of the function for which vmap runs the batch entries (lanes) one after another.
 
-    On a CPU all lanes would otherwise wait for the slowest lane, and for every new tangent of any lane. This replaces
-    `jax.custom_batching.sequential_vmap`, which fails in second derivatives.
+    On a CPU, all lanes would otherwise wait for the slowest lane and for every new tangent in any lane. This function
+    replaces `jax.custom_batching.sequential_vmap`, which fails in second derivatives.
     """
     own = jax.custom_batching.custom_vmap(function)
 
@@ -288,7 +308,8 @@ def _lane_by_lane(function: Callable) -> Callable:
 
 
 def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, inverse: jax.Array) -> _Found:
-    """Newton's method with a kept inverse. A new tangent is made only if iterations reduce the residual too little."""
+    """Solve the step by Newton's method with the inverse of earlier steps. A new tangent is computed only if the
+    iterations reduce the residual too little."""
     e = e._replace(newmark=newmark)
 
     def unfinished(at: _ReducedIterate) -> jax.Array:
@@ -311,8 +332,8 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
 
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
-        # A parabola or a cubic through the last coordinates: whichever would have predicted the last step better.
-        # Accelerations of Newmark's method oscillate, so they are not used for a prediction.
+        # The prediction is a parabola or a cubic through the last coordinates, whichever would have predicted the last
+        # step better. Accelerations of Newmark's method oscillate, so they are not used for a prediction.
         more = jnp.where(e.motion.steady, e.motion.change, 0.0)
         start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = gradients_at(e, start), jnp.zeros((), jnp.int32)
@@ -323,7 +344,7 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     begin = _ReducedIterate(start, F, F, e.q, e.q, zero, zero, inverse, no, no, none, none)
     begin = _in_double_precision(e, begin)
     at = inner(begin)
-    # If the iterations with the old inverse do not converge, the step begins again.
+    # If the iterations with the old inverse do not converge, the iterations begin again at the prediction.
     begin = begin._replace(iterations=at.iterations)
     at = jax.tree.map(lambda old, new: jnp.where(at.size > tolerance, new, old), at, begin)
     at = jax.lax.while_loop(unfinished, lambda at: inner(refreshed(at)), at)
@@ -337,7 +358,8 @@ def _derivative_of_end(newmark: bool, most: int, primals: tuple, tangents: tuple
     found = step_end(newmark, most, *primals)
     without = e._replace(newmark=None)
 
-    # Only with respect to differentiated numbers: derivatives with respect to the slopes would take most of the time.
+    # Only numbers with a tangent are differentiated. Derivatives with respect to the mode gradients would take most of
+    # the time.
     numbers, tree = jax.tree.flatten(without)
     changes = jax.tree.leaves(de)
     live = [k for k, change in enumerate(changes) if not isinstance(change, SymbolicZero)]

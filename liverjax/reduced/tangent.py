@@ -1,9 +1,10 @@
-"""The tangent of a reduced step: products with it, and an approximate inverse that takes half the time.
+"""The tangent of a reduced step: products with the tangent, and an approximate inverse that takes half the time.
 
-The tangent is K = sum_p B_p^T A_p B_p + R, with slopes B_p of the modes and moduli A_p at the points p. The assembly of
-K takes as long as ten products with K, and half of this time in single precision. The inverse N of the single-precision
-matrix is close to the inverse of K. Newton's method uses N. Accurate solves use N in a few corrections x + N (b - K x),
-with products in double precision (iterative refinement: Wilkinson 1963).
+The tangent is K = sum_p B_p^T A_p B_p + R, with the gradients B_p of the modes and the moduli A_p at the points p. R
+contains the terms that do not come from the points. The assembly of K takes as long as ten products with K, and half of
+this time in single precision. The inverse N of the single-precision matrix is close to the inverse of K. Newton's
+method uses N. Accurate solves use N in a few corrections x + N (b - K x), with products in double precision (iterative
+refinement: Wilkinson 1963).
 """
 
 from typing import NamedTuple
@@ -11,14 +12,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-#: Relative residual of a solve, and maximum number of corrections.
+#: LEFT: relative residual at which the corrections end. CORRECTIONS: maximum number of corrections.
 LEFT, CORRECTIONS = 1e-12, 20
-#: If the relative residual after the corrections is above this, the matrix is made in double precision.
+#: If the relative residual after the corrections is above this, K is assembled and factorised in double precision.
 TOO_FAR = 1e-10
 
 
 class SinglePrecision(NamedTuple):
-    """The slopes in two layouts: a product of matrices is faster by a third if no matrix is transposed."""
+    """Gradients of the modes in single precision, in two array layouts. A matrix product is faster by a third if no
+    matrix has to be transposed."""
 
     slopes: jax.Array  # (9, S, n) [1/m]
     flat: jax.Array  # (n, 9 S)
@@ -27,38 +29,38 @@ class SinglePrecision(NamedTuple):
 class ReducedTangent(NamedTuple):
     """The parts of the tangent (n, n) [N/m]."""
 
-    slopes: jax.Array  # (9, S, n) [1/m]
-    moduli: jax.Array  # (9, 9, S) [N m], weights included
-    rest: jax.Array  # inertia and pressures (n, n) [N/m]
+    slopes: jax.Array  # B: gradients of the modes (9, S, n) [1/m]
+    moduli: jax.Array  # A: moduli times weights (9, 9, S) [N m]
+    rest: jax.Array  # R: inertia, springs and pressures (n, n) [N/m]
 
 
 def in_single_precision(slopes: jax.Array) -> SinglePrecision:
-    """The slopes (9, S, n) in single precision."""
+    """Return the gradients of the modes (9, S, n) in single precision."""
     light = jax.lax.stop_gradient(slopes).astype(jnp.float32)
     return SinglePrecision(light, light.reshape(-1, light.shape[-1]).T)
 
 
 def tangent_times(K: ReducedTangent, x: jax.Array) -> jax.Array:
-    """K x (n,)."""
+    """Return K x (n,) [N] for x (n,) [m]."""
     stress = jnp.sum(K.moduli * (K.slopes @ x)[None], axis=1)
     return jnp.tensordot(stress, K.slopes, axes=2) + K.rest @ x
 
 
 def tangent_matrix(K: ReducedTangent) -> jax.Array:
-    """The matrix K (n, n) [N/m]."""
+    """Return the matrix K (n, n) [N/m]."""
     AB = jnp.sum(K.moduli[..., None] * K.slopes[None], axis=1)
     return jnp.tensordot(K.slopes, AB, axes=((0, 1), (0, 1))) + K.rest
 
 
 def near_inverse(K: ReducedTangent, light: SinglePrecision) -> jax.Array:
-    """Approximate inverse of K (n, n) [m/N]: the roundoff in K is that of single precision."""
+    """Return an approximate inverse of K (n, n) [m/N]. K is assembled in single precision."""
     AB = jnp.sum(K.moduli.astype(jnp.float32)[..., None] * light.slopes[None], axis=1)
     near = light.flat @ AB.reshape(-1, AB.shape[-1])
     return jnp.linalg.inv(near.astype(K.rest.dtype) + K.rest)
 
 
 def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -> jax.Array:
-    """The solution x (n,) of K x = b; may be differentiated."""
+    """Return the solution x (n,) of K x = b. The function may be differentiated."""
 
     def solve(_: object, b: jax.Array) -> jax.Array:
         near, limit = near_inverse(K, light), jnp.linalg.norm(b)
@@ -66,7 +68,7 @@ def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -
         def going(at: tuple) -> jax.Array:
             _, r, before, count = at
             size = jnp.linalg.norm(r)
-            # If r is not halved, only roundoff is left, or the inverse is not accurate enough.
+            # If a correction does not halve r, r is roundoff, or the inverse is not accurate enough.
             return (size > LEFT * limit) & (size < 0.5 * before) & (count < CORRECTIONS)
 
         def corrected(at: tuple) -> tuple:

@@ -1,4 +1,5 @@
-"""Modes from runs of the full model (proper orthogonal decomposition of displacements), and choice of the runs."""
+"""Make a reduced model: choose parameter sets, run the full model, and compute modes from the displacements (proper
+orthogonal decomposition)."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -20,18 +21,18 @@ from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation.batch import simulate_batch
 from liverjax.tensors.principal_fields import principal_fields
 
-#: Displacements below this fraction of the body's size count as 0.
+#: Displacements below this fraction of the body's size are regarded as 0.
 _ROUNDOFF = 1e-13
-#: A porous scene has at most one mode of pressure for this number of modes of motion.
+#: A porous scene has at most one pressure mode for this number of displacement modes.
 PRESSURES = 2
 
 
 class _Runs(NamedTuple):
-    """The full runs that converged."""
+    """The R full runs that converged."""
 
-    values: dict[str, np.ndarray]  # the numbers of their rows (R, ...)
+    values: dict[str, np.ndarray]  # dotted names -> parameters of these runs (R, ...)
     u: np.ndarray  # displacements (R, T, V, 3) [m]
-    P: np.ndarray | None  # pressures of the vertices (R, T, V) [Pa], of a porous scene
+    P: np.ndarray | None  # pressures at the vertices (R, T, V) [Pa] in a porous scene
 
 
 def reduce_scene(
@@ -42,21 +43,21 @@ def reduce_scene(
     point_tolerance: float | None = None,
     runs: int | None = None,
 ) -> ReducedModel:
-    """A reduced model of a scene, from full runs with the numbers of some rows.
+    """Make a reduced model of a scene from full runs with different parameters.
 
     Args:
         scene: `Scene`.
-        rows: dotted names -> one value per run, as in `simulate_batch`.
-        tolerance: fraction of the displacements of these runs that the modes may leave out [1], root of mean squares.
+        rows: dotted names -> one value per run, as in `simulate_batch`. A row is the parameter set of one run.
+        tolerance: fraction of the displacements of these runs that the modes may leave out [1], as a root mean square.
         most_modes: maximum number of modes.
-        point_tolerance: fraction of the motions that reduced forces cause that the sampled points may leave out [1];
-            default: `tolerance`.
+        point_tolerance: the reduced forces are converted to motions; the sampled points may leave out this fraction of
+            these motions [1]. Default: `tolerance`.
         runs: number of full runs. Two thirds of them are the first rows. The others are the rows for which a first
             reduced model states the largest errors, relative to the displacements. Default: all rows.
 
     Raises:
-        InputError: physics that a reduced model does not have, a tolerance outside of 0 to 1, no run converged, `runs`
-            does not fit the number of rows, rows with different time steps.
+        InputError: the scene has parts that reduced models do not support; a tolerance is not between 0 and 1; no run
+            converged; `runs` does not fit the number of rows; the rows have different time steps.
     """
     refuse_unknown_physics(scene)
     point_tolerance = tolerance if point_tolerance is None else point_tolerance
@@ -65,7 +66,7 @@ def reduce_scene(
             raise InputError(f"{name} = {value} must be between 0 and 1: give e.g. 1e-4")
     values = {name: np.asarray(value, float) for name, value in rows.items()}
     if "solve.dt" in values:
-        raise InputError("a reduced model has one time step: leave the column solve.dt out, and give dt in [solve]")
+        raise InputError("a reduced model has one time step: remove the column solve.dt, and give dt in [solve]")
     count = len(next(iter(values.values()), ()))
     runs = count if runs is None else runs
     if not FEWEST_RUNS <= runs <= count and runs != count:
@@ -92,7 +93,7 @@ def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
     result = simulate_batch(scene, dict(values)).result
     good = np.all(np.asarray(result.status) == status.CONVERGED, axis=1)
     if not good.any():
-        raise InputError(f"none of the {len(good)} runs converged: give smaller loads or steps in the rows")
+        raise InputError(f"none of the {len(good)} runs converged: give smaller loads or time steps in the rows")
     mask = free_degrees(scene.mesh, scene.fixed, scene.displaced)
     u = np.asarray(result.positions)[good]
     u -= np.asarray(scene.mesh.points)
@@ -116,7 +117,8 @@ def _model_of(scene: Scene, runs: _Runs, tolerance: float, most_modes: int, poin
 
 
 def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -> tuple[jax.Array, np.ndarray]:
-    """Modes (m, V) of pressures P (R, T, V), at most half of `most`, and their coordinates (R, T, m) [Pa]."""
+    """Return modes (m, V) of the pressures P (R, T, V) and their coordinates (R, T, m) [Pa]. The number m is at most
+    half of `most`."""
     volumes = np.asarray(integrals(scene.mesh, jnp.ones_like(scene.mesh.weights)))
     modes = proper_modes(P.reshape(-1, P.shape[-1], 1), volumes, tolerance)[: max(1, most // PRESSURES), :, 0]
     return jnp.asarray(modes), (P * volumes) @ modes.T
@@ -125,7 +127,7 @@ def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -
 def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction | None:
     q, failed = _coordinates_of_rows(model, scene, runs.values)
     moved = np.linalg.norm(runs.u, axis=-1).max(axis=(1, 2))
-    good = ~failed & (moved > 1e-9 * moved.max(initial=0.0))  # the motion of a body at rest is roundoff
+    good = ~failed & (moved > 1e-9 * moved.max(initial=0.0))  # smaller motions are roundoff of a body at rest
     missing = runs.u[good] - np.tensordot(q[good], np.asarray(model.modes), axes=1)
     volumes = np.asarray(nodal_volumes(scene.mesh))
     return learnt_correction(Learnt(q[good], missing, moved[good], volumes, scene.solve.dt))
@@ -134,7 +136,8 @@ def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction |
 def _coordinates_of_rows(
     model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates (R, T, n) [m] of reduced runs of all rows, and which runs failed (R,)."""
+    """Run the reduced model once for each of the R parameter sets. Return the reduced coordinates (R, T, n) [m], and
+    whether each run failed (R,)."""
 
     def run(model: ReducedModel, values: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
         found = simulate_reduced(model, with_parameters(scene, values))
@@ -146,7 +149,8 @@ def _coordinates_of_rows(
 
 
 def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Size of the correction over the largest displacement, or the largest displacement if there is no correction."""
+    """Return for each row the size of the correction divided by the largest displacement. Without a correction, return
+    the largest displacement instead. The value of a failed run is -1."""
     q, failed = _coordinates_of_rows(model, scene, values)
     found = np.zeros(len(q))
     for k, own in enumerate(q):
@@ -156,11 +160,14 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
             continue
         off = np.linalg.norm(np.asarray(correction_at(model.correction, jnp.asarray(own), scene.solve.dt)), axis=-1)
         found[k] = off.max() / max(u, 1e-300)
-    # A failed run gives no error; the full run would probably fail, too.
+    # A failed run has the lowest rank, because the full run would probably fail, too.
     return np.where(failed, -1.0, found)
 
 
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Modes (n, V, c) that leave out at most the fraction `tolerance` of fields u (N, V, c); `volumes` are weights."""
+    """Return modes (n, V, c) that leave out at most the fraction `tolerance` of the fields u (N, V, c).
+
+    `volumes` (V,): volumes of the nodes, which are the weights of a mean square.
+    """
     modes = principal_fields((u * np.sqrt(volumes)[:, None]).reshape(len(u), -1), tolerance)
     return modes.reshape(-1, *u.shape[1:]) / np.sqrt(volumes)[:, None]

@@ -1,1 +1,1 @@
-"""Scenes: their parts, their files, their checks."""
+"""Scenes: the parts of a scene, scene files, and checks of scenes."""

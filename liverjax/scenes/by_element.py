@@ -1,6 +1,6 @@
-"""Parameters of regions as arrays: a parameter that a region changes gets one value per element.
+"""Convert the parameters of regions to arrays: a parameter that a region changes gets one value per element.
 
-If a region has a law of another kind, this law is computed only for the elements of the region.
+If a region has another kind of law, this law is computed only for the elements of the region.
 """
 
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from liverjax.tensors.subsets import subsets
 
 
 def by_element(scene: Scene) -> Scene:
-    """The scene without regions: parameters of law, viscosity and porosity that a region changes become arrays."""
+    """Return the scene without regions. Parameters that a region changes become arrays (E,)."""
     mesh, law, prony, sponge = scene.mesh, scene.law, scene.viscosity, scene.porosity
     if scene.region:
         law = law_of_elements(law, scene.region, mesh.number_of_elements)
@@ -30,13 +30,13 @@ def by_element(scene: Scene) -> Scene:
 
 
 def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Law:
-    """The law of the scene with the parameters and laws of its regions.
+    """Return the law of the scene with the parameters and laws of its regions.
 
     A parameter has one value per element (E,) if a region changes it. If a region has a complete law, the result is a
     `ByRegion` of all laws.
 
     Raises:
-        InputError: a name that the law does not have.
+        InputError: a region changes a parameter that the law does not have.
     """
     for region in regions:
         for name, value in changed_numbers(region).items():
@@ -51,7 +51,7 @@ def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: i
 
 
 def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_elements: int) -> Prony:
-    """The series. If a region changes a parameter, ratios and times have one value per mode and element, (N, E)."""
+    """Return the Prony series. If a region changes it, ratios and times have one value per mode and element, (N, E)."""
     found: Content = {}
     for name in VISCOUS:
         own = {
@@ -73,7 +73,7 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
 
 
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
-    """The porosity. Parameters that a region changes have one value per element: (E,), or (1, E) if quadratic."""
+    """Return the porosity. A parameter that a region changes has one value per element: (E,); quadratic: (1, E)."""
     found: Content = {}
     for region in regions:
         for name, value in (region.porosity or {}).items():
@@ -84,5 +84,5 @@ def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: 
 
 
 def sponge_at_points(porosity: Porosity, mesh: TetMesh) -> Porosity:
-    """The porosity. Its parameters by element get the axes of arrays over the integration points."""
+    """Give porosity parameters with one value per element the axes of arrays over the integration points."""
     return replace(porosity, **mesh.at_points({name: getattr(porosity, name) for name in POROUS}))

@@ -1,5 +1,4 @@
-"""The same scene in the next richer space of functions: quadratic instead of linear elements, cubic instead of
-quadratic.
+"""Convert a scene to the next richer shape functions: linear to quadratic elements, quadratic to cubic elements.
 
 Supports, motions and loads stay the same. The position and the values of a new node follow from the nodes around it.
 """
@@ -18,7 +17,7 @@ from liverjax.scenes.scene import Scene
 
 
 def enriched(scene: Scene) -> Scene:
-    """The scene with quadratic or cubic elements (`liverjax.mesh.promotion.cubic`); numbers may be traced."""
+    """Return the scene with quadratic or cubic elements (`liverjax.mesh.promotion`). Numbers may be traced."""
     return _quadratic_mesh(scene) if scene.mesh.order == 1 else _cubic(scene)
 
 
@@ -42,7 +41,7 @@ def _quadratic_mesh(scene: Scene) -> Scene:
 
 
 def _between(mesh: TetMesh, moved: Displaced, nodes: Indices) -> Displaced:
-    """The motion with new nodes: a middle of an edge moves by the mean motion of the two ends."""
+    """Extend a motion to the new nodes: a midside node moves by the mean of the two edge ends."""
     if moved.by is None or np.ndim(moved.by) == 1:
         return replace(moved, nodes=nodes)
     by = jnp.zeros((mesh.number_of_vertices, 3), mesh.points.dtype).at[moved.nodes].set(moved.by)
@@ -71,7 +70,7 @@ def _cubic(scene: Scene) -> Scene:
 
 
 def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Density of all functions. A new function has the mean density of the elements around it."""
+    """Density for all shape functions. A new function has the mean density of the elements around it."""
     nodes = jnp.stack(mesh.element_nodes)
     own = jnp.broadcast_to(jnp.mean(density[mesh.tetrahedra], axis=1), nodes.shape)
     total, count = (jnp.zeros(mesh.number_of_nodes).at[nodes].add(each) for each in (own, 1.0))
@@ -79,7 +78,7 @@ def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _with_faces(mesh: TetMesh, load: Traction) -> Traction:
-    """The load with the number of the face added to each triangle: the function of the face gets a part of the load."""
+    """Add the face number to each triangle of a load, because the face function gets a part of the load."""
     triangles = np.asarray(load.triangles)
     faces = promotion.face_numbers(mesh, triangles)
     return replace(load, triangles=node_numbers(np.column_stack([triangles, faces])))

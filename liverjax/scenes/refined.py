@@ -1,5 +1,6 @@
-"""The same scene on a mesh with every element cut into eight, for the error of a run with a fluid: its pressures are
-linear in both kinds of elements, so only a finer mesh is richer in pressures.
+"""Convert a scene to a mesh with every element cut into eight, to estimate the mesh error of a run with a fluid.
+
+The pressures of a fluid are linear in linear and in quadratic elements, so only a finer mesh represents them better.
 """
 
 from collections.abc import Callable
@@ -30,33 +31,33 @@ from liverjax.scenes.scene import Scene
 from liverjax.tensors.subsets import subsets
 
 T = TypeVar("T")
-#: The error of a run over the change by a refined mesh: a quarter of an error of second order is left there.
+#: Error of a run, divided by the change due to the refined mesh, where an error of second order is a quarter as large.
 REFINED = 4 / 3
 
 
 @struct
 class Within:
-    """How the nodes of a refined mesh lie in the elements of the old one."""
+    """Positions of the nodes of a refined mesh in the elements of the old mesh."""
 
     nodes: jax.Array = param("1", "old nodes around each new node (n, V')")
-    weights: jax.Array = param("1", "values of their functions at the new node (n, V')")
+    weights: jax.Array = param("1", "values of the shape functions of these old nodes at the new node (n, V')")
 
     def field(self, values: jax.Array) -> jax.Array:
-        """A field of the old nodes (V, …) at the new nodes (V', …): the same function."""
+        """Evaluate a field, given at the old nodes (V, …), at the new nodes (V', …)."""
         w = self.weights.reshape(*self.weights.shape, *(1,) * (values.ndim - 1))
         return jnp.sum(w * values[self.nodes], axis=0)
 
     def forces(self, values: jax.Array, number_of_nodes: int) -> jax.Array:
-        """Forces on the new nodes (V', …) as forces on the old ones (V, …): they do the same work."""
+        """Convert forces on the new nodes (V', …) to forces on the old nodes (V, …) that do the same work."""
         w = self.weights.reshape(*self.weights.shape, *(1,) * (values.ndim - 1))
         return jnp.zeros((number_of_nodes, *values.shape[1:]), values.dtype).at[self.nodes].add(w * values[None])
 
 
 def can_be_refined(scene: Scene) -> bool:
-    """Whether all parts of the scene have a meaning on the refined mesh.
+    """Whether all parts of the scene can be converted to the refined mesh.
 
-    A vessel has numbers of elements. A load, an inlet or a physics may have one number per triangle or per node. These
-    are not refined.
+    This is not possible for a vessel, which contains element numbers. It is also not possible for a load, an inlet or a
+    physics with one number per triangle or per node.
     """
 
     def plain(physics: Physics) -> bool:
@@ -75,10 +76,10 @@ def can_be_refined(scene: Scene) -> bool:
 
 
 def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
-    """The scene with every element cut into eight of the same order; host side, but numbers may be traced.
+    """Return the scene with every element cut into eight of the same order. Runs on the host; numbers may be traced.
 
     Raises:
-        InputError: traced positions of the mesh inside `jax.jit`.
+        InputError: the positions of the mesh are traced inside `jax.jit`.
     """
     old, E = scene.mesh, scene.mesh.number_of_elements
     mesh, within = _mesh_and_within(old)
@@ -109,14 +110,14 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
 
 
 def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
-    """The refined mesh, and where its nodes lie."""
+    """Return the refined mesh, and the positions of its nodes in the old mesh."""
     traced = isinstance(old.points, jax.core.Tracer)
     with nullcontext() if traced else jax.ensure_compile_time_eval():  # node numbers are needed on the host
         mesh = refined(replace(old, triangle_sets=None))
         if isinstance(mesh.pattern.edges, jax.core.Tracer):
             raise InputError(
                 "the mesh error of a scene with a fluid cannot be estimated inside jax.jit if the positions of the "
-                "mesh are traced: estimate it outside"
+                "mesh are traced: estimate the error outside jax.jit"
             )
         element, place = places_in(old, mesh)
         nodes, values = weights(old, element, place)
@@ -124,7 +125,7 @@ def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
 
 
 def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Nodes (n,) of the old mesh, and the new nodes between them that belong to the same places."""
+    """Nodes (n,) of the old mesh, and the new nodes between them, if they belong to the same set of nodes."""
     found = np.concatenate([nodes, np.setdiff1d(middles_of_places(old, nodes), nodes)])
     if mesh.order == 1:
         return found
@@ -132,7 +133,7 @@ def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.nd
 
 
 def _of_parts(E: int, numbers: T) -> T:
-    """A pytree, whose numbers by element (…, E) or (…, E, 3) are given to the eight parts of each element."""
+    """Repeat the element values (…, E) or (…, E, 3) of a pytree for the eight parts of each element."""
 
     def one(a: Number) -> Number:
         shape = jnp.shape(a)
@@ -155,7 +156,7 @@ def _law_of_parts(E: int, law: Law) -> Law:
 
 
 def _series(E: int, prony: Prony | None) -> Prony | None:
-    """The series; numbers by mode and element (N, E) are given to the parts of each element."""
+    """Prony series for the refined mesh: values per mode and element (N, E) are repeated for the eight parts."""
     if prony is None:
         return None
     by_element = {name: own for name in VISCOUS if np.ndim(own := getattr(prony, name)) == 2}
@@ -163,7 +164,7 @@ def _series(E: int, prony: Prony | None) -> Prony | None:
 
 
 def _sponge(E: int, porosity: Porosity | None, more: Callable[[Indices], Indices], parts: Callable) -> Porosity | None:
-    """The sponge, drained and supplied at the nodes of the refined mesh too."""
+    """Porosity for the refined mesh: drained nodes, inlets, and values per element."""
     if porosity is None:
         return None
     inlets = tuple(parts(own if own.nodes is None else replace(own, nodes=more(own.nodes))) for own in porosity.inlet)
@@ -173,7 +174,7 @@ def _sponge(E: int, porosity: Porosity | None, more: Callable[[Indices], Indices
 
 
 def _moved_in_between(within: Within, moved: Displaced, nodes: Indices, number_of_nodes: int) -> Displaced:
-    """The motion of the old nodes, and of the new ones by the same function."""
+    """Extend a motion of the old nodes to the new nodes, by the shape functions."""
     if moved.by is None or np.ndim(moved.by) == 1:
         return replace(moved, nodes=nodes)
     by = jnp.zeros((number_of_nodes, 3)).at[moved.nodes].set(moved.by)

@@ -1,4 +1,4 @@
-"""Parts of a body with other parameters of law, viscosity or porosity, or with a law of another kind."""
+"""Parts of a body with other parameters of law, viscosity or porosity, or with another kind of law."""
 
 import warnings
 from collections.abc import Mapping
@@ -21,11 +21,13 @@ POROUS = ("bulk", "limit_bulk", "fluid_fraction", "permeability")
 
 @struct
 class Region:
-    """Elements with other parameters than the scene or with another law. If regions overlap, the later one counts."""
+    """Elements with other parameters or another law than the scene. If regions overlap, the later one counts."""
 
     elements: Indices = param("1", "element numbers (n,)")
     law: Content | Law | None = param(
-        "1", "names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or another law", default=None
+        "1",
+        "parameter names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or another law",
+        default=None,
     )
     viscosity: Mapping[str, Numbers] | None = param("1", "`ratios` or `relaxation_times` or both -> (N,)", default=None)
     porosity: Mapping[str, Numbers] | None = param(
@@ -37,7 +39,7 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
     """Element numbers of a set, or of the elements whose four vertices satisfy `where` (see `boundary.select`).
 
     Raises:
-        InputError: `where` and `set` are both given or both missing, the mesh has no such set, no element is found.
+        InputError: `where` and `set` are both given or both missing; the mesh has no such set; no element is found.
     """
     if set is not None and where is None:
         if as_word(set, f"{name}: set") not in mesh.element_sets:
@@ -45,12 +47,12 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
             raise InputError(f"{name}: the mesh has no element set {set!r} (it has: {known}); use one of them or where")
         elements = np.asarray(mesh.element_sets[set])
         if not len(elements):
-            raise InputError(f"{name}: the element set {set!r} of the mesh holds no element: correct it, or use where")
+            raise InputError(f"{name}: the element set {set!r} of the mesh is empty: correct the set, or use where")
         return elements
     nodes = boundary.select(mesh, where, set, name)
     inside = np.flatnonzero(np.isin(np.asarray(mesh.tetrahedra), nodes).all(axis=1))
     if not len(inside):
-        raise InputError(f"{name} = {where} holds nodes but no whole element: widen it")
+        raise InputError(f"{name} = {where} contains nodes but no whole element: enlarge the region")
     _warn_of_cut_elements(mesh, inside, where or {}, name)
     return inside
 
@@ -75,26 +77,27 @@ def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, 
         end = own.min() if first else own.max()
         if np.any(cut) and abs(end - bound) > _APART * np.ptp(own):
             warnings.warn(
-                f"{name}: {key} = {bound:g} goes through elements, which are left out: the region "
-                f"{'begins' if first else 'ends'} at {end:.4g} m; put a layer of nodes there (cells of the mesh), or "
-                "use an element set",
+                f"{name}: {key} = {bound:g} cuts elements. Cut elements are left out, so the region "
+                f"{'begins' if first else 'ends'} at {end:.4g} m. Put a layer of nodes at this bound (cells of the "
+                "mesh), or use an element set",
                 stacklevel=3,
             )
 
 
 def laws_of(law: Law, regions: tuple[Region, ...]) -> tuple[Law, ...]:
-    """The law of a scene, and the laws that replace it in regions."""
+    """Return the law of a scene, and the laws that replace this law in regions."""
     return (*law.pieces(), *(region.law for region in regions if isinstance(region.law, Law)))
 
 
 def changed_numbers(region: Region) -> dict[str, object]:
-    """Name -> value of the parameters of the scene's law that a region changes."""
+    """Return the names and values of the parameters of the scene's law that a region changes."""
     return region.law if isinstance(region.law, dict) else {}
 
 
 def set_by_regions(regions: tuple[Region, ...], name: str, number_of_elements: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which elements (E,) have a value of their own from their region, for a parameter of the scene such as `law.mu`;
-    and these values (E,), NaN if a region's law does not have the parameter.
+    """Return which elements (E,) get a parameter, such as `law.mu`, from a region, and the values (E,).
+
+    A value is NaN if the law of the region does not have the parameter, or if it is not one number.
     """
     table, _, rest = name.partition(".")
     own, values = np.zeros(number_of_elements, bool), np.full(number_of_elements, np.nan)
@@ -115,17 +118,17 @@ def set_by_regions(regions: tuple[Region, ...], name: str, number_of_elements: i
 
 
 def law_number(law: Law, name: str) -> jax.Array:
-    """The value in the law of a parameter that a region changes.
+    """Value, in the law of the scene, of a parameter that a region changes.
 
     Raises:
-        InputError: a name that the law does not have, or the name of a list of parameters.
+        InputError: the law does not have this name, or it is the name of a list of parameters.
     """
     value = names.get(law, name, refused_name(name))
     if isinstance(value, tuple):
-        raise InputError(f"region: {name} is a list of {len(value)}: name one of them, {name}.0")
+        raise InputError(f"region: {name} is a list of {len(value)} values: name one of them, for example {name}.0")
     return value
 
 
 def refused_name(name: str) -> str:
-    """The beginning of the message if the law has no such parameter."""
+    """First part of the message if the law has no such parameter."""
     return f"region: the law has no number {name!r}"

@@ -1,4 +1,7 @@
-"""A scene: a mesh, a law, its physics, and its supports, motions and loads."""
+"""A scene: mesh, material law, supports, prescribed motions, loads, and further physics.
+
+A physics is one object that adds forces or constraints, for example contact.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -20,33 +23,36 @@ from liverjax.physics.viscosity import Prony
 from liverjax.scenes.regions import Region
 from liverjax.scenes.springpots import SpringpotSeries
 
-#: Highest frequency [Hz] of harmonic motion: its square must not overflow, and no wave in tissue is faster.
+#: Highest frequency [Hz] of harmonic motion: no wave in tissue is faster, and the square must not overflow.
 HIGHEST_HZ = 1e9
 
 
 @struct
 class Body:
-    """Mass and weight. A node's lumped mass is its density times a quarter of the volumes of its linear elements."""
+    """Mass and weight. Lumped mass of a node: its density times a quarter of the volume of its linear elements."""
 
-    density: Number = param("kg/m^3", "per reference volume; one, or one per node (V,)", above=0.0, typical=1060.0)
+    density: Number = param(
+        "kg/m^3", "mass per reference volume; one number, or one per node (V,)", above=0.0, typical=1060.0
+    )
     gravity: Numbers = param("m/s^2", "acceleration (3,)", default=(0.0, 0.0, 0.0))
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
-    mass: str = static(default="lumped", about="mass in motion: lumped at the nodes, or consistent, as the weight")
+    mass: str = static(default="lumped", about="mass for inertia: lumped at the nodes, or consistent, as the weight")
 
 
 @struct
 class Solve:
     """How the scene is solved.
 
-    Time step, tolerances and frequencies are numbers; another choice compiles a new program.
+    New values of time step, tolerances and frequencies use the same compiled program. A change of any other setting
+    compiles a new program.
     """
 
     dt: Any = param("s", "time step; None: load steps without time", above=0.0, default=None)
     kind: str = static(default="static", about="static: no inertia; dynamic; harmonic: waves at `frequencies`")
     steps: int = static(default=1, about="load steps, or time steps of dt", lower=1)
     tolerance: Any = param(
-        "1", "of the residual, relative to the size of all forces", above=0.0, upper=0.5, default=1e-8
+        "1", "tolerance of the residual, relative to the size of all forces", above=0.0, upper=0.5, default=1e-8
     )
     newton: str = static(
         default="converged",
@@ -55,26 +61,30 @@ class Solve:
     )
     newton_iterations: int = static(
         default=25,
-        about="maximum number of iterations in a step, or in a part of a cut step; 1: newton = one_step",
+        about="maximum number of iterations in a step, or in a part of a divided step; 1 means newton = one_step",
         lower=1,
     )
     integrator: str = static(
         default="euler", about="dynamic: euler (first order) or newmark (average acceleration, second order)"
     )
     precision: str = static(default="float64", about="float64 or float32")
-    linear_solver: str = static(default="auto", about="cg; direct: factorised on the host; auto: by size and stiffness")
+    linear_solver: str = static(
+        default="auto", about="cg; direct: factorised on the host; auto: chosen by size and stiffness"
+    )
     volumetric: str = static(
         default="element",
-        about="element; against locking: mixed (pressures as unknowns) or nodal (averaged at nodes); auto: mixed for "
+        about="element; against locking: mixed (pressures are unknowns) or nodal (averaged at nodes); auto: mixed for "
         "quadratic elements if possible",
     )
     robust: str = static(
-        default="off", about="projected or regularised: minimise the energy if a step cannot be followed"
+        default="off", about="projected or regularised: minimise the energy if Newton's method fails in a step"
     )
-    frequencies: Numbers | None = param("Hz", "(F,) of harmonic motion", above=0.0, upper=HIGHEST_HZ, default=None)
-    reduced: str = static(default="", about="file of a reduced model, as `python -m liverjax reduce` makes it")
+    frequencies: Numbers | None = param(
+        "Hz", "frequencies (F,) of harmonic motion", above=0.0, upper=HIGHEST_HZ, default=None
+    )
+    reduced: str = static(default="", about="file of a reduced model, written by `python -m liverjax reduce`")
     reduced_tolerance: Number = param(
-        "1", "estimated error over the largest displacement, above which the full model runs", above=0.0, default=0.01
+        "1", "estimated error / largest displacement; above this value the full model runs", above=0.0, default=0.01
     )
 
 
@@ -94,21 +104,23 @@ class Scene:
     traction: tuple[Traction, ...] = param("1", "loads", default=())
     physics: tuple[Physics, ...] = unnamed("further physics: supports, …", places="named", default=())
     solve: Solve = param("1", "how it is solved", default=Solve())
-    points_are: str = static(default="reference", about="the mesh's points are reference, or loaded: under the loads")
+    points_are: str = static(
+        default="reference", about="reference: the mesh is unloaded; loaded: the mesh is the shape under the loads"
+    )
 
     def named(self, section: str) -> list[int]:
-        """Indices in `physics` of the physics that scene files write as [[section]]."""
+        """Indices in `physics` of the objects that scene files write as [[section]]."""
         return [k for k, physics in enumerate(self.physics) if physics.section == section]
 
 
 def named_physics(scene: Scene) -> list[tuple[str, Physics]]:
-    """Every further physics with its name in scene files, for example support.0."""
+    """Return every further physics with its name in scene files, for example support.0."""
     places = {k: f"{p.section}.{n}" for p in scene.physics for n, k in enumerate(scene.named(p.section))}
     return [(places[k], physics) for k, physics in enumerate(scene.physics)]
 
 
 def histories(scene: Scene) -> dict[str, object]:
-    """Name -> load, motion, inlet or further physics, for all parts with a history."""
+    """Return name -> part for all parts with a history: body, motions, loads, inlets, further physics."""
     inlets = () if scene.porosity is None else scene.porosity.inlet
     parts: dict[str, object] = {"body": scene.body}
     for key, several in (("displaced", scene.displaced), ("traction", scene.traction), ("porosity.inlet", inlets)):
@@ -118,7 +130,7 @@ def histories(scene: Scene) -> dict[str, object]:
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
-    """The scene with changed numbers. The values may be traced.
+    """Return the scene with changed numbers. The values may be traced.
 
     Args:
         scene: `Scene`.
@@ -127,7 +139,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
             ``mesh.points``, ``region.0.law.mu``. A parameter of a law may have one value per element (E,).
 
     Raises:
-        InputError: a name that the scene does not have.
+        InputError: the scene does not have one of the names.
     """
     for name, value in values.items():
         if name == "mesh.points":
@@ -144,17 +156,17 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
 
 
 def numbers_at(scene: Scene, name: str) -> Any:
-    """The value of a scene at a dotted name: one number or an array.
+    """Value of a scene for a dotted name: one number or an array.
 
     Raises:
-        InputError: a name that the scene does not have, or a name whose value is not floating-point.
+        InputError: the scene does not have the name, or its value is not a floating-point number.
     """
     if name.startswith("mesh.") and not name.startswith("mesh.points"):
         raise InputError(f"{_refusal(name)}: of a mesh only all points can change, mesh.points")
     found = names.get(scene, name, _refusal(name))
     # A single whole number is allowed (`mu = 770`). An array of whole numbers contains node or element numbers.
     if not all(isinstance(v, int) or np.issubdtype(np.asarray(v).dtype, np.floating) for v in jax.tree.leaves(found)):
-        raise InputError(f"{_refusal(name)}: use one like law.mu")
+        raise InputError(f"{_refusal(name)}: use a number, for example law.mu")
     return found if isinstance(found, tuple) else jnp.asarray(found, float)
 
 

@@ -22,11 +22,11 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def check_before_run(scene: Scene) -> None:
-    """Refuse unknown choices, numbers out of bounds and unknown nodes. Traced arrays pass; nothing is compiled.
+    """Check choices, bounds of numbers, and nodes. Traced arrays are not checked, and nothing is compiled.
 
     Raises:
-        InputError: as `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume;
-            nodes that are fixed and moved along the same axis, held although a plate moves them, or in two oblique
+        InputError: as in `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume;
+            nodes that are fixed and moved along the same axis, fixed although a plate moves them, or in two oblique
             planes.
     """
     check_choices(scene)
@@ -38,10 +38,10 @@ def check_before_run(scene: Scene) -> None:
 
 
 def check_time_and_mass(scene: Scene) -> None:
-    """Refuse a scene without a time step or a mass if it needs them. Their values are not checked.
+    """Check that the scene has a time step and a mass if it needs them. Their values are not checked.
 
     Raises:
-        InputError: no `dt` with viscosity, porosity, a history or in dynamics; no mass in dynamics.
+        InputError: `dt` is missing with viscosity, porosity, a history or in dynamics; mass is missing in dynamics.
     """
     solve = scene.solve
     loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))
@@ -62,14 +62,14 @@ def check_time_and_mass(scene: Scene) -> None:
 
 
 def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
-    """Refuse further physics if no run can begin with their numbers, nodes or places; host side.
+    """Check that a run can begin with the numbers, nodes and positions of further physics. Runs on the host.
 
     Args:
         scene: `Scene`.
         only: names of the physics to check, for example ``obstacle.0``; None: all.
 
     Raises:
-        InputError: one sentence that begins with the name of the physics.
+        InputError: the message begins with the name of the physics.
     """
     for name, physics in named_physics(scene):
         if only is None or name in only:
@@ -79,10 +79,11 @@ def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
 
 
 def check_scene(scene: Scene) -> None:
-    """Refuse a scene that cannot be simulated; host side, before any compile.
+    """Check that a scene can be simulated, before anything is compiled. Runs on the host.
 
     Raises:
-        InputError: an unusable mesh or viscosity, missing time step or mass, contradicting conditions, a loose body.
+        InputError: the mesh or the viscosity cannot be used; time step or mass is missing; conditions contradict each
+            other; the supports do not prevent rigid motions.
     """
     check_choices(scene)
     check_numbers(scene)
@@ -97,8 +98,8 @@ def check_scene(scene: Scene) -> None:
     check_motion_in_planes(scene)
     if not free_places(scene.mesh, scene.fixed, ()).any():
         warnings.warn(
-            "fixed holds every node along every axis, so nothing can move: a place like where = {z_min = 0} takes all "
-            "nodes at and above it, {z_max = 0} those at and below",
+            "[[fixed]] fixes all nodes in all directions, so nothing can move. Note: where = {z_min = 0} selects all "
+            "nodes with z >= 0, and {z_max = 0} all nodes with z <= 0",
             stacklevel=2,
         )
     if scene.solve.kind == "static" or scene.points_are == "loaded":

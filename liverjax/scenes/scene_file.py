@@ -1,4 +1,4 @@
-"""Scenes from TOML files. Unknown keys are refused, and every number is checked."""
+"""Read scenes from TOML files. An unknown key is an error, and every number is checked."""
 
 import dataclasses
 import tomllib
@@ -65,16 +65,16 @@ _KEYS = {
     for section in dict.fromkeys(p.section for p in NAMED)
 }
 _SECTIONS = ("mesh", "law", *list(_KEYS)[1:])
-#: Keys that describe a place; they do not say what acts there.
+#: Keys that select nodes or faces. They do not say what acts there.
 PLACE = {"where", "set"}
 
 
 def load_scene(path: str | Path) -> Scene:
-    """A scene from a TOML file. Relative paths in the file begin at the folder of the file.
+    """Read a scene from a TOML file. Relative paths in the file begin at the folder of the file.
 
     Raises:
-        InputError: unreadable file, unknown or missing keys, values that cannot be used. All checks run before any
-            compilation.
+        InputError: the file cannot be read; unknown or missing keys; values that cannot be used. All checks run before
+            anything is compiled.
     """
     path = Path(path)
     try:
@@ -86,7 +86,7 @@ def load_scene(path: str | Path) -> Scene:
     except UnicodeDecodeError:
         raise InputError(f"{path} is not text: give a scene file (TOML)") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is not TOML ({error}): mend that line") from None
+        raise InputError(f"{path} is not TOML ({error}): correct that line") from None
     try:
         return scene_from(content, path.parent)
     except InputError as error:
@@ -94,7 +94,7 @@ def load_scene(path: str | Path) -> Scene:
 
 
 def scene_from(content: Content, folder: Path = Path()) -> Scene:
-    """A scene from the content of a scene file as nested dictionaries."""
+    """Make a scene from the content of a scene file, which is given as nested dictionaries."""
     _known("scene", content, _SECTIONS)
     content = _with_paths(content, folder)
     for name in ("mesh", "law"):
@@ -124,7 +124,7 @@ def scene_from(content: Content, folder: Path = Path()) -> Scene:
 
 
 def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
-    """Names of the fields in [output] of a scene file, and whether the reactions are written as a table.
+    """Return the names of the fields in [output] of a scene file, and whether a table of reactions is written.
 
     Raises:
         InputError: unknown keys, or values of a wrong type.
@@ -139,7 +139,7 @@ def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
 
 
 def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
-    """The physics of the tables whose sections are in `liverjax.physics.registry`.
+    """Read the physics of all tables with a section in `liverjax.physics.registry`.
 
     Each table becomes the first kind of physics that has all its keys.
     """
@@ -151,19 +151,19 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
                 raise InputError(_of_two_kinds(name, own, [set(p.keys) for p in NAMED if p.section == section]))
             if not kinds:
                 known = (", ".join(key for key in p.keys if key not in PLACE) for p in NAMED if p.section == section)
-                raise InputError(f"{name} has only a place: give {' or '.join(known)}")
+                raise InputError(f"{name} has only where or set: give {' or '.join(known)}")
             yield kinds[0].read(mesh, table, name)
 
 
 def _of_two_kinds(name: str, given: set[str], kinds: list[set[str]]) -> str:
-    """A sentence on keys that are known but incompatible."""
+    """Message for keys that are known but cannot be used together."""
     first = min((given - keys for keys in kinds), key=len)
     other = min((given - keys for keys in kinds if first <= keys), key=len, default=given)
-    return f"{name} has {', '.join(sorted(first))} together with {', '.join(sorted(other))}: leave one out"
+    return f"{name} has {', '.join(sorted(first))} together with {', '.join(sorted(other))}: remove one"
 
 
 def _with_paths(content: object, folder: Path) -> Any:
-    """The content with `folder` added to all paths: of histories, surfaces and a reduced model."""
+    """Add `folder` to all paths in the content: histories, surfaces and a reduced model."""
     if isinstance(content, list):
         return [_with_paths(value, folder) for value in content]
     if not isinstance(content, dict):
@@ -215,7 +215,7 @@ def _mesh(table: dict, folder: Path) -> TetMesh:
     if order not in (None, 1, 2) or isinstance(order, bool):
         raise InputError(f"[mesh] order = {order!r} is not known: use 1 (linear) or 2 (quadratic tetrahedra)")
     if order == 1 and mesh.order == 2:
-        raise InputError("[mesh] order = 1, but the file holds quadratic tetrahedra: leave order out, or export linear")
+        raise InputError("[mesh] order = 1, but the file contains quadratic tetrahedra: remove order, or export linear")
     return quadratic(mesh) if order == 2 else mesh
 
 
@@ -241,7 +241,7 @@ def _linear_mesh(table: dict, folder: Path) -> TetMesh:
 
 
 def _cylinder(table: dict, scale: float) -> TetMesh:
-    """A cylinder. With optional keys the mesh is finer near its rims and rings."""
+    """Make a cylinder. With optional keys the mesh is finer near its rims and rings."""
     for key in ("radius", "height", "cell_size"):
         if key not in table:
             raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")
@@ -262,8 +262,8 @@ def _law(value: object, where: str = "[law]") -> Law:
             raise InputError(where + ' needs name = "…": python -m liverjax laws lists them')
         if ".py:" in str(table["name"]):
             raise InputError(
-                f"{where} name = {table['name']!r}: a scene file takes the included laws only (python -m liverjax laws "
-                "lists them); put a law of your own into the scene in Python: dataclasses.replace(scene, law=…)"
+                f"{where} name = {table['name']!r}: a scene file can use only included laws (python -m liverjax laws "
+                "lists them); put a law of your own into the scene in Python, by dataclasses.replace(scene, law=…)"
             )
         law = laws.create(table["name"], **{k: v for k, v in table.items() if k not in ("name", "continued_below")})
         made.append(laws.continued(law, table["continued_below"]) if "continued_below" in table else law)
@@ -280,7 +280,7 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
         if not isinstance(part, kinds):
             raise InputError(f"{name} {key} = {part!r} must be a table: write e.g. law = {{mu = 2000.0}}")
     if not given and not viscous and not porous:
-        raise InputError(f"{name} needs the parameters that differ there: write law = {{mu = 2000.0}}")
+        raise InputError(f"{name} needs the parameters that differ in the region: write law = {{mu = 2000.0}}")
     elements = regions.select_elements(mesh, where, table.get("set"), name)
     return Region(
         elements=node_numbers(elements),
@@ -291,14 +291,14 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
 
 
 def _law_of_region(name: str, given: Any) -> dict[str, object] | Law:
-    """A law of another kind if `given` has a name, else the parameters that differ."""
+    """Return another law if `given` has a name, otherwise the parameters that differ."""
     if isinstance(given, list) or "name" in given:
         return _law(given, f"{name}: law")
     return dict(_dotted(f"{name} law", given))
 
 
 def _dotted(name: str, table: dict) -> list[tuple[str, float]]:
-    """Dotted name and value of each number in nested tables and lists."""
+    """Return the dotted name and the value of each number in nested tables and lists."""
     out = []
     for key, value in table.items():
         if isinstance(value, (dict, list)):
@@ -349,7 +349,7 @@ def _porosity(mesh: TetMesh, table: dict) -> Porosity:
 
 
 def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
-    """A place with a given pressure of the fluid, or with a given flux through its surface."""
+    """Read an inlet: nodes with a given pressure of the fluid, or a surface with a given flux."""
     if not isinstance(table, dict):
         raise InputError(f"{name} must be a table: write [[porosity.inlet]] and its keys below")
     _known(name, table, ("where", "set", "pressure", "flux", "history"))
@@ -360,15 +360,15 @@ def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
         return Inlet(nodes=nodes, pressure=_number(f"{name} pressure", table["pressure"]), **times)
     triangles = boundary.surface_of(mesh, nodes, table.get("set"))
     if not len(triangles):
-        raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
+        raise InputError(f"{name} where contains nodes but no boundary triangle: enlarge it to a whole face")
     flux = _number(f"{name} flux", table["flux"])
     return Inlet(triangles=node_numbers(triangles), flux=flux, **times)
 
 
 def _drained(mesh: TetMesh, given: Any) -> jax.Array:
-    """Nodes of one place, or of all places of a list."""
+    """Return the nodes of one region of the boundary, or of all regions in a list."""
     if given == []:
-        raise InputError("porosity.drained = [] names no place: give [{z_max = 0.0}], or leave it out (sealed)")
+        raise InputError("porosity.drained = [] selects no nodes: give [{z_max = 0.0}], or remove drained (sealed)")
     name = "porosity.drained"
     places = {f"{name}.{k}": p for k, p in enumerate(given)} if isinstance(given, list) else {name: given}
     nodes = []
@@ -385,13 +385,13 @@ def _read_body(table: dict) -> Body:
     density = _number("[body] density", table["density"])
     given = _history("[body]", table)
     if "gravity" in table and given and given["history"].ndim == 2:
-        raise InputError("[body] has gravity and a history of gravity itself: leave one of them out")
+        raise InputError("[body] has gravity and a history of gravity vectors: remove one of them")
     mass = table.get("mass", Body.mass)
     return Body(density=density, gravity=jnp.asarray(gravity), mass=mass, **given)
 
 
 def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, jax.Array]:
-    """Times and values of a table's history; empty if the table has no history."""
+    """Return times and values of the history of a table. They are empty if the table has no history."""
     if "history" not in table:
         return {}
     times, numbers = history.read_history(table["history"], name, forms)
@@ -434,7 +434,7 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
         raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
     triangles: Indices = boundary.surface_of(mesh, _nodes(mesh, name, table), table.get("set"))
     if len(triangles) == 0:
-        raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
+        raise InputError(f"{name} where contains nodes but no boundary triangle: enlarge it to a whole face")
     triangles = node_numbers(triangles)
     if "pressure" in table:
         return Traction(triangles=triangles, pressure=_number(f"{name} pressure", table["pressure"]), **given)

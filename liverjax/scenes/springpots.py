@@ -1,13 +1,13 @@
 """Springpots for harmonic motion: fractional models of soft tissue, relative to the stiffness of the law.
 
-A springpot has the complex modulus V (i omega)^alpha. It lies between a spring (alpha = 0) and a dashpot (alpha = 1).
-With the stiffness G0 of the law,
+A springpot has the complex modulus V (i omega)^alpha with a constant V. It lies between a spring (alpha = 0) and a
+dashpot (alpha = 1). With the stiffness G0 of the law, the model (see `SpringpotSeries`) is
 
     G* / G0 = spring + sum_k 1 / ((i omega tau_k)^-alpha_k + 1 / limit_k).
 
 Special cases with one springpot: spring = 0 gives the springpot alone, and spring = 1 the fractional Kelvin-Voigt
-model. With a limit, which is a spring in series with the springpot, it is the fractional Zener model (Bagley and Torvik
-1983, J. Rheol. 27, 201).
+model. A limit is a spring in series with the springpot; this is the fractional Zener model (Bagley and Torvik 1983,
+J. Rheol. 27, 201).
 """
 
 from typing import Any
@@ -25,38 +25,42 @@ from liverjax.physics.viscosity import PARTS, Prony, check_part
 
 @struct
 class SpringpotSeries:
-    """The complex modulus divided by the modulus of the law; for harmonic motion only."""
+    """Complex modulus divided by the modulus of the law. Only for harmonic motion."""
 
     times: Any = param("s", "tau_k (K,): at omega = 1/tau_k a springpot is as stiff as the law", above=0.0)
-    exponents: Any = param("1", "alpha_k (K,), 0 a spring, 1 a dashpot", lower=0.0, upper=1.0)
-    limits: Any = param("1", "stiffness of a spring in series with each, over the law's (K,)", above=0.0, default=None)
-    spring: Number = param("1", "stiffness at frequency 0, over the law's", lower=0.0, default=1.0)
-    part: str = static(default="all", about="all: of the whole stress; isochoric: of its isochoric part", words=PARTS)
+    exponents: Any = param("1", "alpha_k (K,): 0 is a spring, 1 a dashpot", lower=0.0, upper=1.0)
+    limits: Any = param(
+        "1", "(K,) stiffness of the spring in series with each / that of the law", above=0.0, default=None
+    )
+    spring: Number = param("1", "stiffness at frequency 0 / stiffness of the law", lower=0.0, default=1.0)
+    part: str = static(
+        default="all", about="all: whole stress; isochoric: only the isochoric part of the stress", words=PARTS
+    )
 
 
 def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) -> None:
-    """Refuse springpots that give no modulus; host side.
+    """Check that springpots give a modulus. Runs on the host.
 
     Raises:
-        InputError: lengths that differ, values out of bounds, an unknown part, a part that the law does not have, a
+        InputError: different lengths; values out of bounds; an unknown part; a part that the law does not have; a
             viscosity in the same scene.
     """
     if viscosity is not None:
-        raise InputError("the scene has [viscosity] and [springpots]: leave one of them out")
+        raise InputError("the scene has [viscosity] and [springpots]: remove one of them")
     bounds.check_fields(own, "springpots")
     shapes = {np.shape(a) for a in (own.times, own.exponents, own.limits) if a is not None}
     if len(shapes) != 1 or len(np.shape(own.times)) != 1:
-        raise InputError("springpots times, exponents and limits differ in length: give one each per springpot")
+        raise InputError("springpots times, exponents and limits differ in length: give one each for every springpot")
     check_part(own.part, law, "springpots")
 
 
 def series_at_rest(own: SpringpotSeries) -> Prony:
-    """A Prony series. Its completely relaxed stress is equal to the stress of the springpots at rest."""
+    """Prony series with a completely relaxed stress that is equal to the stress of the springpots at rest."""
     return Prony(ratios=1 - jnp.atleast_1d(own.spring), relaxation_times=jnp.ones(1), part=own.part)
 
 
 def springpot_factors(own: SpringpotSeries, omegas: jax.Array) -> jax.Array:
-    """G*/G0 (F,) at angular frequencies (F,) [rad/s]."""
+    """Complex ratio G*/G0 (F,) at angular frequencies (F,) [rad/s]."""
     times, alpha = jnp.atleast_1d(own.times)[:, None], jnp.atleast_1d(own.exponents)[:, None]
     # (i omega tau)^-alpha has the phase -alpha pi/2.
     compliance = jnp.exp(-alpha * (jnp.log(omegas[None] * times) + 0.5j * jnp.pi))

@@ -1,4 +1,4 @@
-"""Runs of a scene: one step, a whole run, derivatives of a run, and batches of runs."""
+"""Run a scene: one step, a whole run, derivatives of a run, and batches of runs."""
 
 from liverjax.simulation.run import Result, prepared, simulate, simulate_part
 

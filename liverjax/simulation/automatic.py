@@ -1,10 +1,10 @@
-"""The linear solver that `linear_solver = "auto"` means: a rule on size and stiffness, measured in `experiments/`.
+"""Choice of the linear solver for `linear_solver = "auto"`: a rule on size and stiffness, measured in `experiments/`.
 
-It means a factorisation for a static body of at most 10,000 tetrahedra (a quadratic one counts as eight) in two cases.
-In the first case the bulk modulus is more than a thousand times the shear modulus. For at most 1,500 tetrahedra, a
-hundred times is enough: the iterations of such bodies meet negative eigenvalues, and a factorisation can solve with
-them. In the second case the worst element is a sliver. Bodies with friction, with nodes that move together, with a
-pressure that follows the surface, or with pressures as unknowns are never factorised. In all other cases "auto" means
+"auto" chooses a factorisation for a static body of at most 10,000 tetrahedra (a quadratic one counts as eight) in two
+cases. In the first case the bulk modulus is more than a thousand times the shear modulus. For at most 1,500 tetrahedra,
+a ratio of a hundred is enough: in Newton's method the stiffness of such bodies has negative eigenvalues, and a
+factorisation can solve with them. In the second case the worst element is a sliver. A body is never factorised if it
+has friction, nodes that move together, follower pressures, or pressures as unknowns. In all other cases "auto" chooses
 conjugate gradients.
 """
 
@@ -26,7 +26,7 @@ SMALL, STIFFEST_OF_SMALL = 1500, 1e2
 
 
 def chosen(scene: Scene) -> Scene:
-    """The scene with a choice in place of each `auto`: first the form for volumes, then the linear solver."""
+    """Replace each "auto" of a scene by a choice: first the form of volume changes, then the linear solver."""
     solve = _with_form(scene).solve
     if solve.newton_iterations == 1:
         solve = replace(solve, newton="one_step")
@@ -36,13 +36,14 @@ def chosen(scene: Scene) -> Scene:
 
 
 def with_solver(scene: Scene, rows: Iterable[Mapping[str, object]]) -> Scene:
-    """The scene with one linear solver for all rows: one program runs the scene with the numbers of each row.
+    """Choose one linear solver for all parameter sets, because one compiled program runs all of them.
 
-    Inside a program the numbers are not known. So "direct" is chosen here if any row needs it. Otherwise "auto" stays.
+    Inside this program the numbers are unknown. So "direct" is chosen here if any parameter set needs it. Otherwise
+    "auto" stays.
 
     Args:
         scene: `Scene`.
-        rows: dotted names -> numbers, as in `with_parameters`. Traced numbers are ignored.
+        rows: parameter sets, each with dotted names -> numbers, as in `with_parameters`. Traced numbers are ignored.
     """
     direct = replace(scene, solve=replace(scene.solve, linear_solver="direct"))
     if scene.solve.linear_solver != "auto" or not _may_factorise(_with_form(scene)):
@@ -61,12 +62,12 @@ def _with_form(scene: Scene) -> Scene:
 
 
 def linear_solver(scene: Scene) -> str:
-    """The solver for a scene: cg or direct. It is cg if the numbers of the scene are traced and therefore not known."""
+    """Linear solver for a scene: "cg" or "direct". It is "cg" if the numbers of the scene are traced, hence unknown."""
     return "direct" if _may_factorise(scene) and (_is_stiff(scene) or _is_thin(scene)) else "cg"
 
 
 def _may_factorise(scene: Scene) -> bool:
-    """Whether size and physics allow a factorisation, independently of moduli and shape."""
+    """Whether size and physics allow a factorisation. Moduli and shape are not considered."""
     solve = scene.solve
     if solve.volumetric == "mixed" or any(physics.ties for physics in scene.physics):
         return False
@@ -82,7 +83,7 @@ def _size(scene: Scene) -> int:
 
 
 def _is_stiff(scene: Scene) -> bool:
-    """Whether the bulk modulus is far above the shear modulus. The answer is no if the moduli are traced."""
+    """Whether the bulk modulus is far above the shear modulus. Returns False if the moduli are traced."""
     try:
         shear = scene.law.shear_modulus()
         bulk = scene.law.bulk_modulus() if scene.porosity is None else scene.porosity.limit_bulk
@@ -95,7 +96,7 @@ def _is_stiff(scene: Scene) -> bool:
 
 
 def _is_thin(scene: Scene) -> bool:
-    """Whether an element is a sliver. The answer is no if the points are traced."""
+    """Whether an element is a sliver. Returns False if the points are traced."""
     points, volumes = scene.mesh.points, scene.mesh.volumes
     if isinstance(points, jax.core.Tracer) or isinstance(volumes, jax.core.Tracer):
         return False
@@ -104,7 +105,7 @@ def _is_thin(scene: Scene) -> bool:
 
 
 def form_of_volumes(scene: Scene) -> str:
-    """The form for volume changes: mixed for quadratic elements if possible, else element.
+    """Form of the volume changes: "mixed" for quadratic elements if possible, otherwise "element".
 
     The choice does not depend on numbers, since a run and its derivatives must use the same form.
     """
@@ -121,12 +122,12 @@ def form_of_volumes(scene: Scene) -> str:
 
 
 def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> float:
-    """The smallest quality of all elements."""
+    """Lowest quality of all elements (see `qualities`)."""
     return float(np.min(qualities(points, tetrahedra, volumes)))
 
 
 def qualities(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> np.ndarray:
-    """Quality (E,) of elements: their volume over the volume of a regular element with the same mean square edge."""
+    """Quality (E,) of elements: volume divided by that of a regular element with the same mean squared edge length."""
     corners = points[tetrahedra]
     edges = np.stack([corners[:, a] - corners[:, b] for a in range(4) for b in range(a)], axis=1)
     length = np.sqrt(np.mean(np.sum(edges**2, axis=2), axis=1))

@@ -1,7 +1,7 @@
-"""Many runs of one scene, each with other numbers: one compiled program on all devices of the process.
+"""Many runs of one scene, each with other numbers, in one compiled program on all devices of the process.
 
 A lane is one run of the batch. On a CPU each device runs one lane after another. A vectorised step would be slower
-there, because its loops run until the slowest lane is done. On a GPU each device runs all of its lanes at once.
+there, because it would wait for the slowest lane in every loop. On a GPU each device runs all of its lanes at once.
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ STRATEGIES = ("map", "vmap")
 
 @struct
 class Batch:
-    """Results of N lanes; `result.status` is (N, T). A failed lane does not change the results of the other lanes."""
+    """Results of N lanes. `result.status` is (N, T). A failed lane does not change the results of the other lanes."""
 
     result: Result = param("1", "every field with a leading axis of N lanes")
     reference: jax.Array | None = param(
@@ -37,7 +37,7 @@ class Batch:
 
 
 def strategy_for(platform: str) -> str:
-    """The fastest strategy of a platform: map on cpu, vmap elsewhere."""
+    """Fastest strategy on a platform: "map" on a CPU, "vmap" on other platforms."""
     return "map" if platform == "cpu" else "vmap"
 
 
@@ -49,13 +49,13 @@ def simulate_batch(
     Args:
         scene: `Scene`.
         parameters: dotted names (see `with_parameters`) -> values with a leading axis of N lanes.
-        strategy: "map" or "vmap"; None: `strategy_for` chooses by the platform.
+        strategy: "map" or "vmap"; None: the fastest strategy on the platform (`strategy_for`).
         devices: devices that share the lanes; None: all devices of the process.
 
     Raises:
-        InputError: no parameters, different numbers of lanes, a name that the scene does not have, vmap of robust steps
-            on a CPU; or the scene of one lane is refused as in `simulate`: then the message begins with the number of
-            the lane.
+        InputError: no parameters, different numbers of lanes, a name that the scene does not have, "vmap" of robust
+            steps on a CPU. Also if `simulate` would raise InputError for a lane; the message then begins with the
+            number of the lane.
     """
     devices = jax.local_devices() if devices is None else devices
     strategy = strategy_for(devices[0].platform) if strategy is None else strategy
@@ -103,15 +103,15 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
         if length is None or length == 0:
             raise InputError(f"{name} has no lanes: give one value per lane, e.g. [700.0, 800.0]")
         if length != lengths[first]:
-            raise InputError(f"{name} has {length} lanes and {first} has {lengths[first]}: give as many of each")
+            raise InputError(f"{name} has {length} lanes and {first} has {lengths[first]}: give equal numbers")
     return int(lengths[first] or 0)
 
 
 def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[str, np.ndarray]]:
-    """The numbers of each lane, after checks; an empty list if they are traced.
+    """Check the numbers of each lane and return them. Returns an empty list if they are traced.
 
     Raises:
-        InputError: `simulate` would refuse a lane. The message begins with the number of this lane.
+        InputError: `simulate` would raise InputError for a lane. The message begins with the number of this lane.
     """
     if any(isinstance(value, jax.core.Tracer) for value in parameters.values()):
         return []

@@ -1,4 +1,4 @@
-"""Cautions about a run, made on the host. Each caution is one sentence."""
+"""Warnings about a run, computed on the host. The functions return sentences. No sentence means no warning."""
 
 from functools import partial
 
@@ -37,15 +37,15 @@ LONGEST = 1.0
 SHORTEST = 1e-3
 #: A displacement smaller than this fraction of the body's size counts as zero.
 _ROUNDOFF = 1e-13
-#: Elements of a lower quality (see `qualities`) are slivers: their gradients are a hundred times worse.
+#: Elements of a lower quality (see `qualities`) are slivers. Gradients in them are a hundred times less accurate.
 SLIVER = 0.01
-#: About four fifths of a soft tissue is fluid. Below `LEAST_J` not even its solid part has room; `MOST_J` is
-#: 1/`LEAST_J`.
+#: Bounds of the volume ratio J. About four fifths of a soft tissue is fluid, so below `LEAST_J` even the solid part has
+#: too little space. `MOST_J` is 1/`LEAST_J`.
 LEAST_J, MOST_J = 0.2, 5.0
 
 
 def cautions_of_run(scene: Scene, result: Result) -> list[str]:
-    """Sentences about the mesh, the loads, the contacts and the volumes of a run; the list may be empty.
+    """Warnings about the mesh, the loads, the contacts and the volumes of a run; the list may be empty.
 
     Args:
         scene: `Scene`, not traced.
@@ -64,79 +64,82 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
     ]
 
 
-#: If the mesh error is below this fraction of the largest displacement, no other mesh is recommended.
+#: If the mesh error is below this fraction of the largest displacement, no finer mesh is recommended.
 _SMALL = 0.02
 
 
 def mesh_sentence(scene: Scene, result: Result) -> str:
-    """One line on the mesh error of the positions at the last step, with a remedy if the error is large."""
+    """One sentence on the mesh error of the positions at the last step, with a remedy if the error is large."""
     assert result.mesh_error is not None
     if np.asarray(result.status)[-1] not in (status.CONVERGED, status.ONE_STEP):
-        return "mesh error: the last step failed, so that it is not known"
+        return "mesh error: unknown, because the last step failed"
     u = np.asarray(result.positions[-1]) - np.asarray(scene.mesh.points)
     size = float(np.linalg.norm(u, axis=1).max())
     error = float(np.linalg.norm(np.asarray(result.mesh_error.positions[-1]), axis=1).max())
     nothing = _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points))
     if size <= nothing and error <= nothing and np.all(np.asarray(result.mesh_error.found)):
-        return "mesh error: it is zero, because the body does not move"
+        return "mesh error: zero, because the body does not move"
     part = (
         f"{100 * error / size:.2g} % of the largest displacement ({size:.3g} m)"
         if size > nothing
-        else "and do not move"
+        else "although the run shows no displacement"
     )
-    said = f"mesh error (estimate, last step{{}}): nodes are up to {error:.2g} m off, {part}{{}}"
+    said = f"mesh error (estimate, last step{{}}): nodal positions are wrong by up to {error:.2g} m, {part}{{}}"
     said = said.format(*_pressure_errors(result))
+    single = next((p.section for p in scene.physics if p.pulls_single_nodes()), None)
+    if single is not None:
+        said += f". Forces of [[{single}]] at single nodes depend on the mesh, and this estimate does not contain that"
     if not np.all(np.asarray(result.mesh_error.found)):
         return (
-            f"{said}; at some steps it is not found, or turns elements inside out: the mesh is too coarse for a "
-            "reliable number"
+            f"{said}; at some steps the estimate was not found, or it inverts elements: the mesh is too coarse for a "
+            "reliable estimate"
         )
     if error <= _SMALL * size:
         return said
-    return f"{said}: take {'order = 2 in [mesh], or a finer mesh' if scene.mesh.order == 1 else 'a finer mesh'}"
+    return f"{said}: use {'order = 2 in [mesh], or a finer mesh' if scene.mesh.order == 1 else 'a finer mesh'}"
 
 
 def _pressure_errors(result: Result) -> tuple[str, str]:
-    """Two parts of the sentence on the mesh error: what it leaves out, and the error of the fluid's pressures."""
+    """Two parts of the sentence on the mesh error: what the error omits, and the error of the fluid pressures."""
     if result.pressure is None or result.mesh_error is None:
         return "", ""
     if result.mesh_error.pressure is None:
         return ", without the error of the fluid's pressures", ""
     error, size = (float(np.abs(np.asarray(own[-1])).max()) for own in (result.mesh_error.pressure, result.pressure))
-    return "", f"; pressures up to {error:.2g} Pa, the largest is {size:.3g} Pa"
+    return "", f"; pressures are wrong by up to {error:.2g} Pa, the largest pressure is {size:.3g} Pa"
 
 
 def cautions_of_mesh(mesh: TetMesh) -> list[str]:
-    """Sentences on the size of the body, on nodes that are not joined, and on slivers."""
+    """Warnings about the size of the body, about nodes with equal coordinates, and about slivers."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     size, quality = float(np.ptp(points, axis=0).max()), qualities(points, tets, np.asarray(mesh.volumes))
     said = []
     if size > LONGEST:
         said.append(f"the body is {size:.3g} m long: check the mesh's unit, e.g. write unit = 'mm'")
     if size < SHORTEST:
-        said.append(f"the body is {size:.3g} m long: check its size; if its numbers are metres, leave unit out")
+        said.append(f"the body is {size:.3g} m long: check its size; if its coordinates are in m, remove unit")
     doubled = doubled_vertices(mesh)
     if doubled:
         said.append(
-            f"{doubled} nodes are at the place of another node: the body is not joined there; merge them if it should "
-            "be"
+            f"{doubled} nodes have the same coordinates as another node: the body is not connected there; merge these "
+            "nodes if it should be connected"
         )
     slivers = np.flatnonzero(quality < SLIVER)
     if len(slivers):
         worst = int(np.argmin(quality))
         said.append(
             f"{len(slivers)} of {len(tets)} elements are slivers, of quality below {SLIVER:g} (worst: element {worst}, "
-            f"{quality[worst]:.2g}; regular: 1): do not trust stresses there, or remesh"
+            f"{quality[worst]:.2g}; regular: 1): stresses there are unreliable; improve the mesh"
         )
     return said
 
 
-#: With a larger K/mu quadratic elements without unknown pressures are wrong by 10 % or more (experiments/TABLES.md).
+#: Above this K/mu, quadratic elements without pressure unknowns have errors of 10 % or more (experiments/TABLES.md).
 _LOCKING = 100.0
 
 
 def of_locking(scene: Scene) -> list[str]:
-    """A sentence if quadratic elements lock although another form of the volumes would not lock."""
+    """Warn if quadratic elements lock although another form of the volume changes would not lock."""
     if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
         return []
     try:
@@ -147,21 +150,21 @@ def of_locking(scene: Scene) -> list[str]:
     if ratio <= _LOCKING:
         return []
     return [
-        f"the bulk modulus is {ratio:.3g} times the shear modulus, where these elements are too stiff: write "
-        "volumetric = 'mixed' in [solve]"
+        f"the bulk modulus is {ratio:.3g} times the shear modulus, so these quadratic elements are too stiff: "
+        "write volumetric = 'mixed' in [solve]"
     ]
 
 
-#: Fraction of a history that the steps may miss without a caution: of its largest value, or of its sum over time.
+#: The steps may miss this fraction of a history without a warning: of its largest value, or of its integral over time.
 MISSED = 0.05
 
 
-#: After this many relaxation times a body that began unrelaxed is within a hundredth of its state of rest.
+#: After this many relaxation times, the stress of an initially unrelaxed body is relaxed to within 1 %.
 _RESTS = 5.0
 
 
 def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
-    """A sentence if a static run from a loaded shape ends before its stress has relaxed."""
+    """Warn if a static run from a loaded shape ends before the stress has relaxed."""
     if scene.points_are != "loaded" or scene.viscosity is None or scene.solve.kind != "static":
         return []
     own, lasts = by_element(scene).viscosity, float(result.times[-1])
@@ -171,15 +174,15 @@ def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
     if scene.solve.dt is None or lasts > _RESTS * slowest:
         return []
     return [
-        f"the run begins with stress that has not relaxed and lasts {lasts:.3g} s beside a relaxation time of "
-        f"{slowest:.3g} s, so it does not end in the given shape: leave viscosity out, or run for longer"
+        f"the run begins with unrelaxed stress and lasts {lasts:.3g} s, but a relaxation time is {slowest:.3g} s, so "
+        "the body does not end in the given shape: remove viscosity, or run for longer"
     ]
 
 
 def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
-    """A sentence if a body under constant loads has more kinetic energy than the work of these loads.
+    """Warn if the kinetic energy of a body under constant loads exceeds the work of these loads.
 
-    Newmark's method keeps the energy only of small motions. If a step is as long as a period, large motions can grow.
+    Newmark's method conserves energy only in small motions. If a step is as long as a period, large motions can grow.
     """
     body, solve = scene.body, scene.solve
     if solve.kind != "dynamic" or solve.integrator != "newmark" or body is None or body.mass != "lumped":
@@ -199,14 +202,14 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
         return []
     k = int(np.argmax(moving > given + 1e-3 * np.abs(work).max()))
     return [
-        f"from {float(np.asarray(result.times)[k]):.4g} s on the body moves with more energy than its loads have given "
-        "it: Newmark's method lets large motion grow if a step is as long as a period. Take a step of a twentieth of "
-        "the period, or integrator = 'euler'"
+        f"from {float(np.asarray(result.times)[k]):.4g} s on the kinetic energy of the body exceeds the work of its "
+        "loads: with Newmark's method large motions grow if a step is as long as a period. Use a step of a twentieth "
+        "of the period, or integrator = 'euler'"
     ]
 
 
 def _gives_no_energy(physics: Physics) -> bool:
-    """Whether a physics without a history begins without stored energy, and nothing else gives it any."""
+    """Whether a physics without a history has no stored energy at the beginning, and adds no energy to the body."""
     if isinstance(physics, Obstacle):
         return not isinstance(physics, PressedObstacle) and physics.by is None
     if isinstance(physics, RigidPlate):
@@ -215,7 +218,7 @@ def _gives_no_energy(physics: Physics) -> bool:
 
 
 def _of_histories(scene: Scene, result: Result) -> list[str]:
-    """A sentence on every history that changes within a step: the run uses only its values at the ends of steps."""
+    """Warn about each history that changes within a step, since the run uses only its values at the ends of steps."""
     said = []
     steps = np.concatenate([[0.0], np.asarray(result.times)])
     for name, part in histories(scene).items():
@@ -229,39 +232,39 @@ def _of_histories(scene: Scene, result: Result) -> list[str]:
         if beyond[peak] > MISSED * whole.max():
             said.append(
                 f"the history of {name} has a peak at {every[peak]:.4g} s between two steps, and the run misses "
-                f"{100 * beyond[peak] / whole.max():.2g} % of it: take a smaller dt, or one that divides "
+                f"{100 * beyond[peak] / whole.max():.2g} % of it: use a smaller dt, or a dt that divides "
                 f"{every[peak]:.4g} s"
             )
             continue
         lost, everything = (np.trapezoid(a, every, axis=0).max() for a in (apart, whole))
         if lost > MISSED * everything:
             said.append(
-                f"the history of {name} bends within steps, and the run, which sees it at their ends, is off by "
-                f"{100 * lost / everything:.2g} % of its sum over time: take a smaller dt"
+                f"the history of {name} bends within steps, but the run uses only its values at the ends of steps: the "
+                f"error is {100 * lost / everything:.2g} % of the integral over time. Use a smaller dt"
             )
     return said
 
 
-#: Fraction of the approach that an obstacle may enter the body between two contact points without a caution.
+#: No warning if the depth between contact points is below this fraction of the approach (see `missed_depth`).
 BETWEEN = 0.25
 
 
 def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: jax.Array) -> list[str]:
-    """A sentence if the obstacle, displaced by `moved` (T, 3), overlaps the body between the contact points."""
+    """Warn if the obstacle, displaced by `moved` (T, 3), overlaps the body between the contact points."""
     last = len(moved) - 1
     for k in {int(jnp.argmax(jnp.linalg.norm(moved, axis=1))), last}:
         x = jnp.asarray(result.positions[k], scene.mesh.points.dtype)
         between, approach = missed_depth(obstacle, scene.mesh, x, moved[k])
         if between > BETWEEN * approach:
             return [
-                f"{name} is {between:.2g} m in the body between the points at which contact is tested, of an "
+                f"{name} is {between:.2g} m in the body between the points at which contact is tested, with an "
                 f"approach of {approach:.2g} m: the triangles are too large for its radius; refine the mesh there"
             ]
     return []
 
 
 def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: np.ndarray) -> str:
-    """A sentence if the obstacle, displaced by `moved` (T + 1, 3) from step 0 on, passed the surface within a step."""
+    """Warn if the obstacle, displaced by `moved` (T + 1, 3) from step 0 on, passed the surface within a step."""
     ways, radius = np.linalg.norm(np.diff(moved, axis=0), axis=1), float(np.asarray(obstacle.radius))
     centres, axis = np.asarray(obstacle.position, float) + moved, np.asarray(obstacle.axis, float)
     if obstacle.shape == "cylinder":  # it may slide along its axis
@@ -274,14 +277,14 @@ def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, m
         if what:
             return (
                 f"{name} {what} the body in step {k + 1}, in which it moves {ways[k]:.2g} m, with a radius of "
-                f"{radius:.2g} m: it passed the surface between two steps, so that forces of contact are missing or "
-                "act to the wrong side; take more steps"
+                f"{radius:.2g} m: it passed the surface between two steps, so contact forces are missing or point to "
+                "the wrong side; use more steps"
             )
     return ""
 
 
 def _of_contacts(scene: Scene, result: Result) -> list[str]:
-    """Sentences on obstacles (not planes) that passed the surface, or overlap the body between its contact points."""
+    """Warn about obstacles (not planes) that passed the surface, or overlap the body between the contact points."""
     said, steps = [], len(result.times)
     obstacles = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, Obstacle)]
     pressed = any(isinstance(physics, PressedObstacle) for _, physics in obstacles)
@@ -299,7 +302,7 @@ def _of_contacts(scene: Scene, result: Result) -> list[str]:
 
 
 def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
-    """A sentence if a static run failed and only friction holds the body: it may have to slide."""
+    """Warn if a static run failed and only friction supports the body, since the body may slide."""
     rough = any(isinstance(physics, RoughObstacle) for physics in scene.physics)
     fine = (status.CONVERGED, status.ONE_STEP, status.STALLED)
     if not rough or scene.solve.kind != "static" or np.isin(result.statistics.status, fine).all():
@@ -312,17 +315,17 @@ def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
     if not loose:
         return []
     return [
-        f"the run failed, and only friction holds {loose} against sliding away: if loads push it sideways and friction "
-        "is too small for them, no state of rest exists; take a larger friction, [[fixed]], or kind = 'dynamic'"
+        f"the run failed, and only friction prevents sliding of {loose}: if friction is too small for the sideways "
+        "loads, no equilibrium exists; use a larger friction, [[fixed]], or kind = 'dynamic'"
     ]
 
 
-#: If a scheme is unstable, the changes of the pressure over one step are this many times its changes over two steps.
+#: A scheme counts as unstable if the pressure changes over one step are this many times the changes over two steps.
 ALTERNATING = 3.0
 
 
 def _of_pressures(scene: Scene, result: Result) -> list[str]:
-    """A sentence if the pressure overshoots, if elements at drained places are too high, or if "lagged" is unstable."""
+    """Warn if the pressure overshoots, if elements at drained nodes are too thick, or if "lagged" is unstable."""
     if scene.porosity is None or result.pressure is None:
         return []
     P = np.asarray(result.pressure)
@@ -337,7 +340,7 @@ def _of_pressures(scene: Scene, result: Result) -> list[str]:
     if not once > ALTERNATING * twice:
         return []
     return [
-        "the pressure goes up and down from step to step, as scheme = 'lagged' does if it is unstable: write scheme = "
+        "the pressure alternates from step to step, because scheme = 'lagged' is unstable here: write scheme = "
         "'implicit' in [porosity]"
     ]
 
@@ -351,11 +354,11 @@ def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
 
 
 def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
-    """A sentence if the layer that drains in `seconds` is thinner than the elements there; `when` is the time in words.
+    """Warn if the layer that drains in `seconds` is thinner than the elements there; `when` is the time in words.
 
-    After a time t the fluid has left a layer of a thickness of about sqrt(c t), with the diffusivity c = kappa /
-    (1/K_lim + 1/M) (Biot 1941). The pressure is linear in an element. So an element thicker than this layer loses too
-    much fluid.
+    In a time t, a layer of the thickness sqrt(c t) drains, with the diffusivity c = kappa / (1/K_lim + 1/M) (Biot
+    1941). kappa is the permeability, M = K0 + 4/3 mu. The pressure is linear in an element, so an element thicker than
+    this layer loses too much fluid.
     """
     sponge = scene.porosity
     assert sponge is not None
@@ -378,26 +381,26 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
         return []
     return [
         f"{when.format(seconds)} the fluid leaves a layer of about {layer:.2g} m at the drained "
-        f"places, and the elements there are {height:.2g} m high: they drain too much, so that pressures and "
-        "displacements are wrong there (the mesh error says by how much): take thinner elements there, or hold the "
-        "fluid (no drained places) if nothing should flow"
+        f"nodes, but the elements there are {height:.2g} m thick. They drain too much, so pressures and "
+        "displacements are wrong there (the mesh error shows by how much). Use thinner elements there, or no drained "
+        "nodes if nothing should flow"
     ]
 
 
-#: A larger overshoot, divided by the largest pressure of the step, leads to a caution.
+#: A larger overshoot, divided by the largest pressure of the step, leads to a warning.
 OVERSHOOT = 0.05
-#: Minimum dt, in units of h^2/(kappa M), for elements of height h, permeability kappa and longitudinal modulus M. With
-#: this dt or a longer one the overshoot is smaller.
+#: Smallest dt for which the overshoot stays below `OVERSHOOT`, in units of h^2/(kappa M), for elements of height h,
+#: permeability kappa and longitudinal modulus M.
 _FOLLOWS = 0.4
 
 
 def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
-    """A sentence if pressures P (T, V) are higher beside the drained places than further inside.
+    """Warn if pressures P (T, V) are higher beside the drained nodes than further inside.
 
-    The volume that leaves an element within a step belongs to all of its nodes. In a row of elements with dt < h^2/(4
-    kappa M), this couples neighbouring nodes more strongly than the flow between them. Elements of a body need a dt
-    that is longer by half. Such bounds are known since Vermeer and Verruijt 1981 (Int. J. Numer. Anal. Methods Geomech.
-    5, 1).
+    The fluid volume that leaves an element within a step is distributed to all nodes of the element. In one dimension,
+    with dt < h^2/(4 kappa M), this couples neighbouring nodes more strongly than the flow between them. In three
+    dimensions the smallest dt without overshoot is about 1.5 times this bound. Such bounds are known since Vermeer and
+    Verruijt 1981 (Int. J. Numer. Anal. Methods Geomech. 5, 1).
     """
     sponge, tets, V = scene.porosity, np.asarray(scene.mesh.tetrahedra), scene.mesh.number_of_vertices
     assert sponge is not None
@@ -426,20 +429,20 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
         return []
     height = _height_beside(scene, at, faces)
     said = (
-        f"the pressure overshoots beside the drained places, by {100 * over[worst]:.2g} % at "
+        f"the pressure overshoots beside the drained nodes, by {100 * over[worst]:.2g} % at "
         f"{float(scene.solve.dt) * (worst + 1):.3g} s, because the first steps are too short for the elements there"
     )
     try:
         shear = np.median(np.asarray(scene.law.shear_modulus()))
     except InputError:  # a law may have no moduli
-        return [f"{said}: take a larger dt, or thinner elements there"]
+        return [f"{said}: use a larger dt, or thinner elements there"]
     flow = float(np.median(np.asarray(sponge.permeability)) * (np.median(np.asarray(sponge.bulk)) + 4 / 3 * shear))
     enough = _FOLLOWS * height**2 / flow
     if float(scene.solve.dt) >= enough:  # then the steps are not the cause
         return []
     return [
-        f"{said}: take a dt of {enough:.2g} s or more, or elements of "
-        f"{np.sqrt(float(scene.solve.dt) * flow / _FOLLOWS):.2g} m there (they are {height:.2g} m high)"
+        f"{said}: use a dt of {enough:.2g} s or more, or elements of "
+        f"{np.sqrt(float(scene.solve.dt) * flow / _FOLLOWS):.2g} m there (they are {height:.2g} m thick)"
     ]
 
 
@@ -450,9 +453,9 @@ def _at_times(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarr
 
 
 def _of_volumes(scene: Scene, result: Result) -> list[str]:
-    """A sentence on elements beyond `LEAST_J` or `MOST_J` at any step."""
+    """Warn about elements with a volume ratio J below `LEAST_J` or above `MOST_J` at any step."""
     said = []
-    # A run in single precision has a mesh in double.
+    # Positions may be in single precision; the mesh is in double precision.
     positions = jnp.asarray(result.positions, scene.mesh.points.dtype)
     found = [np.asarray(a) for a in compiled(_extremes, scene.mesh, positions)(scene.mesh, positions)]
     kinds = ((np.less, LEAST_J, "shrank below"), (np.greater, MOST_J, "grew above"))
@@ -466,13 +469,13 @@ def _of_volumes(scene: Scene, result: Result) -> list[str]:
         when = f"load step {time:g}" if scene.solve.dt is None else f"{time:.4g} s"
         said.append(
             f"{int(out.sum())} of {len(J)} elements {words} J = {bound:g} (worst: element {worst}, J = {J[worst]:.2g} "
-            f"at {when}), which no tissue does: take a stiffer bulk modulus or smaller loads"
+            f"at {when}), which is impossible in tissue: use a larger bulk modulus or smaller loads"
         )
     return said
 
 
 def _extremes(mesh: TetMesh, positions: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Minimum J (E,) of each element, its step (from 0), maximum J and its step; J is 1 before a run."""
+    """Minimum J (E,) of each element, the step of the minimum (from 0), maximum J, and the step of the maximum."""
 
     def one(carry: tuple, given: tuple) -> tuple[tuple, None]:
         least, when_least, most, when_most = carry

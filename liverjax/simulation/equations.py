@@ -1,4 +1,4 @@
-"""The equations of one load or time step: sums over the physics of the scene."""
+"""The equations of one load or time step: sums over the force terms of the scene's physics."""
 
 from typing import Any, NamedTuple
 
@@ -23,52 +23,52 @@ class State(NamedTuple):
     """The state between two steps."""
 
     x: jax.Array  # (V, 3) [m]
-    memories: tuple  # one for each physics, in order; None: this physics has no memory
+    memories: tuple  # one memory per physics, in order; None if the physics has no memory
 
 
 class Sizes(NamedTuple):
-    """Norms of nodal forces at rest. They are the same for all steps and have no derivatives."""
+    """Norms of nodal forces in the reference shape. They are constant over all steps and not differentiated."""
 
-    unit_strain: jax.Array  # [N] norm of the forces of a stretch along x, per unit strain
-    roundoff: jax.Array  # [N] norm of the forces that rounding of the positions causes
+    unit_strain: jax.Array  # [N] norm of the linearised nodal forces at a uniform unit strain along x
+    roundoff: jax.Array  # [N] norm of the nodal forces due to roundoff of the positions
 
 
 class Equations(NamedTuple):
-    """The equations of a step; constant during it."""
+    """The equations of a step, constant during the step."""
 
     scene: Scene
     physics: tuple[Physics, ...]
-    acting: tuple  # what acts of each physics in this step; None: nothing acts
-    state: State  # at the beginning
+    acting: tuple  # force term of each physics in this step; None if nothing acts
+    state: State  # state at the beginning of the step
     k: Number  # number of the step, from 1
     free: Free
-    noise: Number  # [N] smaller forces are roundoff: an unloaded equilibrium has converged
-    roundoff: jax.Array  # [N] norm of the forces that rounding of the positions causes
+    noise: Number  # [N] added to the force scale of the tolerance, so that an unloaded body converges despite roundoff
+    roundoff: jax.Array  # [N] norm of the nodal forces due to roundoff of the positions
     moved: tuple[jax.Array, jax.Array] | None  # (V, 3) [m] prescribed displacements before and after the step
 
     @property
     def mesh(self) -> TetMesh:
-        """The body."""
+        """Mesh of the body."""
         return self.scene.mesh
 
     @property
     def solids(self) -> list[Solid]:
-        """The physics whose stress depends on the deformation gradient of elements."""
+        """Force terms with a stress that depends on the deformation gradient of the elements."""
         return [a for a in self.acting if isinstance(a, Solid)]
 
     @property
     def volume(self) -> VolumeStress | None:
-        """The physics that acts on the volume of elements, or None."""
+        """Force term with a stress that depends on the volume ratio of the elements, or None."""
         return next((a for a in self.acting if isinstance(a, VolumeStress)), None)
 
     @property
     def mixed(self) -> Any:
-        """The physics whose pressures are unknowns together with the positions, or None."""
+        """Force term with pressures that are unknowns together with the positions, or None."""
         return self.volume if self.volume is not None and self.volume.unknown else None
 
     @property
     def nodal(self) -> list[NodalForce]:
-        """The physics whose forces act at nodes."""
+        """Force terms with forces at nodes."""
         return [a for a in self.acting if isinstance(a, NodalForce)]
 
     @property
@@ -78,14 +78,14 @@ class Equations(NamedTuple):
 
 
 class Forces(NamedTuple):
-    """Forces at a point of a step."""
+    """Nodal forces for given unknowns at one instant within a step."""
 
-    internal: jax.Array  # (V, 3) [N] forces of the elements
-    nodal: list[jax.Array]  # (V, 3) [N] forces of each physics that acts at nodes
+    internal: jax.Array  # (V, 3) [N] forces from the stress in the elements
+    nodal: list[jax.Array]  # (V, 3) [N] forces of each force term at nodes
     pressure: jax.Array | None  # (V,) [Pa]
-    x: jax.Array  # (V, 3) [m]
-    F: Matrix
-    isochoric: jax.Array | None = None  # (V, 3) [N] part of `internal` without the unknown pressures' stress
+    x: jax.Array  # (V, 3) [m] positions
+    F: Matrix  # deformation gradient
+    isochoric: jax.Array | None = None  # (V, 3) [N] part of `internal` without the stress of unknown pressures
 
     @property
     def total(self) -> jax.Array:
@@ -94,7 +94,7 @@ class Forces(NamedTuple):
 
 
 def free_directions(scene: Scene) -> Free:
-    """Directions in which the body can move."""
+    """Directions in which the nodes of the body can move."""
     free = Free(free_degrees(scene.mesh, scene.fixed, scene.displaced))
     for physics in scene.physics:
         free = physics.constrain(free)
@@ -102,12 +102,12 @@ def free_directions(scene: Scene) -> Free:
 
 
 def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
-    """The state at the beginning: at rest in the reference positions, or at rest in positions `start` (V, 3) [m]."""
+    """State at the beginning of a run: at rest in the reference positions, or in positions `start` (V, 3) [m]."""
     x = scene.mesh.points if start is None else start
     physics, free = physics_of(scene), free_directions(scene)
 
     def force() -> jax.Array:
-        """Forces on the nodes at x without inertia. The first acceleration follows from these forces."""
+        """Nodal forces at x without inertia. The initial acceleration follows from these forces."""
         if start is not None or (scene.porosity is not None and scene.porosity.initial_pressure is not None):
             return _forces_at_beginning(scene, x)
         # At rest in the reference positions only nodal forces act.
@@ -122,9 +122,9 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
 
 
 def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] of all physics at positions x (V, 3), except inertia and forces at the end only.
+    """Forces (V, 3) [N] of all physics at positions x (V, 3), with the memories of the reference shape.
 
-    The memories are those of the reference shape.
+    Inertia and the forces that act only at the end of a step (`NodalForce.at_end`) are left out.
     """
     still = replace(scene, solve=replace(scene.solve, kind="static"))
     none = jnp.zeros((), x.dtype)
@@ -142,13 +142,13 @@ def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
 
 
 def _with_tied(physics: tuple[Physics, ...], step: Step) -> Step:
-    """The step with the nodes that move together."""
+    """Add the nodes that move together to the step."""
     tied = tuple(nodes for nodes in (p.tied(step) for p in physics) if nodes is not None)
     return step._replace(free=step.free._replace(tied=tied))
 
 
 def force_sizes(scene: Scene) -> Sizes:
-    """Norms [N] of the forces of a stretch along x and of rounded positions. They set the tolerance if no load acts."""
+    """Norms [N] of the forces of a strain along x and of rounded positions, for the tolerance if no load acts."""
     mesh, law = scene.mesh, law_at_rest(scene)
     dtype = mesh.points.dtype
     along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], dtype)
@@ -164,7 +164,7 @@ def force_sizes(scene: Scene) -> Sizes:
 
 
 def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
-    """Norm [N] of the forces of springs and masses in the reference shape if the nodes move by `rounded` (V, 3) [m].
+    """Norm [N] of the forces of springs and masses if the nodes move by `rounded` (V, 3) [m] from the reference shape.
 
     Contact is left out: the contact points are not known before the step.
     """
@@ -188,7 +188,7 @@ def _is_spring(acting: NodalForce) -> bool:
 
 
 def equations(scene: Scene, state: State, k: Number, sizes: Sizes | None = None) -> Equations:
-    """The equations of step k = 1 … steps from `state`; `sizes` is `force_sizes(scene)`, the same for all steps."""
+    """Equations of step k (from 1) that begins at `state`. `sizes` is `force_sizes(scene)`, the same for all steps."""
     sizes = force_sizes(scene) if sizes is None else sizes
     return _of_physics(scene, physics_of(scene), state, k, sizes)
 
@@ -212,7 +212,7 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
 
 
 def _prescribed_motion(scene: Scene, k: Number) -> tuple[jax.Array, jax.Array] | None:
-    """Displacements (V, 3) [m] before and after step k, or `None` if nothing is moved."""
+    """Prescribed displacements (V, 3) [m] before and after step k, or None if no displacement is prescribed."""
     if not scene.displaced:
         return None
     solve = scene.solve
@@ -224,11 +224,11 @@ def _prescribed_motion(scene: Scene, k: Number) -> tuple[jax.Array, jax.Array] |
 
 
 def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
-    """Positions (V, 3) from unknowns q (3 V,) and the held nodes, at fraction s of the step."""
+    """Positions (V, 3) from the unknowns q (3 V,) and the prescribed motion, at fraction s of the step."""
     held, free = e.mesh.points, e.free
     q = q[: 3 * e.mesh.number_of_nodes]
     if e.moved is not None:
-        # Linear from beginning to end of the step: if a history bends within the step, only its value at the end
+        # Prescribed motion is linear within a step. If a history bends within the step, only its value at the end
         # counts.
         before, after = e.moved
         held = held + before + s * (after - before)
@@ -241,10 +241,11 @@ def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
 
 
 def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> jax.Array:
-    """Unknowns q of a step at positions x (V, 3): free positions (3 V,), then unknown pressures in their unit.
+    """Unknowns q of a step at positions x (V, 3): free positions (3 V,), then pressures in the unit `mixed.unit`.
 
     Args:
-        pressure: pressures of the vertices (V,) [Pa] if they are unknowns; default: those at the step's beginning.
+        pressure: pressures of the vertices (V,) [Pa] if they are unknowns; default: pressures at the beginning of the
+            step.
     """
     field = e.free._replace(tied=()).vectors(x)
     for nodes in e.free.tied:
@@ -256,14 +257,14 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
     return jnp.concatenate([q, pressure / e.mixed.unit])
 
 
-@jax.jit  # a program calls it several times: it is traced once
+@jax.jit  # a program calls it several times, but with jit it is traced once
 def forces(
     e: Equations, q: jax.Array, s: Number, guess: Guess | None = None, pressure: jax.Array | None = None
 ) -> Forces:
-    """Forces of all physics at unknowns q (3 V,), at fraction s of the step.
+    """Forces of all physics for the unknowns q (3 V,), at fraction s of the step.
 
-    Pressures of a flowing fluid can be given as `pressure` (V,) [Pa]. Otherwise they are computed, from `guess` if it
-    is given.
+    The pressures of a flowing fluid can be given as `pressure` (V,) [Pa]. Otherwise they are computed, starting at
+    `guess` if it is given.
     """
     x = positions(e, q, s)
     F = deformation_gradient(e.mesh, x)
@@ -283,7 +284,7 @@ def forces(
 
 
 def forces_at(scene: Scene, x: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] that keep the nodes at rest at positions x (V, 3), for a scene without supports."""
+    """Forces (V, 3) [N] that keep the nodes in equilibrium at positions x (V, 3), for a scene without supports."""
     none = jnp.zeros(())
     e = equations(scene, initial_state(scene), 1.0, Sizes(none, none))
     q = unknowns(e, x)
@@ -291,25 +292,28 @@ def forces_at(scene: Scene, x: jax.Array) -> jax.Array:
 
 
 def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
-    """Unknown pressures (V,) [Pa] of the vertices."""
+    """Pressures (V,) [Pa] of the vertices from the unknowns q."""
     return e.mixed.unit * q[3 * e.mesh.number_of_nodes :]
 
 
 def settled(e: Equations, q: jax.Array, s: Number | None = None) -> jax.Array:
-    """Unknowns q with unknown pressures replaced: they balance the volumes at fraction s of the step (default: 1)."""
+    """Replace the pressures in q by pressures that balance the volumes at fraction s of the step (default: 1)."""
     n, x = 3 * e.mesh.number_of_nodes, positions(e, q, jnp.ones((), q.dtype) if s is None else s)
     pressure = e.mixed.settled(e.mesh, determinant(deformation_gradient(e.mesh, x)))
     return jnp.concatenate([q[:n], pressure / e.mixed.unit])
 
 
 def flowing_pressure(e: Equations, q: jax.Array, s: Number, guess: Guess) -> jax.Array:
-    """Pressures (V,) [Pa] of a flowing fluid at unknowns q (3 V,). The solver starts at `guess`."""
+    """Pressures (V,) [Pa] of a flowing fluid for the unknowns q (3 V,). The solver starts at `guess`."""
     assert e.volume is not None
     return e.volume.pressure(e.mesh, determinant(deformation_gradient(e.mesh, positions(e, q, s))), guess)
 
 
 def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces (3 V,) [N] at the step's end, and residuals (V,) of the given pressures (V,) [Pa]."""
+    """Out-of-balance forces (3 V,) [N] at the end of a step, and residual (V,) of the pressure equation.
+
+    `pressure` (V,) [Pa] are the pressures at the end of the step.
+    """
     volume: Any = e.volume
     f = forces(e, q, jnp.ones((), q.dtype), None, volume.in_force(pressure))
     return flat(e.free.vectors(f.total, f.x)), volume.balance(e.mesh, pressure, determinant(f.F))
@@ -336,7 +340,7 @@ def residual(
 
 
 def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
-    """The energy [J] that a step minimises: the sum of incremental potentials.
+    """Energy [J] that a step minimises: the sum of the incremental potentials.
 
     At `start` the gradient of the energy is the residual. If all forces have an energy, this is true at every q.
     """
@@ -344,20 +348,22 @@ def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
     F = deformation_gradient(e.mesh, x)
     total = jnp.sum(e.mesh.weights * sum(solid.energy(F) for solid in e.solids))
     if e.volume is not None:
-        total = total + e.volume.energy(e.mesh, determinant(F))  # for unknown pressures: with the optimal ones
+        total = total + e.volume.energy(e.mesh, determinant(F))  # unknown pressures take their optimal values
     return sum((a.energy_from(e.mesh, x, begin) for a in e.nodal), total)
 
 
 def advanced(e: Equations, end: End, by_end_forces: jax.Array | None = None) -> State:
-    """The state after an accepted step. `by_end_forces` is the second result of `reported_forces`."""
+    """State after an accepted step. `by_end_forces` is the second result of `reported_forces`."""
     end = end._replace(by_end_forces=by_end_forces)
     each = zip(e.physics, e.state.memories, e.acting, strict=True)
     return State(end.x, tuple(p.advance(memory, acting, end) for p, memory, acting in each))
 
 
 def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-    """The sum of all forces (V, 3) [N] without the doubled part of forces at the end (`NodalForce.at_end`), and minus
-    the accelerations (V, 3) [m/s^2] by these forces, or None if there are none.
+    """Sum of all forces (V, 3) [N], from which the reactions follow. Forces of `NodalForce.at_end` are not doubled.
+
+    The second result is minus the accelerations (V, 3) [m/s^2] due to these forces. It is None if there are no such
+    forces.
 
     Args:
         total: sum of all forces at positions x (V, 3), as in the step's equations.
@@ -371,12 +377,12 @@ def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.A
 
 
 def _at_end(e: Equations, x: jax.Array, s: Number) -> list[jax.Array]:
-    """Forces (V, 3) [N] of the parts that act at the end of a step only, doubled, at fraction s of the step."""
+    """Doubled forces (V, 3) [N], at fraction s of the step, of the terms that act only at the end of a step."""
     return [a.force(e.mesh, x, s) for a in e.nodal if a.at_end]
 
 
 def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:
-    """Results of the physics at a state, in addition to positions and reactions."""
+    """Results of the physics at a state by name, in addition to positions and reactions."""
     shown: dict[str, jax.Array] = {}
     for physics, memory in zip(physics_of(scene), state.memories, strict=True):
         shown |= {name: on_middles(scene.mesh, field) for name, field in physics.output(memory).items()}

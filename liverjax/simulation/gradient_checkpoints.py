@@ -1,8 +1,8 @@
-"""Checkpoints of reverse mode: it keeps the state and the root of every step, or only a few states.
+"""Checkpoints of reverse-mode differentiation: the state and the root of every step are kept, or only a few states.
 
-The root of a step is the solution of its equations; `liverjax.solvers.step_cutting` sets its name. It is kept, so the
-derivative evaluates forces and tangent at the root again, but does not repeat Newton's iterations. If fewer states than
-steps are kept (Griewank and Walther 2008, 12), the steps between two kept states run a second time.
+The root of a step is the solution of its equations (`liverjax.solvers.step_cutting` sets its name for JAX). Since the
+root is kept, the derivative evaluates forces and tangent at the root again, but does not repeat Newton's iterations. If
+fewer states than steps are kept (Griewank and Walther 2008, 12), the steps between two kept states run a second time.
 """
 
 import math
@@ -35,21 +35,21 @@ def number_kept(store: str | int, steps: int) -> int:
 
 
 def lengths(steps: int, kept: int) -> tuple[int, int, int]:
-    """Number of full segments, number of steps in each, and number of steps left for a shorter last segment."""
+    """Number of full segments, number of steps per segment, and number of steps in a shorter last segment."""
     length = math.ceil(steps / kept)
     return steps // length, length, steps % length
 
 
 def one_step(step: Callable) -> Callable:
-    """The function `step`, of which reverse mode keeps only the arguments and the root."""
+    """Wrap the function `step`, so that reverse mode keeps only its arguments and the root."""
     policy = jax.checkpoint_policies.save_only_these_names(ROOT)
     return jax.checkpoint(step, policy=policy, prevent_cse=False)
 
 
 def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
-    """The outputs of `step` (carry, k), stacked over `numbers` (T,), without the carry.
+    """Apply `step` (carry, k) for all `numbers` (T,). Return the stacked outputs without the carry.
 
-    `kept` states are kept (see above).
+    Reverse mode keeps `kept` states.
     """
     steps = len(numbers)
     if kept >= steps:
@@ -62,7 +62,8 @@ def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, carry, k)[1])
         return jax.lax.cond(real, step, lambda carry, _: (carry, nothing), carry, k)
 
-    # Only a segment's beginning is kept. All segments share one program: the last one skips steps after the run's end.
+    # Only the state at the beginning of a segment is kept. All segments share one program, so the last segment skips
+    # the steps after the end of the run.
     @jax.checkpoint
     def segment(carry, at):
         return jax.lax.scan(unless_over, carry, at) if beyond else jax.lax.scan(step, carry, at)

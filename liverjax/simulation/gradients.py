@@ -1,4 +1,4 @@
-"""Derivatives of a result of a run with respect to numbers of its scene, with a status and a prediction of memory.
+"""Derivatives of a result of a run with respect to numbers of its scene.
 
     found = lj.value_and_gradient(lambda result: loss(result.positions), scene, {"law.mu": 770.0})
 
@@ -24,17 +24,17 @@ from liverjax.simulation.run import Result, simulate
 from liverjax.simulation.step import beginning
 
 MODES = ("reverse", "forward")
-#: Name for the positions at the beginning; `with_parameters` has the other names.
+#: Name of the positions at the beginning of the run. `with_parameters` explains the other names.
 START = "start"
 
 
 @struct
 class Gradient:
-    """A number computed from a run, and its derivatives."""
+    """A number computed from a run, and the derivatives of this number."""
 
     value: jax.Array = param("1", "()")
-    gradient: dict = param("1", "name -> derivative, in the shape of the value")
-    status: jax.Array = param("1", "of `liverjax.core.status`: GRADIENT_UNCONVERGED, ADJOINT_FAILED or CONVERGED")
+    gradient: dict = param("1", "name -> derivative, in the shape of the parameter")
+    status: jax.Array = param("1", "a code of `core.status`: GRADIENT_UNCONVERGED, ADJOINT_FAILED or CONVERGED")
 
 
 def value_and_gradient(
@@ -44,18 +44,18 @@ def value_and_gradient(
     store: str | int = "all",
     mode: str = "reverse",
 ) -> Gradient:
-    """Value of `loss` (Result -> number), and its gradient with respect to the numbers named in `at`.
+    """Compute the value of `loss` (Result -> number) and its gradient with respect to the numbers named in `at`.
 
     Args:
-        loss: a function that JAX can differentiate. If the same function is given again, its compiled program is
+        loss: a function that JAX can differentiate. If the same function is given again, the compiled program is
             reused.
         scene: `Scene`.
-        at: dotted names as in `with_parameters` -> values that replace the values of the scene. "start": positions (V,
-            3) [m] at which the run begins, at rest.
-        store: what reverse mode keeps: "all" steps, "sqrt" or a number of states (see `gradient_checkpoints` and
-            `memory`).
-        mode: "reverse": its cost does not grow with the number of parameters. "forward": it needs no memory for the
-            steps, but the cost of one run per parameter.
+        at: dotted names as in `with_parameters` -> values that replace the values of the scene. The name "start" means
+            the positions (V, 3) [m] at which the run begins, at rest.
+        store: the steps that reverse mode keeps: "all", "sqrt" (the square root of their number), or a number of states
+            (see `gradient_checkpoints` and `memory`).
+        mode: "reverse" or "forward". The cost of "reverse" does not grow with the number of parameters. "forward" needs
+            no memory for the steps, but costs one run per parameter.
 
     Raises:
         InputError: unknown mode or store, no parameters, a name that the scene does not have; also as in `simulate`.
@@ -63,7 +63,7 @@ def value_and_gradient(
     if mode not in MODES:
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
     if not at:
-        raise InputError("no parameters to differentiate by: give some, e.g. {'law.mu': 770.0}")
+        raise InputError("no parameters for the derivatives: give some, e.g. {'law.mu': 770.0}")
     gradient_checkpoints.number_kept(store, scene.solve.steps)
     values = {name: jnp.asarray(value, float) for name, value in at.items()}
     numbers = {name: value for name, value in values.items() if name != START}
@@ -92,12 +92,12 @@ def _program_of_gradient(loss: Callable[[Result], jax.Array], store: str | int, 
     return jax.jit(both)
 
 
-#: Measured memory for the derivative of one step, in numbers per integration point, in addition to the tangents.
+#: Measured memory for the derivative of one step, without the tangents, in numbers per integration point.
 _WORK = 440
 
 
 def memory(scene: Scene, store: str | int = "all") -> int:
-    """Predicted memory [bytes] of a derivative in reverse mode. Nothing is compiled for it."""
+    """Predict the memory [bytes] of a derivative in reverse mode, without compiling a program."""
     steps = scene.solve.steps
     kept = gradient_checkpoints.number_kept(store, steps)
 
@@ -110,12 +110,12 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     root = _bytes(scene.mesh.points)
     if scene.porosity is not None and scene.porosity.scheme == "implicit":
         root += scene.mesh.number_of_vertices * scene.mesh.points.dtype.itemsize
-    # Two tangents: of a step, and of the beginning of the run.
+    # There are two tangents: that of a step, and that of the beginning of the run.
     work = 2 * tangent + _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
     if kept >= steps:
         return steps * (state + root) + work
     count, length, rest = gradient_checkpoints.lengths(steps, kept)
-    # The last term is the run's result, in addition to the states; not all of it exists at the same time.
+    # The term with 3/2 is the result of the run, in addition to the states. Not all of it exists at the same time.
     return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 3 * steps * root // 2 + work
 
 

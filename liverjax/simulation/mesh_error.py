@@ -1,25 +1,26 @@
-"""Error that the mesh causes in a run: in each step one linearised solve in the next richer space of functions.
+"""Estimate the error of a run due to the mesh. Each step needs one linearised solve in a richer space of functions.
 
-The richer space of linear elements is the space of quadratic elements; for quadratic elements it has cubic functions.
-The positions of a step are represented in this space without a change. There they have out-of-balance forces r. With
-the tangent K, these give du = -K^-1 r, a motion that the elements of the run cannot represent. The reactions change by
-their derivative along du. A second run, in the richer space, accompanies the first one. It has separate memories for
-viscosity, fluid and inertia. In the richer space a surface touches an obstacle at other points. With contact, solves
-are therefore repeated until these contact points are found. With the contact points of the first solve only, the
-estimated error of a flat punch's force was 1/4; the true error was 1/100.
+The richer space has quadratic functions for linear elements, and cubic functions for quadratic elements. It represents
+the positions of a step exactly. In the richer space these positions have out-of-balance forces r. With the tangent K,
+the forces give du = -K^-1 r, a displacement that the elements of the run cannot represent. The reactions change by
+their derivative along du. A second run, in the richer space, accompanies the first run. The second run has separate
+memories for viscosity, fluid and inertia. In the richer space a surface touches an obstacle at other points. With
+contact, the solves are therefore repeated until these contact points are found. With the contact points of the first
+solve only, the estimated error of the force on a flat punch was 1/4; the true error was 1/100.
 
-The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 times the error, in small and
-in moderate strain. If du is added, about a tenth of the error is left. For quadratic elements the cubic functions find
-about two thirds of the error, so du is multiplied by 1.5. The estimate does not contain the errors of the body's shape
-and of the time steps.
+The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 times the error, at small and
+moderate strain. If du is added to the result, about a tenth of the error is left. For quadratic elements the cubic
+functions contain about two thirds of the error, so du is multiplied by 1.5. The estimate does not contain the errors of
+the body's shape and of the time steps.
 
-The pressures of a fluid are linear in linear elements and in quadratic ones. With a fluid, the richer space therefore
+The pressures of a fluid are linear both in linear and in quadratic elements. With a fluid, the richer space therefore
 has the same elements on a finer mesh: every element is cut into eight (`liverjax.scenes.refined`). Then du is
 multiplied by 4/3, because an error of second order is a quarter as large on the finer mesh.
 
-In dynamics the errors of the steps add up. The richer run has consistent masses, so that its added functions have the
-same acceleration under gravity as the others. The inertia of the richer motion acts on all functions. Each step of the
-richer run is linearised at its positions before the step, moved by the motion of the first run in this step.
+In dynamics the errors of the steps add up. The richer run has consistent masses, so that the added functions have the
+same acceleration under gravity as the other functions. The inertia of the richer motion acts on all functions. Each
+step of the richer run is linearised at the positions before the step, moved by the motion of the first run in this
+step.
 """
 
 from collections.abc import Callable
@@ -60,44 +61,44 @@ from liverjax.solvers.krylov import true_residual
 from liverjax.solvers.point_matrix import restricted
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
-#: Tolerance of the linear solve: 1e-1 would find only a fifth of the error of a slender beam of quadratic elements.
-#: Then, for each order of the elements, the tolerance if pressures are unknowns, and the factor on du. The last number
-#: is the error bar of a quantity over its correction.
+#: Tolerance of the linear solve. 1e-1 would find only a fifth of the error of a slender beam of quadratic elements.
 _TOLERANCE = 1e-2
+#: For each order of the elements: the tolerance if pressures are unknowns, and the factor on du.
 _WITH_PRESSURES = {1: 1e-5, 2: 1e-4}
 _FACTOR = {1: 1.0, 2: 1.5}
+#: Error bar of a quantity, divided by the correction of this quantity.
 BAR = 1.25
-#: Quadratic elements without unknown pressures do not lock up to this K/mu (experiments/TABLES.md).
+#: Up to this K/mu, quadratic elements without pressure unknowns do not lock (experiments/TABLES.md).
 _LOCKS = 10.0
-#: With contact: maximum number of linear solves in a step. They end if the residual, over the sum of the norms of all
-#: forces, is below the second number.
+#: With contact: maximum number of linear solves in a step. The solves end if the residual, divided by the sum of the
+#: norms of all forces, is below the second number.
 _ROUNDS, _SETTLED = 24, 1e-3
-#: With a fluid that flows the residual must be below this: one solve is not exact, because the matrix of the pressures
-#: is only approximated in it (`liverjax.physics.darcy.nearly_solved`).
+#: With a flowing fluid the residual must be below this. One solve is not exact, because it only approximates the
+#: inverse of the pressure matrix (`liverjax.physics.darcy.nearly_solved`).
 _WITH_FLUID = 1e-5
-#: Maximum number of halvings of the change from such a solve, if it makes the residual larger.
+#: Maximum number of halvings of the change from such a solve if the full change increases the residual.
 _HALVINGS = 4
 
 
 @struct
 class MeshError:
-    """Estimated error of a run: the difference that an infinitely fine mesh would add to the result."""
+    """Estimated mesh error of a run: the change of the result on an infinitely fine mesh."""
 
     positions: jax.Array = param("m", "(T, V, 3)")
     reactions: jax.Array = param("N", "(T, V, 3)")
-    found: jax.Array = param("1", "(T,) whether the linear solve of the step ended, with finite numbers")
+    found: jax.Array = param("1", "(T,) whether the linear solve of the step converged to finite numbers")
     pressure: jax.Array | None = param(
-        "Pa", "(T, V), of a fluid; None: no fluid, or its pressures' error is not known", default=None
+        "Pa", "(T, V), of a fluid; None: no fluid, or the error of its pressures is unknown", default=None
     )
 
     def change(self, of: Callable[[jax.Array, jax.Array], Any], result: Any) -> tuple[Any, Any]:
-        """A quantity of interest and its estimated change.
+        """Return a quantity of interest and its estimated change on an infinitely fine mesh.
 
         The sum of both is the corrected quantity. The error bar is `BAR` times the absolute value of the change.
 
         Args:
-            of: function (positions (T, V, 3), reactions (T, V, 3)) -> numbers, any pytree. The change is its derivative
-                along the error.
+            of: function (positions (T, V, 3), reactions (T, V, 3)) -> numbers, any pytree. The change is the derivative
+                of this function along the error.
             result: `Result` of the run.
         """
         return jax.jvp(of, (result.positions, result.reactions), (self.positions, self.reactions))
@@ -106,12 +107,12 @@ class MeshError:
 def mesh_error_of(
     scene: Scene, positions: jax.Array, reactions: jax.Array, pressure: jax.Array | None = None
 ) -> MeshError:
-    """The estimate for a run from the reference positions; its node numbers may not be traced.
+    """Estimate the mesh error of a run from the reference positions. Node numbers may not be traced.
 
     Args:
         scene: the scene that was run (`liverjax.simulation.run.prepared`).
-        positions, reactions: of the run (T, V, 3).
-        pressure: of the run (T, V), if it has a fluid.
+        positions, reactions: positions [m] and reactions [N] of the run (T, V, 3).
+        pressure: pressures [Pa] of the run (T, V), if it has a fluid.
 
     Raises:
         InputError: a scene with another mesh; the one-step scheme, which has an error in addition to the mesh error.
@@ -129,10 +130,10 @@ class Richer:
     """A scene in the next richer space of functions."""
 
     scene: Scene = param("1", "the scene with richer elements, or on the refined mesh")
-    within: Within | None = param("1", "where the nodes of a refined mesh lie; None: richer elements", default=None)
+    within: Within | None = param("1", "position of refined nodes in the mesh; None: richer elements", default=None)
 
     def padded(self, x: jax.Array) -> jax.Array:
-        """Positions (V, 3) of a run in the richer space: the same field."""
+        """Represent positions x (V, 3) of the run in the richer space, as the same field."""
         rich = self.scene.mesh
         if self.within is not None:
             return self.within.field(x)
@@ -141,7 +142,7 @@ class Richer:
         return jnp.concatenate([x, jnp.zeros((rich.number_of_nodes - len(x), 3), x.dtype)])
 
     def on_nodes(self, force: jax.Array, number_of_nodes: int) -> jax.Array:
-        """Forces (V, 3) on the nodes of the run, from forces on the richer functions."""
+        """Forces (V, 3) [N] on the nodes of the run, from forces on the functions of the richer space."""
         rich = self.scene.mesh
         if self.within is not None:
             return self.within.forces(force, number_of_nodes)
@@ -151,7 +152,7 @@ class Richer:
 
 
 def richer(scene: Scene) -> Richer:
-    """The scene in the next richer space, as its error is estimated.
+    """Create the scene in the next richer space of functions, for the error estimate.
 
     Raises:
         InputError: the one-step scheme.
@@ -166,24 +167,23 @@ def richer(scene: Scene) -> Richer:
 
 def _with_richer_elements(scene: Scene) -> Scene:
     rich = enriched(scene)
-    # Linear elements lock, so they are compared with elements that do not lock. At a low bulk modulus these are
-    # quadratic elements without pressures: pressures would have to be continuous where the material changes.
+    # Linear elements lock, so they are compared with elements that do not lock. At a low bulk modulus, these are
+    # quadratic elements without pressures, because pressures would be continuous where the material changes.
     of_linear = "auto" if _may_lock(scene) else "element"
     volumetric = of_linear if scene.mesh.order == 1 else scene.solve.volumetric
-    # Under an indenter the iterations of mixed cubic elements do not converge: factorise if the user has chosen
-    # "direct".
+    # Under an indenter the iterations for mixed cubic elements do not converge, so a chosen "direct" is kept.
     mixed = scene.mesh.order == 2 and scene.solve.volumetric == "mixed"
     linear = "direct" if mixed and scene.solve.linear_solver == "direct" else "cg"
     solve = replace(rich.solve, linear_solver=linear, robust="off", volumetric=volumetric)
     sponge = None if rich.porosity is None else sponge_at_points(rich.porosity, rich.mesh)
-    # With lumped masses the added functions would have another acceleration under gravity than the others.
+    # With lumped masses, the added functions would have a different acceleration under gravity.
     body = None if rich.body is None else replace(rich.body, mass="consistent")
     rich = replace(rich, law=rich.mesh.at_points(rich.law), porosity=sponge, body=body, solve=solve)
     return replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
 
 
 def _may_lock(scene: Scene) -> bool:
-    """Whether a bulk modulus is, or may be, more than `_LOCKS` times the shear modulus."""
+    """Whether a bulk modulus is more than `_LOCKS` times the shear modulus. Returns True if the moduli are unknown."""
     laws = list(laws_of(scene.law, scene.region))
     for region in scene.region:
         own = scene.law
@@ -192,7 +192,7 @@ def _may_lock(scene: Scene) -> bool:
         laws.append(own)
     try:
         numbers = [(a.bulk_modulus(), a.shear_modulus()) for a in laws]
-    except InputError:  # a law need not state its moduli
+    except InputError:  # a law may have no moduli
         return True
     if any(isinstance(a, jax.core.Tracer) for pair in numbers for a in pair):
         return True
@@ -200,22 +200,20 @@ def _may_lock(scene: Scene) -> bool:
 
 
 def refuse(scene: Scene) -> None:
-    """Refuse a scene for which this estimate cannot be made.
+    """Check that the mesh error of a scene can be estimated.
 
     Raises:
         InputError: the one-step scheme.
     """
     if scene.solve.newton == "one_step":
-        raise InputError("solve.newton = 'one_step' leaves an error of its own: estimate that of a converged run")
+        raise InputError("solve.newton = 'one_step' has an additional error: use newton = 'converged' for a mesh error")
 
 
 @jax.jit
 def estimated_error(
     scene: Scene, rich: Richer, x: jax.Array, reactions: jax.Array, pressure: jax.Array | None = None
 ) -> MeshError:
-    """The estimate from positions and reactions (T, V, 3) and pressures (T, V) of the run, with the result of
-    `richer`.
-    """
+    """Estimate the mesh error from positions x, reactions (T, V, 3) and pressures (T, V); `rich` is `richer(scene)`."""
     sizes = force_sizes(rich.scene)
     numbers = jnp.arange(1, len(x) + 1, dtype=x.dtype)
     before = jnp.concatenate([scene.mesh.points[None], x[:-1]])
@@ -232,21 +230,21 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
     q = unknowns(e, rich.padded(x))
     begin = q
     if scene.solve.kind == "dynamic":
-        # Errors of a motion add up: the richer run goes on from its own positions, by the run's motion in the step.
+        # Errors of a motion add up. So the richer run continues from its positions, with the run's motion in the step.
         begin = q + unknowns(e, state.x) - unknowns(e, rich.padded(before))
     near, (dq, iterations, positive) = _found_near(scene, e, begin)
     f, along = jax.linearize(lambda q: forces(e, q, one), near)
     whole, _ = reported_forces(e, f.total + along(dq).total, positions(e, near + dq, one))
     reaction = whole - e.free.vectors(whole)
     dq = near + dq - q
-    # If du inverts elements, the richer run goes on from the positions of the run.
+    # If du inverts elements, the richer run continues from the positions of the run.
     sound = jnp.all(volume_ratios(e.mesh, positions(e, q + dq, one)) > 0) & jnp.all(jnp.isfinite(dq))
     end = forces(e, jnp.where(sound, q + dq, q), one)
     found = sound & positive & (iterations < MOST_LINEAR_ITERATIONS)
     change = {
         "positions": positions(e, q + dq, one)[: len(x)] - x,
         "reactions": rich.on_nodes(reaction, len(x)) - reactions,
-        # The old nodes are vertices of the refined mesh.
+        # The nodes of the run are vertices of the refined mesh.
         "pressure": None if pressure is None else end.pressure[: len(x)] - pressure,
     }
     by_end_forces = reported_forces(e, end.total, end.x)[1]
@@ -258,14 +256,15 @@ _Solved = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _Solved]:
-    """The point where the last linear solve begins, and the result of this solve.
+    """Return the unknowns at which the last linear solve begins, and the result of this solve.
 
-    Without contact there is one solve, from q. If contact is possible, more solves find its points in the richer space.
+    Without contact there is one solve, from q. With contact, more solves find the contact points in the richer space. A
+    flowing fluid also needs more solves.
     """
     one = jnp.ones((), q.dtype)
     tolerance = _TOLERANCE
     if e.volume is not None and e.volume.unknown:
-        # The guess has the pressures of the step's beginning, far from the end: the load is much above the mesh error.
+        # The solve starts at the pressures of the step's beginning, so its load is much larger than the mesh error.
         tolerance = _WITH_PRESSURES[scene.mesh.order]
 
     def solved(q: jax.Array) -> _Solved:
@@ -273,7 +272,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
         K = tangent.tangent(e, f.pressure, f.x, one)
         load = -residual(e, q, one)[0]
         dq, iterations, positive = tangent.solve(e, K, load, tolerance, MOST_LINEAR_ITERATIONS)
-        # The solver does not report every breakdown.
+        # The solver does not report every breakdown, so the true residual is checked.
         ended = true_residual(tangent.product(e, K), load, dq) <= 10 * tolerance
         return dq, iterations, positive & ended
 
@@ -304,7 +303,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
 
 
 def _shortened(size: Callable[[jax.Array], jax.Array], q: jax.Array, dq: jax.Array) -> jax.Array:
-    """The factor t (halved at most `_HALVINGS` times) with which q + t dq has a smaller residual than q."""
+    """Find the factor t with which q + t dq has a smaller residual than q. It is halved at most `_HALVINGS` times."""
     before = size(q)
 
     def go_on(t: jax.Array) -> jax.Array:

@@ -1,8 +1,9 @@
-"""The mixed system of positions and nodal pressures: how to assemble it and to eliminate its pressures.
+"""The mixed system of positions and nodal pressures: its assembly, and the elimination of the pressures.
 
-A physics that acts on the volume of elements has pressures at the nodes, and a matrix of these pressures. In a sponge
-the fluid flows, so this matrix couples the pressures of neighbours. If volume changes are averaged at the nodes, the
-matrix is diagonal.
+A physics with a stress that depends on the volume ratio of the elements has pressures at the nodes, and a pressure
+matrix. In a porous body the fluid flows, so this matrix couples the pressures of neighbours. If volume changes are
+averaged at the nodes, the matrix is diagonal. Columns (V,) are the x, y and z components of a nodal vector in separate
+arrays.
 """
 
 from collections.abc import Sequence
@@ -23,25 +24,24 @@ from liverjax.solvers.krylov import chebyshev
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.tensors.matrices import Matrix, scale
 
-#: Degree of the polynomial that replaces the inverse of the matrix of the pressures. The error of the polynomial is 1
-#: %.
+#: Degree of the polynomial that approximates the inverse of the pressure matrix with an error of 1 %.
 _DEGREE = 6
 
 
 def coupled(
     mesh: TetMesh, K: dict, own: Any, F: Matrix, pressures: block_matrix.BlockMatrix, slope: Any = 1.0
 ) -> block_matrix.BlockMatrix:
-    """Derivative of the forces and of minus the pressure equation with respect to (x, P), in 4 x 4 blocks.
+    """Assemble the coupled matrix in 4 x 4 blocks, which is symmetric and indefinite.
 
-    The matrix is symmetric and indefinite.
+    It is the derivative of the forces and of minus the pressure equation with respect to (x, P).
 
     Args:
-        K: blocks (E,) of the forces at given pressure, by pairs of nodes.
-        own: 3 x 3 blocks of entries (V,) that physics at nodes add to the diagonal; an entry that is 0 is None. None:
-            no such physics.
+        K: stiffness blocks (E,) at given pressure, for pairs of nodes.
+        own: 3 x 3 blocks of entries (V,) that force terms at nodes add to the diagonal, or None. An entry that is 0 is
+            None.
         F: deformation gradient at the end of the step.
         pressures: matrix of the pressure equation.
-        slope: derivative (E,) with respect to J of the quantity on which the pressures act.
+        slope: derivative (E,) with respect to J of the volumetric strain that the pressures multiply.
     """
     q = [scale(slope * mesh.volumes / 4, g) for g in volume_gradients(mesh, F)]
     bordered = {}
@@ -51,7 +51,7 @@ def coupled(
     rows: block_matrix.Block = block_matrix.off_diagonal(mesh, bordered)
     rows = (*rows[:3], (*rows[3][:3], -pressures.rows[0][0]))
     sums = block_matrix.row_sums(rows)
-    # A translation causes no force: in each row the entries of x add up to zero.
+    # A translation causes no force, so in each row the entries of x add up to zero.
     corner: Any = tuple(tuple(-sums[r][c] for c in range(3)) for r in range(3))
     corner = corner if own is None else block_matrix.added(corner, own)
     border = [-sums[3][c] for c in range(3)]
@@ -62,7 +62,7 @@ def coupled(
 def balances(
     mesh: TetMesh, A: block_matrix.BlockMatrix | PointMatrix, motion: Sequence[jax.Array]
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """Forces, as columns (V,), of a motion at given pressures, and the change of the balance of volumes (V,)."""
+    """Forces due to a displacement at given pressures, as columns (V,), and change (V,) of the balance of volumes."""
     if isinstance(A, PointMatrix):
         return point_matrix.product(mesh, A, motion), -point_matrix.volume_changes(mesh, A, motion)
     *forces, balance = block_matrix.product(A, motion)
@@ -76,10 +76,10 @@ def pressure_change(
     balance: jax.Array,
     exactly: bool = False,
 ) -> jax.Array:
-    """Change of pressures (V,) that reduces a balance of volumes (V,) to 0.
+    """Change of the pressures (V,) that reduces a balance of volumes (V,) to 0.
 
-    Without `flow` the matrix of the pressures is diagonal. With `flow` the equation of the pressures is solved
-    approximately. If `exactly` is true, it is solved to its tolerance.
+    Without `flow` the pressure matrix is diagonal. With `flow` the pressure equation is solved approximately, or to its
+    tolerance if `exactly` is true.
     """
     if flow is None:
         if isinstance(A, PointMatrix):
@@ -94,10 +94,13 @@ def pressure_change(
 def with_pressures(
     mesh: TetMesh, volume: Any, A: PointMatrix | block_matrix.BlockMatrix, both: Any
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """Forces, as columns (V,), and balance (V,) of the pressures in their unit, for a change (motion, pressures)."""
+    """Forces, as columns (V,), and balance (V,) of the pressures times `volume.unit`, for a change `both`.
+
+    `both` consists of the displacement as columns (V,), and of the pressures (V,) divided by `volume.unit`.
+    """
     motion, dp = both
     if isinstance(A, block_matrix.BlockMatrix):
-        # In the coupled matrix pressures push inwards, and the balance has a minus sign.
+        # In the coupled matrix positive pressures push inwards, and the balance has a minus sign.
         every = block_matrix.product(A, (*motion, -volume.unit * dp))
         return every[:3], -volume.unit * every[3]
     forces, outwards = point_matrix.product(mesh, A, motion), pulled(mesh, A, volume.unit * dp)
@@ -106,10 +109,10 @@ def with_pressures(
 
 
 def without_pressures(mesh: TetMesh, volume: Any, A: PointMatrix, motion: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Forces, as columns (V,), of a motion and of the unknown pressures that it causes, for quadratic elements.
+    """Forces, as columns (V,), of a displacement and of the pressures that it causes, for quadratic elements.
 
-    A polynomial replaces the inverse of the matrix of the pressures, so that this product stays symmetric. Divided by
-    its diagonal, this matrix has eigenvalues between 1/2 and 5/2 in tetrahedra (Wathen 1987).
+    A polynomial approximates the inverse of the pressure matrix, so that this product stays symmetric. In tetrahedra
+    the pressure matrix divided by its diagonal has eigenvalues between 1/2 and 5/2 (Wathen 1987).
     """
     changes = point_matrix.volume_changes(mesh, A, motion)
     own, bounds = volume.diagonal(mesh), (0.5, 2.5)
@@ -118,7 +121,7 @@ def without_pressures(mesh: TetMesh, volume: Any, A: PointMatrix, motion: Sequen
 
 
 def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: jax.Array) -> tuple[jax.Array, ...]:
-    """Forces, as columns (V,), of pressures (V,) [Pa] at the vertices that push outwards."""
+    """Forces, as columns (V,), of vertex pressures (V,) [Pa], which push outwards if they are positive."""
     if isinstance(A, block_matrix.BlockMatrix):
         rows, diagonal = (tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal))
         return block_matrix.product(block_matrix.BlockMatrix(rows, diagonal, A.nodes), (-pressures,))
@@ -126,19 +129,19 @@ def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: 
 
 
 def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> jax.Array:
-    """Stiffness [Pa/m^3] of each integration point against a change of its volume if nothing flows between elements.
+    """Stiffness [Pa/m^3] of each integration point against a volume change, if nothing flows between elements.
 
-    C is the matrix of the pressures. The diagonal of C is divided among the elements in proportion to their volumes.
-    The sum over the elements is then not softer than the true matrix.
+    C is the pressure matrix. The diagonal of C is divided among the elements in proportion to their volumes. The sum
+    over the elements is then not softer than the true matrix.
     """
     share = integrals(mesh, jnp.ones_like(mesh.volumes)) * mask / C.diagonal[0][0]
     return interpolated(mesh, share) / mesh.weights
 
 
 def undrained_diagonal(A: block_matrix.BlockMatrix, mask: Number) -> block_matrix.Block:
-    """Diagonal blocks of K + G^T D^-1 G, with D the diagonal of the matrix of the pressures.
+    """Diagonal blocks of K + G^T D^-1 G, with the diagonal D of the pressure matrix.
 
-    If nothing flows, this is exact.
+    K is the stiffness at given pressures, and G couples pressures and positions. If nothing flows, this is exact.
     """
     soft = -mask / A.diagonal[3][3]
     near = soft[A.nodes]

@@ -17,25 +17,26 @@ class ObstacleForces(NamedTuple):
 
     force: jax.Array  # (obstacles, T, 3) [N] force of the body on the obstacle
     depth: jax.Array  # (obstacles, T) [m] maximum depth of the surface in the obstacle
-    displacement: jax.Array  # (obstacles, T, 3) [m] of the obstacle: it follows from a force or is prescribed
+    displacement: jax.Array  # (obstacles, T, 3) [m] displacement of the obstacle, prescribed or due to a force
 
 
 def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
-    """Forces on the obstacles of a scene, depths of the body's surface in them, and displacements of the obstacles. All
-    three are differentiable.
+    """Compute the forces on the obstacles of a scene, the depths of the surface in them, and their displacements.
+
+    All three are differentiable.
 
     Args:
         scene: the scene that was run.
-        result: `Result` of `liverjax.simulate` from the reference positions, all steps stored.
+        result: `Result` of `liverjax.simulate`, with all steps, for a run from the reference positions.
     """
-    scene = prepared(scene)  # as in the run: numbers of regions by element, in the scene's precision
+    scene = prepared(scene)  # as in the run: one value per element, in the precision of the scene
     steps, dt = scene.solve.steps, 0.0 if scene.solve.dt is None else scene.solve.dt
     mesh, free = scene.mesh, Free(jnp.ones_like(scene.mesh.points))
     numbers = jnp.arange(1, len(result.positions) + 1)
     found = [p.in_body(scene.mesh, scene.law) for p in scene.physics if isinstance(p, Obstacle)]
 
     def one(obstacle: Obstacle) -> tuple[jax.Array, jax.Array, jax.Array]:
-        # Friction has a memory: the steps are computed in order.
+        # Friction has a memory, so the steps are computed in order.
         def at(carry: Any, given: Any) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
             (memory, before), (k, x) = carry, given
             acting = obstacle.freeze(memory, Step(mesh, before, k, steps, dt, False, None, free))

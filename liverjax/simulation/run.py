@@ -1,4 +1,4 @@
-"""Run a scene: load steps or time steps. Each is a Newton solve with implicit differentiation."""
+"""Run a scene in load steps or time steps. Each step is a Newton solve with implicit differentiation."""
 
 from collections.abc import Callable
 from functools import partial
@@ -27,16 +27,16 @@ from liverjax.solvers.problem import StepStatistics
 class Result:
     """Result of a run: arrays over the T steps. Positions, reactions and pressures are differentiable."""
 
-    times: jax.Array = param("s", "(T,); the number of the load step if there is no time")
+    times: jax.Array = param("s", "(T,); numbers of the load steps if there is no time")
     positions: jax.Array = param("m", "(T, V, 3)")
-    reactions: jax.Array = param("N", "(T, V, 3), force of the support on the body, 0 where nothing is prescribed")
+    reactions: jax.Array = param("N", "(T, V, 3), force of the supports on the body, 0 where nothing is prescribed")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
-    pressure: jax.Array | None = param("Pa", "(T, V), of a porous scene", default=None)
-    statistics: StepStatistics = param("1", "per step: Newton and CG iterations, cuts, residual")
-    mesh_error: MeshError | None = param("1", "estimated error of the mesh; None: not estimated", default=None)
+    pressure: jax.Array | None = param("Pa", "(T, V), fluid pressure of a porous scene", default=None)
+    statistics: StepStatistics = param("1", "for each step: Newton and CG iterations, cuts, residual")
+    mesh_error: MeshError | None = param("1", "estimated mesh error; None: not estimated", default=None)
 
     def check(self) -> "Result":
-        """Return the result, or raise `RuntimeError` with advice if a step failed; host side."""
+        """Check the result on the host: return it, or raise `RuntimeError` with advice if a step failed."""
         codes = np.asarray(self.status)
         if np.any(codes != status.CONVERGED):
             step = int(np.argmax(codes != status.CONVERGED))
@@ -47,12 +47,12 @@ class Result:
 def _step_by_step(
     scene: Scene, sizes: Sizes, report: Callable[[int], None] | None, near: Any, differentiable: bool = True
 ) -> Callable:
-    """A function (state and tangent, k) -> (state and tangent after step k, row of step k for `_result`)."""
+    """Return a function (state and tangent, k) -> (state and tangent after step k, output of step k for `_result`)."""
 
     def physics(carry, k):
         state, kept = carry
         new, reactions, statistics, kept = step(equations(scene, state, k, sizes), kept, near, differentiable)
-        # If a state is not finite, the run stays at the last finite state.
+        # If a new state is not finite, the run stays at the last finite state.
         finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, reactions))]).all()
         good = finite & (statistics.status != status.NOT_FINITE)
         statistics = statistics._replace(status=jnp.where(finite, statistics.status, status.NOT_FINITE))
@@ -85,7 +85,7 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
     first = equations(scene, start, numbers[0], sizes)
-    # In runs of several steps derivatives use the coarse space of the beginning. It is computed only for derivatives.
+    # In runs of several steps, derivatives use the coarse space of the first step. Only derivatives compute this space.
     kept, near = beginning(first, tangent_too=steps > 1)
     advance = _step_by_step(scene, sizes, report, near)
     return _result(scene, numbers, gradient_checkpoints.scan(advance, (start, kept), numbers, store))
@@ -97,7 +97,7 @@ def _run_part(
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
     kept, _ = beginning(equations(scene, state, numbers[0], sizes))
-    # With `inline` it is traced only once, for `eval_shape` and for the program.
+    # With `inline` the function is traced only once, for `eval_shape` and for the program.
     advance = jax.jit(_step_by_step(scene, sizes, report, None, differentiable=False), inline=True)
 
     def unless_over(carry, k):
@@ -121,21 +121,21 @@ def simulate(
         scene: `Scene`.
         start: positions (V, 3) [m] at which the run begins, at rest, as if the body had just been moved there from the
             reference positions. No stress has relaxed yet, and the fluid responds to the change of volume in the first
-            step. None: the reference positions. If elements are inverted there, use robust = "projected": then a static
-            scene takes `start` as a guess. If the guess is inverted or leads to no solution, the run begins at the
-            reference positions.
+            step. None: the reference positions. If elements are inverted at `start`, use robust = "projected". Then a
+            static scene uses `start` as a guess. If the guess is inverted or does not lead to a solution, the run
+            begins at the reference positions.
         report: a function that is called on the host with the number of each finished step, to show progress.
-        store: what reverse mode keeps. "all": the end of every step; a whole number: this number of states; "sqrt": the
-            square root of the number of steps. The steps between kept states run a second time. Without a derivative it
-            has no effect. See `liverjax.simulation.gradients`.
-        mesh_error: whether to estimate the error of the mesh (`liverjax.simulation.mesh_error`). Then the run must
-            begin in the reference positions. The estimate has derivatives in forward mode only.
+        store: number of states that reverse mode keeps: "all" (the end of every step), a whole number, or "sqrt" (the
+            square root of the number of steps). The steps between kept states run a second time. Without derivatives
+            `store` has no effect. See `liverjax.simulation.gradients`.
+        mesh_error: whether to estimate the mesh error (`liverjax.simulation.mesh_error`). Then the run must begin at
+            the reference positions. The estimate can be differentiated in forward mode only.
 
     Raises:
         InputError: unknown choices; a time step or a mass is missing; numbers out of bounds, unless they are traced; a
-            loaded mesh for which no reference shape is found (if traced: its points are NaN and its steps are
-            NOT_FINITE); precision "float64" although JAX's 64-bit mode is off. `check_scene` checks more, mainly the
-            mesh. It is called when a scene file is read.
+            loaded mesh for which no reference shape is found (if traced, its points are NaN and its steps are
+            NOT_FINITE); precision "float64" although JAX's 64-bit mode is off. `check_scene`, which is called when a
+            scene file is read, checks more, mainly the mesh.
     """
     scene = prepared(scene)
     check_time_and_mass(scene)
@@ -146,7 +146,7 @@ def simulate(
     if mesh_error:
         refuse(scene)
         if start is not None:
-            raise InputError("mesh_error = True is for runs from the reference positions: leave start out")
+            raise InputError("mesh_error = True needs a run from the reference positions: leave start out")
     result = _run(scene, start, report, gradient_checkpoints.number_kept(store, scene.solve.steps))
     if not mesh_error:
         return result
@@ -160,17 +160,17 @@ def simulate_part(
     count: int,
     report: Callable[[int], None] | None = None,
 ) -> tuple[Result, State]:
-    """Some steps of a run, and the state after them, so that a long run can be stored in parts. Not differentiable.
+    """Run some steps and return their results and the final state. So a long run can be stored in parts.
+
+    This function is not differentiable. Every part begins with a new tangent, so that a run which continues from a
+    stored state gives exactly the same result.
 
     Args:
         scene: `Scene`.
-        state: the state after the previous step; at the beginning `initial_state(prepared(scene))`.
+        state: state after the previous step; at the beginning `initial_state(prepared(scene))`.
         first: number of the first step, from 1; may be traced.
-        count: number of steps. Steps after the last step of the scene are skipped; their rows are zeros.
+        count: number of steps. Steps after the last step of the scene are skipped; their results are zeros.
         report: as in `simulate`.
-
-    Every part begins with a new tangent, so that a run which continues from a stored state gives exactly the same
-    result.
 
     Raises:
         InputError: as `simulate`.
@@ -181,9 +181,9 @@ def simulate_part(
 
 
 def prepared(scene: Scene) -> Scene:
-    """The scene in the form in which it is run: numbers by element, a linear solver, the scene's precision.
+    """Prepare a scene for its run: one value of each number per element, a linear solver, the scene's precision.
 
-    `simulate` calls this function. But inside `jax.jit` numbers are not known, so `linear_solver = "auto"` then means
+    `simulate` calls this function. But inside `jax.jit` the numbers are unknown, so `linear_solver = "auto"` then means
     iterations. Call this function before `jax.jit` if a factorisation may be chosen.
 
     Raises:
@@ -194,15 +194,15 @@ def prepared(scene: Scene) -> Scene:
 
 
 def unloaded(scene: Scene) -> Unloaded:
-    """The scene with the reference shape that its loads deform into the given mesh.
+    """Return the scene with the reference shape that the loads deform into the given mesh.
 
     The reference points have derivatives with respect to all numbers of the scene. The loads are those at the beginning
     of the run: histories have their value at time 0, and prescribed motion has not begun. The body has been under these
-    loads for a long time: viscosity has relaxed. Under load the vertices of quadratic elements are the given ones; in
-    the reference shape the edges of these elements are straight.
+    loads for a long time, so viscosity has relaxed. Under load the vertices of quadratic elements are at the given
+    positions. In the reference shape the edges of these elements are straight.
 
     Raises:
-        InputError: as `simulate`; a porous scene; no reference shape was found (if traced: the points are NaN).
+        InputError: as `simulate`; a porous scene; no reference shape was found (if traced, the points are NaN).
     """
     found = unload(_ready(replace(scene, points_are="loaded")))
     whole = replace(scene, mesh=with_points(scene.mesh, found.scene.mesh.points), points_are="reference")
@@ -210,23 +210,23 @@ def unloaded(scene: Scene) -> Unloaded:
 
 
 def _ready(scene: Scene) -> Scene:
-    """The scene as in `prepared`, but with the given points."""
+    """Prepare a scene for its run as `prepared` does, but keep the given points."""
     check_before_run(scene)
     if scene.solve.kind == "harmonic":
         raise InputError(
-            "[solve] kind = 'harmonic' has no run in time: run python -m liverjax simulate, or call lj.harmonic(scene)"
+            "[solve] kind = 'harmonic' has no time steps: run python -m liverjax simulate, or call lj.harmonic(scene)"
         )
     if scene.solve.reduced:
         file = scene.solve.reduced
         raise InputError(
-            f"[solve] reduced = {file!r} is for python -m liverjax simulate: in Python leave it out and call "
+            f"[solve] reduced = {file!r} is only for python -m liverjax simulate: in Python remove it and call "
             "lj.simulate_reduced(lj.load_reduced(file), scene)"
         )
     scene = automatic.chosen(by_element(scene))
     if scene.solve.precision == "float32":
         scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
     elif jnp.result_type(float) != jnp.float64:  # 64-bit mode is off
-        raise InputError("precision = 'float64' needs JAX's 64-bit mode: unset JAX_ENABLE_X64 or ask for float32")
+        raise InputError("precision = 'float64' needs JAX's 64-bit mode: unset JAX_ENABLE_X64, or use float32")
     return scene
 
 

@@ -1,4 +1,4 @@
-"""One load or time step of a scene: solve the equations and return the next state."""
+"""Solve the equations of one load or time step of a scene, and return the next state."""
 
 from functools import partial
 from typing import Any
@@ -42,7 +42,7 @@ from liverjax.tensors.matrices import deformation_gradient, determinant
 
 
 def problem_of(e: Equations) -> Problem:
-    """The problem that `step_cutting.solve` solves to find the end of the step."""
+    """Define the problem that `step_cutting.solve` solves to find the end of the step."""
     potential = None
     if e.scene.solve.robust != "off":
         potential = Potential(
@@ -60,7 +60,7 @@ def problem_of(e: Equations) -> Problem:
         tangent=partial(_tangent, e, "true"),
         solve=partial(tangent.solve, e),
         preconditioner=partial(tangent.preconditioner, e),
-        # If nodes move together on circles, the tangent is of small rotations: close to the derivative, but not equal.
+        # If nodes move together on circles, the tangent is that of small rotations, not the exact derivative.
         adjoint=partial(adjoint, e) if e.conservative and not e.free.tied else None,
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
@@ -73,7 +73,7 @@ def problem_of(e: Equations) -> Problem:
 
 
 def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangent.Tangent | None]:
-    """The empty `Kept` of a run that begins with these equations, and the first tangent if `tangent_too`."""
+    """Return an empty `Kept` for a run that begins with these equations, and the first tangent if `tangent_too`."""
     method, q = problem_of(first), unknowns(first, first.state.x)
     kept = step_cutting.nothing_kept(method, q)
     if not tangent_too:
@@ -83,7 +83,7 @@ def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangen
 
 
 def _flowing(e: Equations) -> Beside | None:
-    """The pressures of a flowing fluid that depend on the motion; None: the scene has no such pressures."""
+    """Pressures of a flowing fluid, which depend on the positions, or None if the scene has no such fluid."""
     volume: Any = e.volume
     if volume is None or volume.flow is None:
         return None
@@ -104,13 +104,13 @@ def _definite(
 
 
 def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
-    """The unknowns of the reference shape, and whether the first step begins at another shape (in statics: a guess)."""
+    """Unknowns of the reference shape, and whether this is the first step and begins at another shape (a guess)."""
     points = e.mesh.points
     return unknowns(e, points), (e.k == 1) & jnp.any(e.free.vectors(e.state.x - points) != 0)
 
 
 def _finite(e: Equations) -> Equations:
-    """The equations of the same body with stable neo-Hookean material. Physics that act at nodes stay the same."""
+    """Equations of the same body with a stable neo-Hookean law. Force terms at nodes stay the same."""
     law = e.scene.law
     mu = law.shear_modulus()
     own = [p.bulk_modulus() for p in e.physics if p.bulk_modulus() is not None]
@@ -123,7 +123,7 @@ def _finite(e: Equations) -> Equations:
 def step(
     e: Equations, kept: Kept | None = None, near: Any = None, differentiable: bool = True
 ) -> tuple[State, jax.Array, StepStatistics, Kept]:
-    """The next state, the reactions (V, 3) [N], the statistics of the solve and the tangent for the next step.
+    """Solve a step. Return the next state, the reactions (V, 3) [N], the statistics and the tangent for the next step.
 
     `kept` is the tangent of the last step. Derivatives may use the coarse space of the tangent `near`.
     """
@@ -134,7 +134,7 @@ def step(
         one_step=solve.newton == "one_step",
         differentiable=differentiable,
     )
-    # With inertia the guess is a motion at constant velocity. A one-step solve starts at x, as in the book chapter.
+    # With inertia the solve starts after a motion at constant velocity. A one-step solve starts at x (book chapter).
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
     problem = problem_of(e)
@@ -158,11 +158,12 @@ def adjoint(
     max_iterations: int,
     earlier: Earlier | None = None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve K x = b together with the pressures, for derivatives. Return x, the load (3 V,) and the residual over |b|.
+    """Solve K x = b together with the pressures, for derivatives. Return x, the load (3 V,) and the residual / |b|.
 
-    With a flowing fluid, x also contains its pressures, and b contains forces and minus the balance of volumes. In the
-    returned load this balance is eliminated, and the residual is divided by the norm of this load. Iterations begin
-    with a combination of `earlier` solves if this reduces the residual. No load may follow the body.
+    With a flowing fluid, x also contains the pressures of the fluid, and b contains forces and minus the balance of
+    volumes. In the returned load this balance is eliminated, and the residual is divided by the norm of this load.
+    Iterations begin with a combination of `earlier` solves if this reduces the residual. Follower loads are not
+    allowed.
     """
     volume = tangent.volume_with_pressures(e)
     flows = e.mixed is None and volume is not None and volume.flow is not None
@@ -185,26 +186,26 @@ def adjoint(
     return x, b, residual
 
 
-#: For `_with_flow`: tolerances of the solves for motions and for pressures, maximum number of refinements, and maximum
-#: number of successive refinements without a smaller residual. Far from the solution an inaccurate solve for pressures
-#: may make the residual larger.
+#: For `_with_flow`: tolerances of the solves for displacements and for pressures, maximum number of refinements, and
+#: maximum number of successive refinements without a smaller residual. Far from the solution an inaccurate solve for
+#: pressures may increase the residual.
 _INNER, _INNER_PRESSURE, _REFINEMENTS, _VAIN = 5e-2, 1e-2, 60, 3
 
 
 def _with_flow(
     e: Equations, K: tangent.Tangent, b: jax.Array, limits: tuple[Number, int], earlier: Earlier | None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`adjoint` for the mixed system with a flowing fluid, by iterative refinement.
+    """Solve the equations of `adjoint` for the mixed system with a flowing fluid, by iterative refinement.
 
-    Motions and pressures are refined together, so the solves for pressures are only as accurate as needed.
+    Displacements and pressures are refined together, so the solves for pressures are only as accurate as needed.
     """
     volume: Any = tangent.volume_with_pressures(e)
     n, flow, (tolerance, max_iterations) = 3 * e.mesh.number_of_nodes, volume.flow, limits
     loose = flow._replace(tolerance=_INNER_PRESSURE)
-    given = (flow.mask - 1) * b[n:]  # the rows of the solution for given pressures
+    given = (flow.mask - 1) * b[n:]  # the entries of the solution at given pressures
 
     def left(x: jax.Array, P: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Forces out of balance after a change of pressures that balances the volumes, and this change."""
+        """Out-of-balance forces after a change of pressures that balances the volumes, and this change."""
         motion = e.free.columns(block_matrix.columns(x))
         force, balance = mixed_system.balances(e.mesh, K.matrix, motion)
         balance = balance - b[n:] - darcy.flow_product(flow, P)
@@ -219,7 +220,7 @@ def _with_flow(
     def step(c):
         x, P, r, dP, least, vain, k = c
         size = jnp.linalg.norm(r)
-        # The accuracy of the last refinement is not higher than needed.
+        # The last refinement needs no more accuracy than the tolerance.
         inner = jnp.clip(0.3 * tolerance * scale / size, _INNER, 0.5)
         x, P = x + tangent.solve(e, K, r, inner, max_iterations)[0], P + dP
         r, dP = left(x, P)

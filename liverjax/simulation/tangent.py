@@ -1,9 +1,11 @@
-"""The tangent of a scene's forces, computed from hand-derived blocks, and linear solves with this tangent.
+"""The tangent of the forces of a scene, computed from hand-derived blocks, and linear solves with this tangent.
 
-The physics of the scene decide the method. Conjugate gradients solve symmetric systems, after nodal pressures are
-eliminated. BiCGSTAB solves the other systems: with loads that follow the body or friction (they are not symmetric), and
-with pressures as unknowns (their preconditioner is not symmetric). The preconditioner consists of the inverse diagonal
-blocks and, if slowly varying motions would need many iterations, of a coarse space.
+The physics of the scene determine the method. Conjugate gradients solve symmetric systems, after nodal pressures are
+eliminated. BiCGSTAB solves two other kinds of systems: systems with follower loads or friction, which are not
+symmetric, and systems with pressures as unknowns, which have a non-symmetric preconditioner. The preconditioner
+consists of the inverse diagonal blocks. A coarse space, with few unknowns for long waves, is added if long waves would
+need many iterations. Columns (V,) are the x, y and z components of a nodal vector in separate arrays. A flat vector
+(3 V,) contains the columns one after the other.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,17 +46,17 @@ from liverjax.tensors.matrices import (
 _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
 
-#: Kinds of element stiffness: the true one, one without negative eigenvalues, and the one of section 4.1.2 iii of the
-#: book chapter.
+#: Kinds of element stiffness: the true stiffness, a stiffness without negative eigenvalues, and the stiffness of the
+#: book chapter, section 4.1.2 iii.
 KINDS = ("true", "projected", "regularised")
 
-#: One of `KINDS`; or one of the last two with a flag that the running program computes. If the flag is false, the true
-#: stiffness is used.
+#: One of `KINDS`; or one of the last two together with a flag that is computed at run time. If the flag is false, the
+#: true stiffness is used.
 Kind = str | tuple[str, jax.Array]
 
 
 def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
-    """Call `make` with the kind. If the kind is chosen at run time, the program contains both kinds."""
+    """Call `make` with the kind. If the kind is chosen at run time, the compiled program contains both kinds."""
     if isinstance(kind, str):
         return make(kind)
     name, taken = kind
@@ -62,7 +64,7 @@ def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
 
 
 def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: Kind = "true") -> dict[tuple[int, int], Matrix]:
-    """K_ab [N/m] of corners 1 <= a <= b <= 3 at every integration point, at given nodal pressures (V,) [Pa] or None."""
+    """Blocks K_ab [N/m] of corners 1 <= a <= b <= 3 at every integration point, for `pressure` (V,) [Pa] or None."""
     return _of_kind(kind, partial(_own_blocks, e, pressure, F))
 
 
@@ -89,19 +91,19 @@ def _own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str) -> dict[tuple
 def element_blocks(
     e: Equations, pressure: jax.Array | None, F: Matrix, kind: Kind = "true"
 ) -> dict[tuple[int, int], Matrix]:
-    """K_ab [N/m] of `PAIRS` of every linear element, at given nodal pressures (V,) [Pa] or None."""
+    """Blocks K_ab [N/m] of every linear element for the node pairs of `PAIRS`, at `pressure` (V,) [Pa] or None."""
     full = mjed.all_blocks(own_blocks(e, pressure, F, kind))
     return {(a, b): full[a][b] for a, b in PAIRS}
 
 
 def stiffness(e: Equations, pressure: jax.Array | None, x: jax.Array, kind: Kind = "true") -> BlockMatrix:
-    """Derivative of element and nodal forces at positions x (V, 3) [m], at given pressures (V,) [Pa] or None."""
+    """Derivative of element and nodal forces at positions x (V, 3) [m], at `pressure` (V,) [Pa] or None."""
     K = element_blocks(e, pressure, deformation_gradient(e.mesh, x), kind)
     return block_matrix.force_matrix(e.mesh, K, node_blocks(e))
 
 
 def node_blocks(e: Equations) -> Block | None:
-    """Sum of the diagonal entries (V,) [N/m] of physics at nodes; None: no physics has such entries."""
+    """Sum of the diagonal blocks (V,) [N/m] of all force terms at nodes, or None if there are no such blocks."""
     total: Block | None = None
     for a in e.nodal:
         own = a.stiffness()
@@ -111,7 +113,7 @@ def node_blocks(e: Equations) -> Block | None:
 
 
 def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Between, ...]:
-    """Stiffness of elements between nodes, and the losses of this stiffness (`GivesWay`), of all physics at nodes."""
+    """Stiffness of elements between nodes, and losses of stiffness (`GivesWay`), of all force terms at nodes."""
 
     def of(kind: str) -> tuple[Between, ...]:
         found: list[Between | None] = []
@@ -124,7 +126,7 @@ def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Betwee
 
 
 def _symmetric(e: Equations, more: tuple[Between, ...]) -> tuple[Attached, ...]:
-    """The symmetric part of the elements between nodes, for a preconditioner: friction's stiffness is not symmetric."""
+    """Symmetric part of the elements between nodes, for a preconditioner. Friction has a non-symmetric stiffness."""
     elements = tuple(own for own in more if isinstance(own, Attached))
     return elements if e.conservative else tuple(attached.symmetric_part(own) for own in elements)
 
@@ -136,29 +138,29 @@ def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -
 
 
 def _shift(e: Equations) -> jax.Array | None:
-    """Stiffness (V,) [N/m] that acts on every node, or None. It limits slowly varying motions."""
+    """Stiffness (V,) [N/m] that acts on every node and limits long waves, or None."""
     own = [a.stiffness() for a in e.nodal if a.everywhere]
     return own[0][0][0] if own and own[0] is not None else None
 
 
 def volume_with_pressures(e: Equations) -> VolumeStress | None:
-    """The physics whose pressures are coupled to the motion; None: no physics has such pressures."""
+    """Force term with pressures that depend on the positions, or None if there is no such term."""
     return e.volume if e.volume is not None and e.volume.coupled else None
 
 
 class Tangent(NamedTuple):
-    """A tangent with its preconditioner. It is assembled at one point and used for some iterations near this point."""
+    """A tangent with its preconditioner. It is assembled at some positions and used for iterations near them."""
 
     matrix: BlockMatrix | PointMatrix
-    inverse: Inverses  # of the diagonal blocks of the matrix
-    vertices: Inverses | None  # quadratic elements: of the diagonal blocks of linear elements with the same vertices
+    inverse: Inverses  # inverses of the diagonal blocks of the matrix
+    vertices: Inverses | None  # for quadratic elements: `inverse` of linear elements with the same vertices
     slow: Coarse
-    x: jax.Array | None  # (V, 3) positions of the assembly, for loads that follow the body
+    x: jax.Array | None  # (V, 3) positions of the assembly, for non-conservative forces
     s: Any  # fraction of the step at the assembly
-    follows: jax.Array | None  # 1 if K contains these loads, 0 if K has no negative eigenvalues
+    follows: jax.Array | None  # 1 if K contains the tangent of these forces, 0 if K has no negative eigenvalues
     attached: tuple[Between, ...] = ()  # elements between nodes, not in the matrix
-    pressures: Coarse | None = None  # coarse space of unknown pressures in thin cells
-    #: Whether `solve` eliminates unknown pressures first; None: never.
+    pressures: Coarse | None = None  # coarse space of pressure unknowns in thin elements
+    #: Whether `solve` eliminates pressure unknowns first; None: never.
     eliminates: jax.Array | None = None
 
 
@@ -170,10 +172,10 @@ def tangent(
     near: tuple[Any, Tangent] | None = None,
     kind: Kind = "true",
 ) -> Tangent:
-    """The derivative of the forces at positions x (V, 3) [m], at fraction s of the step.
+    """Derivative of the forces at positions x (V, 3) [m], at fraction s of the step. JAX does not differentiate it.
 
-    `pressure` (V,) [Pa] is the pressure at the nodes, or None. `near` is a flag and a tangent: if the flag is true, the
-    coarse space of this tangent is used. `kind` is a `Kind`. JAX does not differentiate the result.
+    `pressure` (V,) [Pa] is the pressure at the nodes, or None. `near` is a flag and a tangent. If the flag is true, the
+    coarse space of this tangent is used. `kind` is a `Kind`.
     """
     e, pressure, x, s = jax.lax.stop_gradient((e, pressure, x, s))
     name, taken = (kind, None) if isinstance(kind, str) else kind
@@ -183,7 +185,7 @@ def tangent(
         return _coarse(e, A)
 
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
-    # Loads that follow the body need the positions at which the tangent was assembled.
+    # Non-conservative forces need the positions at which the tangent was assembled.
     where, part, follows = (None, None, None) if e.conservative else (x, s, _true(kind, x.dtype))
     eliminates = ~_true(kind, bool) if kind != "true" and eliminates_pressures(e) else None
     K = Tangent(matrix, inverse, below, slow, where, part, follows, more, eliminates=eliminates)
@@ -198,30 +200,30 @@ def tangent(
 
 
 def eliminates_pressures(e: Equations) -> bool:
-    """Whether unknown pressures are eliminated in solves with a tangent that has no negative eigenvalues.
+    """Whether pressure unknowns are eliminated in solves with a tangent that has no negative eigenvalues.
 
-    Far from a solution the pressures are as large as the bulk modulus, and their stiffness is as large, too. Iterations
-    for positions and pressures together are scaled by the shear modulus and do not converge there. After the
-    elimination the matrix of the positions is positive. For linear elements the matrix of the pressures has no simple
-    inverse, so they are not eliminated.
+    Far from a solution, pressures and their stiffness are as large as the bulk modulus. Iterations for positions and
+    pressures together are scaled by the shear modulus and do not converge there. After the elimination the matrix of
+    the positions is positive. For linear elements the pressures are not eliminated, because their matrix has no simple
+    inverse.
     """
     return e.mixed is not None and e.mesh.order > 1 and e.scene.solve.linear_solver != "direct"
 
 
 def _thin(e: Equations) -> bool:
-    """Whether unknown pressures of linear elements get a coarse space: if cells are thin.
+    """Whether the pressure unknowns get a coarse space: in linear elements, if some elements are thin.
 
-    In strongly compressed quadratic elements it would increase the number of iterations.
+    In strongly compressed quadratic elements a coarse space would increase the number of iterations.
     """
     return e.mixed is not None and e.mesh.order == 1 and _groups_in_use(e, e.mesh.pattern.clusters) is not None
 
 
 @jax.jit
 def _slow_pressures(e: Equations, K: Tangent) -> Coarse:
-    """The coarse space of the pressures, with motions eliminated approximately.
+    """Coarse space of the pressures, after approximate elimination of the displacements.
 
-    In a layer between plates, pressures that vary slowly along the layer cause much less motion than their mass matrix
-    suggests.
+    In a layer between plates, pressures that vary slowly along the layer cause much smaller displacements than their
+    mass matrix suggests.
     """
     motions, volume = _motions(e, K), e.mixed
 
@@ -234,21 +236,21 @@ def _slow_pressures(e: Equations, K: Tangent) -> Coarse:
 
 
 def _true(kind: Kind, dtype: Any) -> jax.Array:
-    """1 for the true tangent, else 0."""
+    """Return 1 for the true tangent, and 0 for the other kinds."""
     return jnp.asarray(kind == "true" if isinstance(kind, str) else ~kind[1], dtype)
 
 
 #: Matrix, inverse and vertices of a `Tangent`, the matrix for its coarse space, and elements between nodes.
 _Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Between, ...]]
 
-# The two functions below occur several times in a program: within jit they are traced once.
+# The functions below occur several times in a program. With jit they are traced once.
 
 
 @partial(jax.jit, static_argnames="name")
 def _assembled(
     e: Equations, pressure: jax.Array | None, at: tuple[jax.Array, Number], taken: jax.Array | None, name: str
 ) -> _Assembled:
-    """The tangent without its coarse space."""
+    """Assemble the tangent without its coarse space."""
     mesh, volume, (x, s) = e.mesh, volume_with_pressures(e), at
     kind: Kind = name if taken is None else (name, taken)
     if mesh.order > 1:
@@ -273,7 +275,7 @@ def _assembled(
 
 
 def _vertex_inverses(e: Equations, free: Free, A: BlockMatrix, diagonal: Block) -> Inverses:
-    """Inverses of the given diagonal blocks of a matrix of the vertices, and inverses for clusters of vertices."""
+    """Inverses of the diagonal blocks of a vertex matrix, and inverses for clusters of vertices."""
     single = block_matrix.inverse_blocks(diagonal, free.mask, free.normals)
     groups = _groups_in_use(e, e.mesh.pattern.clusters)
     entries = clusters.of_rows(groups, e.mesh.pattern.edge_slots, A)
@@ -281,19 +283,19 @@ def _vertex_inverses(e: Equations, free: Free, A: BlockMatrix, diagonal: Block) 
 
 
 def _groups_in_use(e: Equations, groups: Any) -> Any:
-    """The clusters, or None if they are not used: with a factorisation, or if nodes slide on oblique planes."""
+    """Return the clusters, or None with a factorisation or if nodes slide on oblique planes (no clusters are used)."""
     return None if e.free.normals is not None or e.scene.solve.linear_solver == "direct" else groups
 
 
 @jax.jit
 def _coarse(e: Equations, A: BlockMatrix) -> Coarse:
-    """The coarse space of the vertices."""
+    """Coarse space of the vertices for the preconditioner."""
     used = False if e.scene.solve.linear_solver == "direct" else worthwhile(A, _vertex_shift(e))
     return coarse(e.mesh, A, _coarse_mask(_of_vertices(e)), used)
 
 
 def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number, kind: Kind) -> _Assembled:
-    """The tangent of quadratic elements: blocks at their integration points, and a preconditioner with two levels."""
+    """Tangent of quadratic elements: blocks at the integration points, and a preconditioner with two levels."""
     mesh, volume = e.mesh, volume_with_pressures(e)
     F = deformation_gradient(mesh, x)
     A = PointMatrix(stored(own_blocks(e, pressure, F, kind)), node_blocks(e), None, None)
@@ -322,7 +324,7 @@ def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number
 
 
 def _of_vertices(e: Equations) -> Free:
-    """The free directions of the vertices."""
+    """Free directions of the vertices."""
     V, (mask, normals) = e.mesh.number_of_vertices, e.free[:2]
     return Free(mask[:V], None if normals is None else normals[:V])
 
@@ -333,18 +335,18 @@ def _vertex_shift(e: Equations) -> jax.Array | None:
 
 
 def _coarse_mask(free: Free) -> jax.Array:
-    """1 where coarse motions act, else 0, (V, 3). It is 0 for nodes that slide on an oblique plane."""
+    """Mask (V, 3) of the coarse space: 0 for fixed directions and for nodes that slide on oblique planes, else 1."""
     mask, normals = free[:2]
     return mask if normals is None else mask * jnp.all(normals == 0, axis=1, keepdims=True)
 
 
 def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]:
-    """The preconditioner: inverse diagonal blocks plus the coarse solution, as a function of flat vectors (3 V,)."""
+    """Preconditioner as a function of flat vectors (3 V,): inverse diagonal blocks plus the coarse solution."""
     return _with_pressures(e, K, _motions(e, K))
 
 
 def _motions(e: Equations, K: Tangent) -> Callable:
-    """The preconditioner of the motions, as a function of columns (V,)."""
+    """Preconditioner of the displacements, as a function of columns (V,)."""
     mesh = e.mesh
     vertices = _groups_in_use(e, mesh.pattern.clusters)
     nodes = vertices if mesh.order == 1 else _groups_in_use(e, mesh.clusters)
@@ -371,7 +373,7 @@ def _motions(e: Equations, K: Tangent) -> Callable:
 
 
 def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[jax.Array], jax.Array]:
-    """The preconditioner `motions` of columns (V,) as a function of flat vectors, with unknown pressures if any."""
+    """Preconditioner as a function of flat vectors, from `motions` for columns (V,), with pressure unknowns if any."""
     if e.mixed is None:
         return lambda r: flat_free(e, motions(block_matrix.columns(r)))
     volume, n = e.mixed, 3 * e.mesh.number_of_nodes
@@ -380,7 +382,7 @@ def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[ja
     slow = None if K.pressures is None else correction(e.mesh, K.pressures, every)
 
     def triangular(r: jax.Array) -> jax.Array:
-        """Solve for the pressures first, then for the motions that the remaining forces cause."""
+        """Solve for the pressures first, then for the displacements that the remaining forces cause."""
         dp = -r[n:] / schur
         if slow is not None:
             dp = dp - slow((r[n:],))[0] / volume.unit**2
@@ -392,16 +394,16 @@ def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[ja
 
 
 def flat_free(e: Equations, columns: Any) -> jax.Array:
-    """The free part of columns (V,) as a flat vector."""
+    """Project columns (V,) onto the free directions, and return a flat vector (3 V,)."""
     if e.free.normals is None and not e.free.tied:
         return e.free.mask.T.ravel() * jnp.concatenate(columns)
     return jnp.concatenate(e.free.columns(columns))
 
 
 def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Array], jax.Array]:
-    """K as a function of flat vectors (3 V,).
+    """Return the product with K, as a function of flat vectors (3 V,).
 
-    If `exactly` is false, pressures that depend on the motion are approximate.
+    If `exactly` is false, pressures that depend on the positions are approximate.
     """
     A, volume, n = K.matrix, volume_with_pressures(e), 3 * e.mesh.number_of_nodes
 
@@ -426,7 +428,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 def with_nodal_products(
     e: Equations, K: Tangent, motion: Sequence[jax.Array], force: Sequence[jax.Array]
 ) -> tuple[jax.Array, ...]:
-    """`force` plus, for a motion, forces of elements between nodes and of loads that follow the body; columns (V,)."""
+    """Add to `force` the forces of elements between nodes and of follower loads due to `motion`; columns (V,)."""
     for own in K.attached:
         force = block_matrix.sums(force, attached.product(own, motion))
     following = [a for a in e.nodal if not a.conservative]
@@ -441,15 +443,15 @@ def with_nodal_products(
 def solve(
     e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve K dq = b. Return dq, the iterations (0 for a factorisation), and whether K seems to be positive."""
+    """Solve K dq = b. Return dq, the number of iterations (0 for a factorisation), and whether K seems positive."""
     if e.scene.solve.linear_solver == "direct":
         dq = factorised_solution(e, K, b)
-        # With unknown pressures the matrix has negative eigenvalues anyway.
+        # With pressure unknowns the matrix always has negative eigenvalues.
         positive = jnp.vdot(dq, b) >= 0 if e.mixed is None else jnp.all(jnp.isfinite(dq))
         return dq, jnp.zeros((), jnp.int32), positive
     if K.eliminates is not None:
         return _one_of_both(e, K, K.eliminates, b, (tolerance, max_iterations))
-    # With unknown pressures the preconditioner is block-triangular, so it is not symmetric.
+    # With pressure unknowns the preconditioner is block-triangular, hence not symmetric.
     method = conjugate_gradients if e.conservative and e.mixed is None else stabilised_biconjugate_gradients
     dq, s = method(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
     return dq, s.iterations, s.positive
@@ -458,7 +460,7 @@ def solve(
 def _one_of_both(
     e: Equations, K: Tangent, flag: jax.Array, b: jax.Array, limits: tuple[Number, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`solve` with pressures eliminated if `flag` is true; the other solve has the load 0 and ends at once."""
+    """Solve K dq = b, with pressures eliminated if `flag` is true. The other solve has the load 0 and ends at once."""
     n, A, motions = 3 * e.mesh.number_of_nodes, K.matrix, _motions(e, K)
     assert isinstance(A, PointMatrix)
 
@@ -478,7 +480,7 @@ def _one_of_both(
 
 
 def factorised_solution(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
-    """Solve K dq = b by a factorisation; with pressures the matrix is coupled, and b may contain their entries."""
+    """Solve K dq = b by a factorisation. With pressures the matrix is coupled, and b may contain pressure entries."""
     n, volume, nothing = 3 * e.mesh.number_of_nodes, volume_with_pressures(e), jnp.ones(0)
     # In the factorised matrix positive pressures push inwards, and the balance has a minus sign.
     unit = 1.0 if e.mixed is None else -e.mixed.unit

@@ -1,9 +1,9 @@
-"""The unloaded shape: reference positions from which the loads lead to the given positions.
+"""The unloaded shape: the reference positions from which the loads deform the body into the given positions.
 
-The unknowns are the displacements u. The vertices of the reference shape are X = x - u, with x the given positions. In
-this shape quadratic elements have straight edges, so the positions of the edge middles follow from the vertices. The
-displacements of the edge middles are unknowns, too. A body with reference shape X must have no out-of-balance forces at
-X + u. For small u the derivative of these forces is the stiffness K. So Newton's method with BiCGSTAB uses the
+The unknowns are the displacements u. The vertices of the reference shape are X = x - u, with the given positions x. In
+the reference shape quadratic elements have straight edges, so the edge middles follow from the vertices. The
+displacements of the edge middles are unknowns, too. A body with the reference shape X must be in equilibrium at X + u.
+For small u the derivative of the out-of-balance forces is the stiffness K. So Newton's method with BiCGSTAB uses the
 preconditioner of K.
 
 Source: Govindjee and Mihalic 1996, "Computational methods for inverse finite elastostatics". This module solves the
@@ -30,29 +30,29 @@ from liverjax.simulation.equations import Equations, Sizes, equations, force_siz
 from liverjax.solvers.block_matrix import columns, flat
 from liverjax.solvers.newton import NewtonOptions, newton_root
 
-#: A step that is too long is halved. Only the last linear solve needs high accuracy.
+#: A Newton step that is too long is halved. Only the last linear solve needs high accuracy.
 _OPTIONS = NewtonOptions(max_iterations=50, linear_tolerance=1e-2, max_halvings=12, symmetric=False)
 
 
 class Unloaded(NamedTuple):
-    """A reference shape, its status and its residual."""
+    """A scene with the reference shape, the status of the search and its residual."""
 
     scene: Scene  # with the reference shape
-    status: jax.Array  # of `liverjax.core.status`; under jit the points are NaN if it is not CONVERGED
-    residual: jax.Array  # |r| over the norm of all forces
+    status: jax.Array  # code of `liverjax.core.status`; under jit the points are NaN if it is not CONVERGED
+    residual: jax.Array  # norm of the residual forces, divided by the norm of all forces
 
 
 def unload(scene: Scene) -> Unloaded:
-    """`liverjax.simulation.run.unloaded` for a scene in the form in which it is run.
+    """Find the reference shape, as `liverjax.simulation.run.unloaded`, for a scene that is ready to run.
 
     Raises:
-        InputError: no reference shape was found. With traced numbers nothing is raised.
+        InputError: no reference shape was found. If numbers are traced, nothing is raised.
     """
     points, code, relative = _found_shape(resting(scene))
     if not isinstance(code, jax.core.Tracer) and int(code) != status.CONVERGED:
         raise InputError(
-            '[mesh] is = "loaded": no reference shape was found that these loads bring to the given one (the rest is '
-            f"{float(relative):.1g} of the forces): take a stiffer law, smaller loads or a better mesh"
+            '[mesh] is = "loaded": no reference shape was found that these loads deform into the given shape '
+            f"(residual {float(relative):.1g} of the forces): use a stiffer law, smaller loads or a better mesh"
         )
     # Under jit the points are NaN if no shape was found.
     mesh = with_points(scene.mesh, jnp.where(code == status.CONVERGED, points, jnp.nan))
@@ -60,7 +60,7 @@ def unload(scene: Scene) -> Unloaded:
 
 
 def resting(scene: Scene) -> Scene:
-    """The same body after a long time at rest under the loads of time 0."""
+    """The scene of the same body after a long time under the loads of time 0: static and fully relaxed."""
     if scene.springpots is not None:
         scene = replace(scene, viscosity=series_at_rest(scene.springpots), springpots=None)
     law = scene.law
@@ -75,7 +75,7 @@ def resting(scene: Scene) -> Scene:
 
         law = law.each(relaxed)
     held = tuple(Fixed(nodes=d.nodes, axes=d.axes) for d in scene.displaced)
-    # With a step of length 0, histories have their first value.
+    # In a step of length 0, histories have their first value.
     solve = replace(scene.solve, kind="static", steps=1, dt=0.0, newton="converged", robust="off")
     changed: Content = {"fixed": (*scene.fixed, *held), "physics": tuple(p.at_beginning() for p in scene.physics)}
     return replace(scene, law=law, viscosity=None, displaced=(), solve=solve, points_are="reference", **changed)
@@ -83,18 +83,18 @@ def resting(scene: Scene) -> Scene:
 
 @jax.jit
 def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Reference positions (V, 3) [m], status code, and the residual over the norm of all forces."""
+    """Reference positions (V, 3) [m], status code, and residual divided by the norm of all forces."""
     one, given = jnp.ones((), scene.mesh.points.dtype), scene.mesh.points
     sizes = force_sizes(scene)
     first = jax.lax.stop_gradient(equations(scene, initial_state(scene), one, sizes))
     q = unknowns(first, given)
-    # The norm of all forces on the given shape without strain: the residual is divided by it.
+    # `loads` is the norm of all forces on the given shape without strain. The residual is divided by this norm.
     _, loads, pressure = jax.lax.stop_gradient(residual(first, q, one))
     K = tangent.tangent(first, pressure, given, one)
 
     def held(z: jax.Array) -> jax.Array:
         e, q = _with_displacements(scene, given, z, sizes)
-        # Unknowns that are not free must be 0. Their equations are added, so that the matrix has no empty rows.
+        # Unknowns that are not free must be 0. These equations are added, so that the matrix has no empty rows.
         return residual(e, q, one)[0] + (z - _free_part(first, z))
 
     options = _OPTIONS._replace(tolerance=jax.lax.stop_gradient(scene.solve.tolerance))
@@ -106,7 +106,7 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def _free_part(e: Equations, z: jax.Array) -> jax.Array:
-    """The unknowns with 0 for displacements that are not free: first displacements, then unknown pressures."""
+    """Set displacements that are not free to 0 in the unknowns z (displacements, then pressures)."""
     n = 3 * e.mesh.number_of_nodes
     return jnp.concatenate([jnp.concatenate(e.free.columns(columns(z[:n]))), z[n:]])
 
@@ -117,7 +117,7 @@ def _reference_shape(mesh: TetMesh, given: jax.Array, e: Equations, z: jax.Array
 
 
 def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
-    """The equations of the body with the reference shape that z gives, and the unknowns of its positions."""
+    """Equations of the body with the reference shape that belongs to z, and the unknowns of its loaded positions."""
     n = 3 * scene.mesh.number_of_nodes
     still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)
     mesh = _reference_shape(scene.mesh, given, still, z)

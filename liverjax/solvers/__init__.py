@@ -1,1 +1,1 @@
-"""Block matrices, Krylov methods, factorisation, preconditioners, Newton's method along a load, and minimisation."""
+"""Solvers: block matrices, Krylov methods, factorisation, preconditioners, Newton's method, energy minimisation."""

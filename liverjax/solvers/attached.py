@@ -1,4 +1,4 @@
-"""Stiffness of small elements between nodes of the body, and masses that the nodes of an element share."""
+"""Stiffness of additional elements between nodes of the body (springs, contact …), and consistent element masses."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,34 +13,34 @@ from liverjax.tensors.places import given, taken
 
 
 class Attached(NamedTuple):
-    """Stiffness of m elements between n nodes each."""
+    """Stiffness matrices of m additional elements with n nodes each."""
 
     nodes: jax.Array  # (n, m)
     blocks: jax.Array  # (n, 3, n, 3, m) [N/m], symmetric unless there is friction
 
 
 class GivesWay(NamedTuple):
-    """The change -h h^T / size of a stiffness by one eliminated unknown, for example the travel of an obstacle."""
+    """Rank-one change -h h^T / size of a stiffness by an eliminated unknown, e.g. the displacement of an obstacle."""
 
     h: jax.Array  # (V, 3) [N/m] forces on the nodes per unit of this unknown
     size: jax.Array  # () [N/m] stiffness of this unknown if the nodes do not move
 
 
 class Masses(NamedTuple):
-    """The elements' consistent mass minus the nodes' diagonal masses, or the stiffness of this mass in a time step."""
+    """Consistent minus lumped mass matrices of the elements, or the stiffness of this difference in a time step."""
 
     nodes: jax.Array  # (n, E)
-    signs: jax.Array  # (n, E) signs of functions that have a direction
+    signs: jax.Array  # (n, E) 1, or -1 for a shape function with reversed direction
     matrix: jax.Array  # (n, n) symmetric
     size: jax.Array  # (E,) [kg] or [N/m]
 
 
-#: Stiffness between nodes that is not part of an assembled matrix.
+#: Stiffness between nodes that is not part of the assembled matrix.
 Between = Attached | GivesWay | Masses
 
 
 def masses(mesh: TetMesh, matrix: np.ndarray, size: jax.Array) -> Masses:
-    """`Masses` with the matrix (n, n) times one number for each element (E,)."""
+    """Make `Masses`: the matrix (n, n), the same for all elements, times one number `size` for each element (E,)."""
     nodes = jnp.stack(mesh.element_nodes)
     signs = mesh.oriented(jnp.ones((len(nodes), 1, nodes.shape[1]), size.dtype))[:, 0]
     return Masses(nodes, signs, jnp.asarray(matrix, size.dtype), size)
@@ -53,7 +53,7 @@ def _shared(A: Masses, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
 
 
 def product(A: Between, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Forces, columns (V,), of a motion given by its columns (V,)."""
+    """Product of A and a nodal motion, which is given by its columns (V,): nodal forces as columns (V,)."""
     if isinstance(A, Masses):
         return _shared(A, columns)
     if isinstance(A, GivesWay):
@@ -66,8 +66,8 @@ def product(A: Between, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
 
 
 def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
-    """Diagonal blocks, 3 x 3 of (V,)."""
-    # If an element has the same node twice, the blocks between both are on the diagonal, too.
+    """Diagonal blocks of A at the nodes: 3 x 3 arrays (V,)."""
+    # If an element has the same node twice, the blocks between both entries are also on the diagonal.
     same = A.nodes[:, None] == A.nodes[None]
     own = jnp.sum(jnp.where(same[:, None, :, None], A.blocks, 0.0), axis=2)  # (n, 3, 3, m)
     own = jnp.zeros((number_of_nodes, 3, 3), own.dtype).at[A.nodes].add(jnp.transpose(own, (0, 3, 1, 2)))
@@ -75,7 +75,7 @@ def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
 
 
 def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -> BlockMatrix:
-    """The matrix of the vertices plus the elements' blocks, as far as their vertices are neighbours in the body."""
+    """Add the blocks of the elements to the matrix of the vertices, for vertices that are neighbours in the body."""
     if not attached:
         return A
     rows = jnp.stack([jnp.stack(row[:3]) for row in A.rows[:3]])
@@ -93,7 +93,7 @@ def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -
 
 
 def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
-    """The elements for motions that are linear along edges: a middle moves by the mean of the edge's ends."""
+    """Restrict the elements to motions linear along edges: a midside node moves by the mean of the two edge ends."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     edge = jnp.clip(A.nodes - V, 0, low.shape[0] - 1)
     is_vertex = A.nodes < V
@@ -104,12 +104,12 @@ def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
 
 
 def symmetric_part(A: Attached) -> Attached:
-    """The elements with the symmetric part of their matrices."""
+    """Replace the matrix of each element by its symmetric part."""
     return Attached(A.nodes, 0.5 * (A.blocks + jnp.transpose(A.blocks, (2, 3, 0, 1, 4))))
 
 
 def definite(A: Attached) -> Attached:
-    """The elements with negative eigenvalues of their matrices set to 0."""
+    """Set the negative eigenvalues of the symmetrised element matrices to 0."""
     n, m = A.nodes.shape
     K = jnp.moveaxis(A.blocks.reshape(3 * n, 3 * n, m), -1, 0)
     size, axes = jnp.linalg.eigh(0.5 * (K + jnp.swapaxes(K, 1, 2)))

@@ -9,15 +9,15 @@ from threadpoolctl import ThreadpoolController
 def one_blas_thread() -> AbstractContextManager:
     """Limit BLAS to one thread inside a `with` block, for code with several threads or with small matrices.
 
-    With more BLAS threads, these and our threads would wait for each other: a factorisation took three times as long,
-    and the step of a reduced model twice as long.
+    With more BLAS threads, these and our own threads would wait for each other. A factorisation then took three times
+    as long, and a step of a reduced model twice as long.
     """
     return _libraries().limit(limits=1, user_api="blas")
 
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """The loaded BLAS libraries. `scipy.linalg` is imported because it loads a separate one."""
+    """The loaded BLAS libraries. `scipy.linalg` is imported because it loads a separate BLAS library."""
     import scipy.linalg  # noqa: F401
 
     return ThreadpoolController()

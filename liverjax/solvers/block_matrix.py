@@ -1,7 +1,8 @@
-"""Symmetric matrices of node blocks in padded rows, assembled from element blocks. Products need no search.
+"""Symmetric block matrices with one block for each pair of neighbouring nodes, assembled from element blocks.
 
-The block of each edge is added only once. Forces do not change under translation, so a diagonal block is minus the sum
-of the other blocks in its row. Callers give other terms of the diagonal.
+All rows are padded to one length. Every row stores the numbers of its neighbours, so a matrix-vector product needs no
+search for column indices. The block of each edge is added only once. Forces do not change under translation, so a
+diagonal block is minus the sum of the other blocks in its row. The caller adds other terms of the diagonal.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,13 +24,13 @@ Block = tuple[tuple[Any, ...], ...]
 class BlockMatrix(NamedTuple):
     """A symmetric matrix (V m, V m) of m x m blocks; each entry of a block is an array over the nodes."""
 
-    rows: Block  # arrays (W, V): blocks of a node and its neighbours
+    rows: Block  # arrays (W, V): blocks between each node and its W neighbours
     diagonal: Block  # arrays (V,)
-    nodes: jax.Array  # (W, V) neighbours
+    nodes: jax.Array  # (W, V) node numbers of the neighbours
 
 
 def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
-    """Blocks between nodes and their neighbours, m x m arrays (W, V).
+    """Assemble the blocks between nodes and their neighbours, m x m arrays (W, V).
 
     They are sums of the element blocks of `PAIRS`, m x m arrays (E,).
 
@@ -37,7 +38,7 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
     """
     pattern: Pattern = mesh.pattern
     m = len(blocks[PAIRS[0]])
-    # Stored, since otherwise XLA:CPU would compute every entry again in each scatter.
+    # The blocks are stored. Otherwise XLA:CPU would compute every entry again in each scatter.
     blocks = stored(blocks)
     number = pattern.edges.shape[1]
     swapped = {(a, b): mesh.tetrahedra[:, a] > mesh.tetrahedra[:, b] for a, b in PAIRS}
@@ -62,17 +63,17 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
 
 
 def row_sums(rows: Block) -> Block:
-    """Sums over the neighbours: m x m arrays (V,)."""
+    """Sums of the blocks over the neighbours of each node: m x m arrays (V,)."""
     return tuple(tuple(jnp.sum(entry, axis=0) for entry in row) for row in rows)
 
 
 def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], own: Block | None = None) -> BlockMatrix:
-    """The stiffness matrix, from the elements' 3 x 3 blocks between different nodes and from additional node blocks.
+    """Assemble the stiffness matrix from 3 x 3 element blocks between different nodes and from additional node blocks.
 
     Args:
         mesh: `TetMesh`.
-        blocks: blocks of every element for `PAIRS`, with entries (E,).
-        own: blocks with entries (V,), added to the diagonal; an entry may be None for 0.
+        blocks: blocks of every element for the node pairs `PAIRS`, with entries (E,).
+        own: blocks with entries (V,) that are added to the diagonal. An entry that is 0 may be None.
     """
     rows = off_diagonal(mesh, blocks)
     sums = row_sums(rows)
@@ -90,10 +91,10 @@ def added(a: Block, b: Block) -> Block:
 
 
 def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None = None) -> Block:
-    """Inverse 3 x 3 blocks, with unit rows where `mask` (V, 3) is 0.
+    """Invert the 3 x 3 diagonal blocks. Directions with `mask` (V, 3) equal to 0 get unit rows.
 
-    If a block is not positive definite, the inverse of the mean of its diagonal is used. Nodes do not move along
-    `normals` (V, 3), unit vectors or 0: along them a block is replaced by this mean.
+    If a block is not positive definite, its mean absolute diagonal entry is inverted instead. `normals` (V, 3) are unit
+    vectors or 0. Nodes do not move along them; in this direction a block is replaced by the mean of its diagonal.
     """
     if normals is not None:
         diagonal = _across(diagonal, normals)
@@ -114,7 +115,7 @@ def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None =
 
 
 def _across(A: Block, normals: jax.Array) -> Block:
-    """(I - n n) A (I - n n) + mean n n."""
+    """Return (I - n n^T) A (I - n n^T) + mean n n^T, with the mean of the diagonal of A."""
     n = normals.T
     mean = (A[0][0] + A[1][1] + A[2][2]) / 3
     An = [sum(A[r][c] * n[c] for c in range(3)) for r in range(3)]
@@ -123,18 +124,18 @@ def _across(A: Block, normals: jax.Array) -> Block:
 
 
 def applied(blocks: Block, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Columns (V,): the block of each node, m x k arrays (V,), times the k entries of the vector at this node."""
+    """Multiply the block of each node, m x k arrays (V,), by the k entries of the vector there. Return columns (V,)."""
     return tuple(_row(row, columns) for row in blocks)
 
 
 def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """A v as columns (V,), for the k columns (V,) of v. All rows and the first k columns of the blocks are used."""
+    """Product A v as m columns (V,), for v with k columns (V,). Only the first k columns of the blocks are used."""
 
     def add(slot, total):
         near = [taken(column, A.nodes[slot]) for column in columns]
         return tuple(t + _row([e[slot] for e in row], near) for t, row in zip(total, A.rows, strict=True))
 
-    # A loop over the neighbours, so that gathered values stay in the cache.
+    # In a loop over the neighbours, gathered values stay in the cache.
     return jax.lax.fori_loop(0, A.nodes.shape[0], add, applied(A.diagonal, columns))
 
 
@@ -143,15 +144,15 @@ def _row(entries: Any, columns: Sequence[jax.Array]) -> jax.Array:
 
 
 def sums(a: Sequence[jax.Array], b: Iterable[jax.Array]) -> tuple[jax.Array, ...]:
-    """Sums of columns (V,)."""
+    """Sum of two vectors that are given by their columns (V,)."""
     return tuple(x + y for x, y in zip(a, b, strict=True))
 
 
 def columns(vector: jax.Array) -> tuple[jax.Array, ...]:
-    """x, y and z (V,) of a flat vector (3 V,), which has first all x, then all y, then all z."""
+    """Columns x, y and z (V,) of a flat vector (3 V,), which contains first all x, then all y, then all z."""
     return tuple(vector.reshape(3, -1))
 
 
 def flat(field: jax.Array) -> jax.Array:
-    """The flat vector (3 V,) of a field (V, 3)."""
+    """Flat vector (3 V,) of a field (V, 3): first all x, then all y, then all z."""
     return field.T.ravel()

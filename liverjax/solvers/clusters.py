@@ -1,8 +1,8 @@
 """Dense inverse blocks for clusters of near nodes: a part of the preconditioner for meshes with thin cells.
 
-In a thin cell, nodes across the cell are coupled much more strongly than nodes along it. Block-Jacobi spreads a motion
-across the cell by only one node per iteration. So each cluster of near nodes (`liverjax.mesh.adjacency.Clusters`) is
-treated as one block.
+In a thin cell, nodes are coupled much more strongly through the thickness than along the cell. Block-Jacobi spreads a
+motion through the thickness by only one node per iteration. So each cluster of near nodes
+(`liverjax.mesh.adjacency.Clusters`) is treated as one block.
 """
 
 from collections.abc import Sequence
@@ -32,15 +32,15 @@ class Inverses(NamedTuple):
 def inverses(
     clusters: Clusters | None, entries: jax.Array | None, diagonal: Block, mask: jax.Array, single: Block
 ) -> Inverses:
-    """Inverse blocks of clusters and of single nodes.
+    """Compute the inverse blocks of clusters and of single nodes.
 
-    If a cluster is not positive definite, its nodes are single nodes.
+    If the matrix of a cluster is not positive definite, its nodes are treated as single nodes.
 
     Args:
-        clusters: clusters of the mesh; None: the mesh has none.
-        entries: blocks (n, 3, 3) of the matrix, one for each source of the clusters.
+        clusters: clusters of the mesh, or None if the mesh has no clusters.
+        entries: blocks (n, 3, 3) of the matrix, one for each entry of `clusters.sources`.
         diagonal: diagonal blocks of the matrix, 3 x 3 arrays (V,).
-        mask: (V, 3) 1 where free.
+        mask: (V, 3) 1 where free, else 0.
         single: inverse blocks of single nodes, 3 x 3 arrays (V,).
     """
     if clusters is None or entries is None:
@@ -63,7 +63,7 @@ def inverses(
 
 
 def smoothed(clusters: Clusters | None, A: Inverses, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """The inverse blocks times a vector given by its columns (V,)."""
+    """Multiply the inverse blocks by a vector that is given by its columns (V,). Return columns (V,)."""
     single = block_matrix.applied(A.nodes, columns)
     if clusters is None or A.clusters is None:
         return single
@@ -75,7 +75,7 @@ def smoothed(clusters: Clusters | None, A: Inverses, columns: Sequence[jax.Array
 
 
 def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) of a matrix of the vertices, one for each source of the clusters."""
+    """Blocks (n, 3, 3) of a matrix of the vertices, one for each entry of `clusters.sources`."""
     if clusters is None:
         return None
     slots = taken(edge_slots, clusters.sources[0])
@@ -84,16 +84,18 @@ def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) ->
 
 
 def of_points(clusters: Clusters | None, order: int, A: PointMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) of the matrix between two shape functions a and b of an element, one for each source of the
-    clusters: the sum of c_ak K_kl c_bl over the integration points and over k and l. c_ak is the derivative of function
-    a by the linear function k, minus its derivative by the linear function 0. K_kl are the blocks of A.
+    """Blocks (n, 3, 3) of the matrix between two shape functions a and b, one for each entry of `clusters.sources`.
+
+    A block is the sum of c_ak K_kl c_bl over the integration points of the element and over k and l. c_ak is the
+    derivative of function a with respect to the barycentric coordinate k, minus its derivative with respect to
+    coordinate 0. K_kl are the blocks of A.
     """
     if clusters is None:
         return None
     c = basis(order).c
     slopes = jnp.asarray(c[:, 1:] - c[:, :1], A.blocks[1, 1][0][0].dtype)  # (n, 3, Q)
     pairs = sorted(A.blocks)
-    # The element is the first axis, so that the numbers of one element are close together in memory.
+    # With the element as the first axis, the numbers of one element are close together in memory.
     K = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in pairs])
     K = jnp.moveaxis(K, -1, 0)  # (E, 6, 3, 3, Q)
 

@@ -1,7 +1,7 @@
-"""Linear solves by a sparse factorisation on the host, for matrices that are too ill-conditioned for iterations.
+"""Solve linear systems by sparse factorisation on the host, if they are too ill-conditioned for Krylov methods.
 
-The factorisation is SciPy's SuperLU. Its time and memory grow faster than the mesh (n^1.5 to n^2), so it is for bodies
-with some thousand nodes.
+The factorisation is SciPy's SuperLU. Its time and memory grow faster than the number n of nodes (as n^1.5 to n^2), so
+it is suitable for bodies with a few thousand nodes.
 """
 
 from functools import partial
@@ -29,9 +29,10 @@ def solve(
     normals: jax.Array | None = None,
     attached: tuple[Between, ...] = (),
 ) -> jax.Array:
-    """Solution (m, V) of A x = b (m, V) for m x m blocks; 0 where `free` (m, V) is 0; NaN if A is singular.
+    """Solve A x = b (m, V) for a matrix of m x m blocks. Return x (m, V).
 
-    Along `normals` (V, 3), unit vectors or 0, the first three rows of x are 0. `attached` is added to A.
+    x is 0 where `free` (m, V) is 0, and NaN if A is singular. `normals` (V, 3) are unit vectors or 0: the motion of
+    each node (the first three rows of x) has no component along its normal. `attached` is added to A.
     """
     rows, diagonal = (jnp.stack([jnp.stack(row) for row in blocks]) for blocks in (A.rows, A.diagonal))
     shape = jax.ShapeDtypeStruct(b.shape, b.dtype)
@@ -47,10 +48,11 @@ def solve_points(
     normals: Number | None = None,
     attached: tuple[Between, ...] = (),
 ) -> jax.Array:
-    """`solve` for quadratic elements, as a flat vector: positions (3 V,), then pressures of vertices if A has them.
+    """Solve the linear system of quadratic elements. The arguments have the same meaning as in `solve`.
 
-    `free` and `b` are pairs of arrays: for positions (3, V) and for pressures. Empty arrays for the pressures mean that
-    all pressures are free and that their part of `b` is 0.
+    The result is a flat vector: the positions (3 V,), then the pressures of the vertices if A has pressures. `free` and
+    `b` are pairs of arrays: for positions (3, V) and for pressures. An empty array for the pressures means that all
+    pressures are free, or that their part of `b` is 0.
     """
     blocks = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in sorted(A.blocks)])
     own = None if A.own is None else _filled(A.own, b[0][0])
@@ -72,7 +74,7 @@ def _filled(blocks: Block, like: jax.Array) -> jax.Array:
 
 
 def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
-    """Matrix (size, size) with the block n n^T for every node, in the order of the unknowns."""
+    """Matrix (size, size) with the 3 x 3 block n n^T of every node (normal n), in the order of the unknowns."""
     import scipy.sparse  # slow to import (a fifth of the package's time), so it is imported only where it is used
 
     number, own = len(normals), np.arange(len(normals))
@@ -84,9 +86,9 @@ def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
 
 
 def _entries(attached: tuple[Between, ...], n: int) -> list[tuple]:
-    """Values, rows and columns of the matrices of elements between nodes.
+    """Return the values, row indices and column indices of the matrices in `attached`.
 
-    Unknowns are all x of the n nodes, then y, z.
+    The unknowns are first the x of all n nodes, then all y, then all z.
     """
     found = []
     for nodes, blocks in (own for own in attached if isinstance(own, Attached)):
@@ -121,7 +123,10 @@ def _solve(*given: object) -> np.ndarray:
 
 
 def _given_ways(attached: tuple[Between, ...], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """h (size, n) of all `GivesWay`, in the order of the unknowns, and their stiffnesses (n,)."""
+    """Return the vectors h (size, n) of the n rank-one changes `GivesWay`, and the stiffness of each (n,).
+
+    The rows of h are in the order of the unknowns.
+    """
     found = [own for own in attached if isinstance(own, GivesWay)]
     H = np.zeros((size, len(found)))
     for column, own in zip(H.T, found, strict=True):
@@ -168,9 +173,9 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
 
 
 def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: tuple) -> np.ndarray:
-    """Solution (n,) of (A - H S^-1 H^T) x = b where `free` (n,) is not 0. `ways` is H and the diagonal of S.
+    """Solve (A - H S^-1 H^T) x = b (n,). x is 0 where `free` (n,) is 0. `ways` contains H and the diagonal of S.
 
-    `along` has the normals along which x is 0, or None, and the number that replaces A along them.
+    `along` contains the normals, along which x is 0 (or None), and the stiffness that replaces A along them.
     """
     import scipy.sparse.linalg
 
@@ -183,7 +188,7 @@ def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: t
     A = A[keep][:, keep].tocsc()
     x = np.zeros_like(b)
     try:
-        # The pattern is symmetric, so an ordering that is good for A + A^T is close to the optimum.
+        # The sparsity pattern is symmetric, so an ordering that is good for A + A^T is nearly optimal.
         factor = scipy.sparse.linalg.splu(A, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         x[keep] = factor.solve(b[keep])
         if len(size):  # Sherman, Morrison and Woodbury

@@ -1,4 +1,4 @@
-"""Linear solves inside jit: preconditioned Krylov methods that compute the true residual at the end."""
+"""Preconditioned Krylov methods for use inside `jax.jit`. At the end they compute the true residual."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from liverjax.core.struct import Number
 
 
 class LinearStatistics(NamedTuple):
-    """Statistics of one solve: iterations and residual."""
+    """Statistics of one linear solve: iterations and residual."""
 
     iterations: jax.Array
     residual: jax.Array  # |b - A x| / |b|, recomputed at the end
-    positive: jax.Array  # False: a direction without positive curvature was found
+    positive: jax.Array  # False if a direction without positive curvature was found
 
 
 def conjugate_gradients(
@@ -29,7 +29,7 @@ def conjugate_gradients(
 
     Args:
         matvec, precondition: A and an approximation of its inverse.
-        tolerance: tolerance of the recursive residual, relative to |b|.
+        tolerance: tolerance, relative to |b|, of the residual that the iterations update.
         max_iterations: maximum number of iterations.
 
     The solve also stops if it finds a direction without positive curvature. The statistics contain the true residual.
@@ -42,7 +42,7 @@ def conjugate_gradients(
 
     def step(c):
         x, r, p, rz_before, k, _ = c
-        z = precondition(r)  # called only here, so that the program contains it once
+        z = precondition(r)  # the only call, so that the program contains it once
         rz = jnp.vdot(r, z)
         p = z + rz / rz_before * p
         Ap = matvec(p)
@@ -96,7 +96,10 @@ def stabilised_biconjugate_gradients(
     tolerance: Number,
     max_iterations: int,
 ) -> tuple[jax.Array, LinearStatistics]:
-    """The same for a matrix that is not symmetric: BiCGSTAB (van der Vorst 1992), two products in each iteration."""
+    """Solve A x = b for a matrix A that is not symmetric, by BiCGSTAB (van der Vorst 1992).
+
+    The arguments are those of `conjugate_gradients`. Each iteration needs two products with A.
+    """
     goal = tolerance * jnp.linalg.norm(b)
     one = jnp.ones((), b.dtype)
 
@@ -126,19 +129,22 @@ def stabilised_biconjugate_gradients(
     return x, LinearStatistics(k, true_residual(matvec, b, x), jnp.array(True))
 
 
-#: Number of earlier solves that are kept for the start of a solve. An earlier load is skipped if newer loads represent
-#: it up to this fraction of its norm: the solutions are not more accurate than this.
+#: EARLIER: number of earlier solves that are kept to compute the starting vector of a solve. An earlier load is skipped
+#: if newer loads represent this load up to the fraction _NEW of its norm, because solutions are not more accurate.
 EARLIER, _NEW = 6, 1e-7
 
 
 class Earlier(NamedTuple):
-    """Loads and solutions of earlier solves, the latest first; zeros if there are fewer solves."""
+    """Loads (right-hand sides) and solutions of earlier solves, the latest first. Missing solves are zeros."""
 
     loads: jax.Array  # (EARLIER, n)
     solutions: jax.Array  # (EARLIER, m)
 
     def combined(self, b: jax.Array) -> jax.Array:
-        """The combination (m,) of earlier solutions whose load is closest to b (n,), by Gram-Schmidt, applied twice."""
+        """Linear combination (m,) of the earlier solutions that has the load closest to b (n,).
+
+        It is computed by Gram-Schmidt orthogonalisation of the loads, applied twice.
+        """
 
         def add(c, pair):
             Q, Y, b, x, k = c
@@ -157,13 +163,13 @@ class Earlier(NamedTuple):
         return jax.lax.scan(add, start, (self.loads, self.solutions))[0][3]
 
     def with_latest(self, load: jax.Array, solution: jax.Array) -> "Earlier":
-        """The earlier solves and a new one, without the oldest one."""
+        """Add a new solve and remove the oldest one."""
         pairs = ((self.loads, load), (self.solutions, solution))
         return Earlier(*(jnp.concatenate([new[None], old[:-1]]) for old, new in pairs))
 
 
 def no_earlier(load: jax.Array, solution: jax.Array) -> Earlier:
-    """An empty `Earlier` for loads and solutions of these sizes."""
+    """Empty `Earlier` for loads and solutions of the same sizes as `load` and `solution`."""
     return Earlier(*(jnp.zeros((EARLIER, len(each)), each.dtype) for each in (load, solution)))
 
 
@@ -177,19 +183,19 @@ def symmetric_solve(
     solver: Callable[[jax.Array, Earlier], tuple[jax.Array, jax.Array, jax.Array]],
     tolerance: Number,
 ) -> WithEarlier:
-    """The solution of A x = b for a symmetric A, as a linear map of b, and the earlier solves with this solve added.
+    """Solve A x = b for a symmetric A. Return x, and the earlier solves with this solve added.
 
-    Its derivatives are also solves, in forward and in reverse mode. In the cases of `differentiable_solve` the solution
-    is NaN.
+    x is a linear function of b: its derivatives are also solves, in forward and in reverse mode. x is NaN if the
+    residual is too large (the bounds are those of `differentiable_solve`).
 
     Args:
-        matvec: (x, earlier) -> (A x, the same earlier).
-        both: b, and the earlier solves that give the start of this solve.
-        solver: (b, earlier) -> solution, its load (b, or what remains of b after the elimination of unknowns), and the
-            true residual over the norm of the load.
+        matvec: function (x, earlier) -> (A x, the same earlier).
+        both: b, and the earlier solves that give the starting vector.
+        solver: function (b, earlier) -> solution, its load, and the true residual divided by the norm of the load. The
+            load is b, or what remains of b after the elimination of unknowns.
         tolerance: tolerance of the solver.
     """
-    # All in one vector: a derivative with respect to one part has no cotangents for the others, which JAX refuses.
+    # All in one vector: JAX raises an error if a derivative with respect to one part lacks cotangents for the others.
     joined, parted = ravel_pytree(both)
 
     def solve(_, vector):
@@ -215,10 +221,10 @@ def started(
     near: jax.Array,
     tolerance: Number,
 ) -> tuple[jax.Array, jax.Array]:
-    """Solution of A x = b, from a start at `near` if the residual there is smaller than at 0.
+    """Solve A x = b from the starting vector `near`, or from 0 if the residual is smaller there.
 
-    `solver` is (b, tolerance) -> solution and its residual over |b|. `tolerance` is the bound on |b - A x| over |b|.
-    The function returns the solution and its residual over |b|.
+    `solver` is a function (b, tolerance) -> solution and its residual divided by |b|. `tolerance` is the upper bound of
+    |b - A x| / |b|. The result is the solution and its residual divided by |b|.
     """
     left, size = b - matvec(near), jnp.linalg.norm(b)
     helps = jnp.linalg.norm(left) < size
@@ -229,7 +235,7 @@ def started(
 
 
 def true_residual(matvec: Callable[[jax.Array], jax.Array], b: jax.Array, x: jax.Array) -> jax.Array:
-    """|b - A x| / |b|."""
+    """Relative residual |b - A x| / |b|."""
     scale = jnp.linalg.norm(b)
     return jnp.linalg.norm(b - matvec(x)) / jnp.where(scale > 0, scale, 1.0)
 
@@ -238,7 +244,7 @@ class Known(NamedTuple):
     """Known properties of the matrix A of `differentiable_solve`."""
 
     symmetric: bool = True
-    #: b -> (solution for a symmetric A, true residual over |b|); None: solve by iterations.
+    #: Function b -> (solution for a symmetric A, true residual divided by |b|); None: a Krylov method solves.
     solver: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None
     diagonal: jax.Array | None = None  # diagonal of a diagonally dominant A
 
@@ -251,11 +257,11 @@ def differentiable_solve(
     max_iterations: int,
     known: Known = Known(),
 ) -> jax.Array:
-    """A solve as a linear map of `b`: its derivatives are also solves, not derivatives of the iterations.
+    """Solve A x = b as a linear function of `b`: derivatives are also solves, not derivatives of the iterations.
 
     It uses conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. The solution is NaN if the true
     residual is above 6e-6 |b| (float32: 1e-3) and above ten times the tolerance. With the `diagonal` D of a diagonally
-    dominant A, a residual below 4 eps |D x| is also accepted: the rounding of x causes already eps |D x|.
+    dominant A, a residual below 4 eps |D x| is also accepted, because the rounding of x alone causes eps |D x|.
     """
     symmetric, solver, diagonal = known
     method = conjugate_gradients if symmetric else stabilised_biconjugate_gradients

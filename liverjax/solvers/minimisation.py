@@ -1,16 +1,18 @@
-"""Minimise the energy of a step, if the step begins with inverted elements or if its load could not be followed.
+"""Minimise the energy of a step, if it begins with inverted elements or if Newton's method along the load fails.
 
 The true tangent is used if conjugate gradients find no negative curvature in it. Otherwise a tangent without negative
-eigenvalues is used (`liverjax.elements.projection`). Every step is shortened until the energy decreases (Armijo). Near
-the minimum the convergence is quadratic. If elements are inverted at the start, the body is first untangled as a stable
-neo-Hookean body of the same moduli. Its energy is finite everywhere, so every law can start from inverted elements.
+eigenvalues is used (`liverjax.elements.projection`). Every direction is shortened until the energy decreases (Armijo).
+Near the minimum the convergence is quadratic. If elements are inverted at the start, a minimisation with a stable
+neo-Hookean law of the same moduli first removes the inversions. The energy of this law is finite everywhere, so every
+law can start from inverted elements.
 
-If pressures are unknowns, the solution is a saddle point of the energy. If each position has its optimal pressures, the
-solution is a minimum. So only positions are varied, and the pressures follow from them. In quadratic elements the
-pressures are eliminated from a tangent without negative eigenvalues, so that the tangent is positive.
+If pressures are unknowns, the solution is a saddle point of the energy. With the optimal pressures for each set of
+positions, the solution is a minimum. So only positions are varied, and the pressures follow from the positions. In
+quadratic elements the pressures are eliminated from a tangent without negative eigenvalues, so that the tangent is
+positive.
 
-Forces without an energy, for example friction, keep their values at the beginning of an iteration. So they have an
-energy during this iteration. The gradient of the total energy at its beginning is the residual.
+Forces without an energy, for example friction, are held constant during an iteration. So they have an energy during
+this iteration. At the beginning of the iteration, the gradient of the total energy is the residual.
 """
 
 from typing import NamedTuple
@@ -21,31 +23,31 @@ import jax.numpy as jnp
 from liverjax.core import status
 from liverjax.solvers.problem import LINEAR_TOLERANCE, MOST_LINEAR_ITERATIONS, Potential, Problem, StepOptions
 
-#: Required decrease of the energy, over the decrease that its slope predicts (Armijo; Nocedal and Wright 2006, 3.1).
+#: Required decrease of the energy / decrease that its derivative predicts (Armijo; Nocedal and Wright 2006, 3.1).
 _FALL = 1e-4
-#: A relative difference of energies below this multiple of the precision is roundoff: then the residual must decrease.
+#: A relative difference of energies below this multiple of the precision is roundoff. Then the residual must decrease.
 _ROUNDOFF = 5e3
 #: The true tangent is tried again after at most this number of iterations.
 _PATIENCE = 8
-#: Maximum number of iterations, and maximum number of halvings of a step.
+#: Maximum number of iterations, and maximum number of halvings of a direction.
 _MOST_ITERATIONS, _MOST_SHORTENINGS = 300, 30
-#: If the residual over the norm of all forces is above this, a true tangent that is not symmetric is not tried:
-#: BiCGSTAB does not report that it is not positive, and it would need all its iterations.
+#: A true tangent that is not symmetric, or has pressures, is used only if the relative residual is below this value.
+#: Far from the solution the tangent may be indefinite. BiCGSTAB does not detect this and would use all its iterations.
 _NEAR = 0.1
-#: Tolerance of directions if pressures follow from positions: errors of their balance are amplified by K/mu.
+#: Tolerance of the linear solves if pressures follow from positions: K/mu amplifies errors of the pressure equations.
 _WITH_PRESSURES = 1e-6
-#: Tolerance with which a surrogate body is untangled.
+#: Tolerance of the minimisation that removes inversions with a surrogate law.
 _UNTANGLED = 1e-4
 
 
 class Minimum(NamedTuple):
-    """The last point of the minimisation."""
+    """Last iterate of the minimisation."""
 
     q: jax.Array
     code: jax.Array
     iterations: jax.Array
     linear_iterations: jax.Array
-    relative: jax.Array  # |r| over the norm of all forces
+    relative: jax.Array  # |r| divided by the norm of all forces
 
 
 class _Descent(NamedTuple):
@@ -56,14 +58,14 @@ class _Descent(NamedTuple):
     by: jax.Array
     definite: jax.Array  # number of iterations with a definite tangent until the true one is tried
     patience: jax.Array  # the next value of `definite`, if the true tangent fails again
-    indefinite: jax.Array  # the last true tangent was not positive
+    indefinite: jax.Array  # whether the last true tangent was not positive
     stuck: jax.Array
     iterations: jax.Array
     linear: jax.Array
 
 
 def minimise(problem: Problem, start: jax.Array, options: StepOptions) -> Minimum:
-    """A minimum of `problem.potential.energy` near `start` (n,), at the end of the step.
+    """Find a minimum of `problem.potential.energy` near `start` (n,), with the loads at the end of the step.
 
     Args:
         problem: `liverjax.solvers.problem.Problem` with a potential.
@@ -95,7 +97,7 @@ def _settled(problem: Problem, q: jax.Array) -> jax.Array:
 
 
 def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """A point near `start` without inverted elements, if one is found; number of nonlinear and linear iterations."""
+    """Try to find unknowns near `start` without inverted elements. Return them, and both numbers of iterations."""
     zero, potential = jnp.zeros((), jnp.int32), _potential(problem)
     surrogate = potential.surrogate
     if surrogate is None:
@@ -149,7 +151,7 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
 
 
 def _length(problem: Problem, c: _Descent, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
-    """The first of the factors 1, 1/2, 1/4, … on dq that reduces the energy; 0 if none of them does."""
+    """Return the first factor 1, 1/2, 1/4, … on dq that reduces the energy; 0 if none reduces it."""
     one, size = jnp.ones((), c.q.dtype), jnp.linalg.norm(c.r)
 
     def good(t):

@@ -1,6 +1,6 @@
-"""Newton's method with a line search and conjugate gradients or BiCGSTAB, differentiated implicitly at its root.
+"""Newton's method with a line search, and conjugate gradients or BiCGSTAB. The root is differentiated implicitly.
 
-The steps of a scene use `liverjax.solvers.step_cutting` instead: it can divide their load into parts.
+The steps of a scene use `liverjax.solvers.step_cutting` instead, which can divide the load of a step into parts.
 """
 
 from collections.abc import Callable
@@ -47,14 +47,14 @@ def newton_root(
     scale: Number,
     options: NewtonOptions = NewtonOptions(),
 ) -> tuple[jax.Array, NewtonStatistics]:
-    """Root of `residual`, a function of a flat vector (n,).
+    """Find a root of `residual`, a function of a flat vector (n,).
 
     Args:
-        residual: may close over traced parameters. The derivatives of the root with respect to them are exact (implicit
-            function theorem with the true tangent).
-        start: first guess; it has no derivative.
-        precondition: approximate inverse of the tangent; it has no derivative.
-        scale: force [N]; the tolerance is relative to it.
+        residual: the function may use traced parameters. The derivatives of the root with respect to these parameters
+            are exact (implicit function theorem with the true tangent).
+        start: first guess, without derivatives.
+        precondition: approximate inverse of the tangent, without derivatives.
+        scale: force [N]; the tolerance is relative to this force.
         options: tolerances and limits.
     """
 
@@ -71,7 +71,7 @@ def newton_root(
 
 
 class _Iterate(NamedTuple):
-    """State of the iteration: `q` is the best point so far, `q + t dq` the one to try next."""
+    """State of the iteration: `q` is the best point found, and `q + t dq` is the next trial point."""
 
     q: jax.Array
     r: jax.Array
@@ -84,9 +84,9 @@ class _Iterate(NamedTuple):
 
 
 def _halving_newton(residual, start, precondition, scale, options):
-    """Newton's method; a step is halved if |r| grows.
+    """Run Newton's method. A step is halved if |r| does not decrease.
 
-    The program has residual and tangent once: it compiles twice as fast.
+    The program contains residual and tangent only once, so it compiles twice as fast.
     """
     goal = options.tolerance * scale
     method = conjugate_gradients if options.symmetric else stabilised_biconjugate_gradients
@@ -104,7 +104,7 @@ def _halving_newton(residual, start, precondition, scale, options):
         converged = norm(r) <= goal
         spent = (c.iterations > options.max_iterations) | (halvings > options.max_halvings)
         done = converged | spent | ~jnp.isfinite(norm(r))
-        # Not stricter than the last Newton step needs, and not looser than the linear tolerance.
+        # The solve is not stricter than the last Newton step needs, and not looser than the linear tolerance.
         forcing = jnp.clip(0.1 * goal / norm(r), 1e-12, options.linear_tolerance)
         load = jnp.where(better & ~done, -r, jnp.zeros_like(r))  # a load of 0 needs no iteration
         dq, s = method(matvec, load, precondition, forcing, options.max_linear_iterations)

@@ -1,9 +1,9 @@
-"""Symmetric matrices of quadratic elements, stored as blocks at their integration points. Products need no assembly.
+"""Symmetric matrices of quadratic elements, stored as blocks at their integration points.
 
-At every point an element is like a linear element, but with other corners (`liverjax.mesh.shape_functions`). So its
-stiffness has 45 numbers per point. A product interpolates the motion to these corners, multiplies, and returns the
-forces to the nodes. For the vertices there is an assembled matrix of linear elements: the second level of the
-preconditioner.
+A matrix-vector product needs no assembled matrix. At every integration point, an element behaves like a linear element
+with other corners (`liverjax.mesh.shape_functions`). So its stiffness has 45 numbers per point. A product interpolates
+the motion to these corners, multiplies it by the blocks, and distributes the forces to the nodes. The second level of
+the preconditioner is an assembled matrix of linear elements on the vertices.
 """
 
 from collections.abc import Sequence
@@ -27,23 +27,23 @@ from liverjax.tensors.places import given
 
 
 class PointMatrix(NamedTuple):
-    """Derivative of the forces and, if there are pressures, of minus the balance of nodal volumes."""
+    """Derivative of the nodal forces and, if pressures are unknowns, of the negative balance of nodal volumes."""
 
     blocks: dict[tuple[int, int], Matrix]  # for corners 1 <= a <= b <= 3, arrays (Q, E) [N/m]
-    own: Block | None  # 3 x 3 arrays (V,) of physics at nodes; entries that are 0 are None
-    border: list[Vector] | None  # derivative of a point's volume by corners 1, 2, 3, arrays (Q, E) [m^2]
-    pressures: BlockMatrix | None  # of the pressures of the vertices [m^3/Pa]
+    own: Block | None  # 3 x 3 arrays (V,) of forces at nodes; entries that are 0 are None
+    border: list[Vector] | None  # d volume of a point / d corners 1, 2, 3; arrays (Q, E) [m^2]
+    pressures: BlockMatrix | None  # block of the vertex pressures [m^3/Pa]
 
 
 class Levels(NamedTuple):
-    """The parts of the preconditioner."""
+    """The two levels of the preconditioner."""
 
     diagonal: Block  # 3 x 3 of (V,)
     vertices: BlockMatrix  # the matrix for motions that are linear in every element
 
 
 def product(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Forces, as columns (V,), of a motion with columns (V,), at given pressures."""
+    """Nodal forces, as columns (V,), due to a motion with columns (V,) at constant pressures."""
     moved = stored(mesh.edges(columns))
     forces = [_force(A.blocks, k, moved) for k in (1, 2, 3)]
     result = mesh.spread(forces)
@@ -68,17 +68,17 @@ def volume_changes(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) 
 
 
 def pull(mesh: TetMesh, A: PointMatrix, pressures: jax.Array) -> tuple[jax.Array, ...]:
-    """Forces, as columns (V,), of pressures (V,) [Pa] at the vertices: the transpose of `volume_changes`."""
+    """Nodal forces, as columns (V,), due to vertex pressures (V,) [Pa]: the transpose of `volume_changes`."""
     assert A.border is not None
     p = interpolated(mesh, pressures)
     return tuple(mesh.spread([tuple(p * g for g in border) for border in A.border]))
 
 
 def levels(mesh: TetMesh, A: PointMatrix, bulk: Number | None = None) -> Levels:
-    """Diagonal blocks, and the matrix of linear elements of the vertices.
+    """Return the diagonal blocks of A, and the matrix of linear elements on the vertices.
 
     Args:
-        bulk: additional stiffness (Q, E) [Pa/m^3] against a change of a point's volume; None: no such stiffness.
+        bulk: (Q, E) additional stiffness [Pa/m^3] against volume changes at the points, or None.
     """
     blocks = A.blocks
     if bulk is not None and A.border is not None:
@@ -99,14 +99,15 @@ def levels(mesh: TetMesh, A: PointMatrix, bulk: Number | None = None) -> Levels:
 def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
     """Diagonal blocks, 3 x 3 arrays (V,).
 
-    The block of node a is the sum of c_ak K_kl c_al over elements, points and k, l = 1, 2, 3.
+    The block of node a is the sum of c_ak K_kl c_al over elements, points and k, l = 1, 2, 3. c_ak is the derivative of
+    function a with respect to the barycentric coordinate k, minus that with respect to coordinate 0.
     """
     c = basis(mesh.order).c
     slopes = c[:, 1:] - c[:, :1]
     weights = np.stack([slopes[:, a - 1] * slopes[:, b - 1] * (1 if a == b else 2) for a, b in sorted(blocks)], axis=1)
     matrix = jnp.asarray(weights.reshape(len(c), -1), mesh.points.dtype)
     entries = [(r, s) for r in range(3) for s in range(r, 3)]
-    # Symmetric part of each block: with weight 2 it stands for K_kl + K_lk.
+    # The symmetric part of a block K_kl, with weight 2, replaces K_kl + K_lk.
     symmetric = [
         jnp.stack([0.5 * (blocks[pair][r][s] + blocks[pair][s][r]) for r, s in entries], axis=1)
         for pair in sorted(blocks)
@@ -118,12 +119,12 @@ def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
 
 
 def _on_vertices(mesh: TetMesh, own: Block) -> Block:
-    """The blocks of physics at nodes, lumped to the vertices: each end of an edge gets half of its middle's part."""
+    """Lump the blocks of all nodes to the vertices: each end of an edge gets half of the block of the midside node."""
     return tuple(tuple(None if e is None else restricted(mesh, e) for e in row) for row in own)
 
 
 def restricted(mesh: TetMesh, column: jax.Array) -> jax.Array:
-    """The transpose of `prolonged`: it maps values at all nodes (V,) to the vertices."""
+    """Map values at all nodes (V,) to the vertices, by the transpose of `prolonged`."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     half = 0.5 * column[V : V + low.shape[0]]
     return given(given(column[:V], low, half), high, half)

@@ -1,4 +1,4 @@
-"""A coarse space for the linear solves: the affine motions of each of a few dozen patches of nodes.
+"""A coarse space for the preconditioner: affine motions of patches of nodes (`liverjax.mesh.adjacency.patches`).
 
 Block-Jacobi removes errors of short wavelength. The coarse space solves directly for motions that vary slowly over the
 body. The sum of both is a two-level Schwarz preconditioner (Smith, Bjorstad and Gropp 1996).
@@ -20,20 +20,22 @@ Columns = Sequence[jax.Array]
 
 
 class Coarse(NamedTuple):
-    """The inverse of a matrix that is restricted to the coarse space."""
+    """Inverse of a matrix that is restricted to the coarse space."""
 
     inverse: jax.Array  # (4 m P, 4 m P)
-    used: jax.Array  # False: the coarse space is left out
+    used: jax.Array  # False if the coarse space is not used
 
 
 def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coarse:
-    """The coarse space of the leading m x m blocks. It is 0 if its matrix is not positive definite or `used` is false.
+    """Make the coarse space of the leading m x m blocks of A.
+
+    Its inverse is 0 if `used` is false, or if the coarse matrix is not positive definite.
 
     Args:
         mesh: `TetMesh`.
-        A: the matrix; it has no derivative.
-        mask: (V, m) 1 where free: m = 3 for forces, 1 for a pressure.
-        used: whether the coarse space is worth its cost (see `worthwhile`).
+        A: the matrix.
+        mask: (V, m) 1 where free, else 0. m is 3 for forces and 1 for a pressure.
+        used: whether the coarse space saves time (see `worthwhile`).
     """
     f, number = mesh.pattern.patch_functions, mesh.pattern.number_of_patches
 
@@ -46,10 +48,10 @@ def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coar
 
 
 def _inverse(E: jax.Array) -> jax.Array:
-    """The inverse of a coarse matrix; 0 if it is not positive definite."""
+    """Inverse of a coarse matrix; 0 if the matrix is not positive definite."""
     d = jnp.diagonal(E)
-    # A patch that is flat, or has no free nodes along an axis, has motions that are 0. The added diagonal excludes
-    # them.
+    # In a patch that is flat or has no free nodes along an axis, some coarse motions are 0. The added diagonal
+    # excludes these motions.
     E = E + jnp.diag(jnp.where(d > 0, max(1e-9, 100 * float(jnp.finfo(d.dtype).eps)) * d, 1.0))
     factor = jax.scipy.linalg.cho_factor(E)
     inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(len(E), dtype=E.dtype))
@@ -57,9 +59,9 @@ def _inverse(E: jax.Array) -> jax.Array:
 
 
 def coarse_of_product(mesh: TetMesh, product: Callable[[jax.Array], jax.Array]) -> Coarse:
-    """The coarse space of a symmetric matrix of the vertices, given as a function.
+    """Make the coarse space of a symmetric matrix of the vertices that is given by its products with vectors (V,).
 
-    It needs one product per coarse motion.
+    One product is needed for each coarse motion.
     """
     f, patch, number = mesh.pattern.patch_functions, mesh.pattern.patches, mesh.pattern.number_of_patches
 
@@ -72,7 +74,7 @@ def coarse_of_product(mesh: TetMesh, product: Callable[[jax.Array], jax.Array]) 
 
 
 def worthwhile(A: BlockMatrix, inertia: Any) -> jax.Array:
-    """Whether slowly varying motions slow down block-Jacobi: if inertia is less than a thirtieth of the diagonal."""
+    """Whether the coarse space saves time: true if the sum of `inertia` is less than 1/30 of that of the diagonal."""
     if inertia is None:
         return jnp.array(True)
     total = sum(jnp.sum(A.diagonal[r][r]) for r in range(3)) / 3
@@ -80,7 +82,7 @@ def worthwhile(A: BlockMatrix, inertia: Any) -> jax.Array:
 
 
 def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Columns], Columns]:
-    """Z (Z^T A Z)^-1 Z^T, with the coarse motions Z, as a function of a vector's m columns (V,); `mask` is (V, m)."""
+    """Return the function v -> Z (Z^T A Z)^-1 Z^T v, with the coarse motions Z, for v with m columns (V,)."""
     f, patch = mesh.pattern.patch_functions.T, mesh.pattern.patches
     masks, number = mask.T, mesh.pattern.number_of_patches
     m = len(masks)
@@ -89,7 +91,7 @@ def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Colu
         weighted = jnp.stack([fk * free * r for fk in f for free, r in zip(masks, columns, strict=True)], axis=-1)
         sums = given(jnp.zeros((number, 4 * m), weighted.dtype), patch, weighted)
         motion = (coarse.inverse @ sums.ravel()).reshape(number, 4, m)
-        # Written out, since on XLA:CPU a sum over an axis of length four needs more time than everything else.
+        # The sum is written out: on XLA:CPU a sum over an axis of length four takes more time than everything else.
         return tuple(masks[i] * sum(f[k] * taken(motion[:, k, i], patch) for k in range(4)) for i in range(m))
 
     return apply
@@ -98,7 +100,7 @@ def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Colu
 def corrected(
     mesh: TetMesh, coarse: Coarse, mask: jax.Array, fine: Callable[[Columns], Columns]
 ) -> Callable[[Columns], Columns]:
-    """The preconditioner `fine` of columns, with the coarse solution added if the coarse space is used."""
+    """Return the preconditioner `fine` with the coarse solution added, if the coarse space is used."""
     apply = correction(mesh, coarse, mask)
 
     def both(columns):
@@ -108,7 +110,7 @@ def corrected(
 
 
 def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, number: int) -> jax.Array:
-    """Z^T A Z (4 m P, 4 m P): the sum over the edges, its transpose, and the diagonal blocks."""
+    """Coarse matrix Z^T A Z (4 m P, 4 m P): the sum over the edges, its transpose, and the diagonal blocks."""
     pattern, m = mesh.pattern, mask.shape[1]
     size = 4 * m * number
     low, high = pattern.edges

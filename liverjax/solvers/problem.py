@@ -1,4 +1,8 @@
-"""Input and output of the solvers of a step: the problem, limits, the tangent that is kept, and statistics."""
+"""Input and output of the solvers of a step: the equations, limits, the tangent that is used again, and statistics.
+
+q (n,) is the flat vector of unknowns. s is the fraction of the step's load: 0 at the beginning of the step, 1 at its
+end. r(q, s) is the residual.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,7 +14,7 @@ from liverjax.solvers.krylov import Earlier
 
 #: Maximum number of iterations of one linear solve.
 MOST_LINEAR_ITERATIONS = 3000
-#: Maximum tolerance of the linear solve for a direction.
+#: Maximum tolerance of the linear solve for a Newton direction.
 LINEAR_TOLERANCE = 5e-2
 
 
@@ -18,17 +22,17 @@ class StepStatistics(NamedTuple):
     """Statistics of one step. Every field is an array; under vmap it has one entry for each run."""
 
     status: jax.Array
-    iterations: jax.Array  # Newton iterations of all parts together
+    iterations: jax.Array  # Newton iterations of all parts of the load
     linear_iterations: jax.Array
-    cuts: jax.Array  # how often a part was halved
-    residual: jax.Array  # |r| over the norm of all forces
+    cuts: jax.Array  # how often a part of the load was halved
+    residual: jax.Array  # |r| divided by the norm of all forces
 
 
 class StepOptions(NamedTuple):
-    """Limits of a step's solver. All except the tolerance are fixed in the compiled program."""
+    """Limits of the solver of a step. All except the tolerance are fixed in the compiled program."""
 
     tolerance: float = 1e-8  # of |r|, relative to the norm of all forces
-    max_iterations: int = 25  # per part
+    max_iterations: int = 25  # per part of the load
     one_step: bool = False  # only one linear solve per step; its result has no correct derivatives
     max_halvings: int = 6
     max_cuts: int = 12
@@ -40,81 +44,88 @@ class Kept(NamedTuple):
     """The tangent of an earlier step. The next step uses it as long as the iterations converge fast."""
 
     tangent: Any
-    made: jax.Array  # False: there is no tangent yet
-    pace: jax.Array  # linear iterations per digit, when the preconditioner was new
+    made: jax.Array  # False if there is no tangent yet
+    pace: jax.Array  # linear iterations per digit of accuracy when the preconditioner was new
     worn: jax.Array  # whether the preconditioner now needs many more iterations
-    #: `surprise`: the last root minus its prediction. `trust`: which fraction of it the previous surprise predicted;
-    #: the next guess adds this fraction of `surprise`.
+    #: `surprise`: the last root minus its prediction. `trust`: the fraction of this vector that the surprise of the
+    #: step before predicted. The next guess adds `trust` times `surprise`.
     surprise: jax.Array
     trust: jax.Array
     beside: jax.Array | None = None  # the additional unknowns at the root (`Problem.beside`)
-    #: The last linear solves for derivatives; the next such solve begins with them. In a run they are zeros.
+    #: The last linear solves for derivatives: the next such solve begins with them. In the simulation they are zeros.
     adjoints: Earlier | tuple[()] = ()
 
 
 class Beside(NamedTuple):
-    """Additional unknowns, for which the residual solves at every q. A guess reduces the iterations of this solve."""
+    """Additional unknowns, for which `residual` solves at every q. A guess reduces the iterations of this solve."""
 
     before: jax.Array  # a guess at the beginning of the step
-    #: (q, s, guess) -> the additional unknowns at q.
+    #: Function (q, s, guess) -> the additional unknowns at q.
     solved: Callable[..., jax.Array]
-    #: (solution at a nearby q, factor on the usual tolerance) -> guess for `residual` and `solved`.
+    #: Function (solution at a nearby q, factor on the usual tolerance) -> guess for `residual` and `solved`.
     guess: Callable[[jax.Array, Number], tuple]
-    #: (q, solution) -> r and the residual of the equation of the additional unknowns. Both are differentiated together,
-    #: so that no inner solve is differentiated. If dr/dq is symmetric, the derivative of both together is symmetric.
+    #: Function (q, solution) -> r, and the residual of the equation of the additional unknowns. Both are differentiated
+    #: together, so that no inner solve is differentiated. If dr/dq is symmetric, this joint derivative is symmetric.
     lack: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 class Problem(NamedTuple):
-    """Equations of a step, and functions that solve their linear systems."""
+    """Equations of a step, and functions that solve the linear systems of these equations."""
 
-    #: (q, s) -> (r, force, by): r is a flat vector (n,); `force` is the norm of all forces, with which r is compared;
-    #: `by` is data for `tangent`. It may close over traced parameters; derivatives are exact at the root. With a
-    #: `beside`, `by` is its solution, and a third argument is a guess for this solution.
+    #: Function (q, s) -> (r, force, by). r is the residual (n,), `force` is the norm of all forces for the relative
+    #: residual, and `by` is data for `tangent`. The function may use traced parameters; derivatives are exact at the
+    #: root. With a `beside`, `by` is the solution for the additional unknowns, and a third argument is a guess for it.
     residual: Callable[..., tuple[jax.Array, jax.Array, Any]]
-    #: (q, s, by, near) -> any pytree that represents dr/dq; it is used again while iterations converge fast with it.
-    #: `near` is None or a pair (flag, earlier tangent): the flag says whether parts of this tangent can be used.
+    #: Function (q, s, by, near) -> any pytree that represents dr/dq. This tangent is used again while iterations
+    #: converge fast. `near` is None or a pair (flag, earlier tangent): the flag shows whether parts of this tangent can
+    #: be used.
     tangent: Callable[[jax.Array, jax.Array, Any, Any], Any]
-    #: (tangent, b, tolerance, max_iterations) -> (x with dr/dq x = b, iterations, whether dr/dq seems to be positive).
+    #: (tangent, b, tolerance, max_iterations) -> (x with dr/dq x = b, iterations, whether dr/dq seems positive
+    #: definite).
     solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array, jax.Array]]
-    #: tangent -> approximate inverse of dr/dq, for derivatives.
+    #: Function tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
     #: For derivatives, if dr/dq is symmetric: (tangent, b, tolerance, max_iterations, earlier solves) -> solution with
-    #: the exact dr/dq, its load, and its residual over the norm of the load. With a `beside`, b and the solution are
-    #: for both together (`Beside.lack`), and the load is what remains of b after the elimination of `beside`. None:
-    #: derivatives use products with dr/dq.
+    #: the exact dr/dq, its load, and its residual divided by the norm of the load. With a `beside`, b and the solution
+    #: contain q and the additional unknowns (`Beside.lack`). The load is then what remains of b after the elimination
+    #: of the additional unknowns. None: derivatives use products with dr/dq.
     adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
     #: Whether dr/dq is symmetric.
     symmetric: bool = True
     #: Whether r depends on s.
     moved: bool = True
-    #: |r| that the rounding of q causes.
+    #: The norm |r| that the rounding of q causes.
     roundoff: Any = 0.0
     beside: Beside | None = None
     #: Whether dr/dq can jump, for example where contact begins.
     kinks: bool = False
-    #: The energy that is minimised if the load cannot be followed; None: nothing is minimised.
+    #: The energy that is minimised if Newton's method along the load fails; None: nothing is minimised.
     potential: "Potential | None" = None
-    #: A pytree of all numbers on which r depends, except q and s: the root has derivatives with respect to them.
+    #: A pytree of all numbers on which r depends, except q and s. The root has derivatives with respect to these
+    #: numbers.
     numbers: Any = None
 
 
 class Potential(NamedTuple):
-    """The energy of a step, for steps whose load cannot be followed."""
+    """Energy of a step. It is minimised if Newton's method along the load fails."""
 
-    #: (q, start) -> energy. Its gradient at start is r(start, 1). Forces without an energy keep their values at start.
+    #: Function (q, start) -> energy. Its gradient at start is r(start, 1). Forces without an energy keep their values
+    #: at start.
     energy: Callable[[jax.Array, jax.Array], jax.Array]
-    #: As `Problem.tangent`, but without negative eigenvalues; with a fifth argument that is false, the true tangent.
+    #: As `Problem.tangent`, but without negative eigenvalues. If a fifth argument is false, the true tangent is
+    #: returned.
     definite: Callable[..., Any]
-    #: (q, s) -> minimum J of the elements. It is 0 or negative if elements are inverted.
+    #: Function (q, s) -> minimum volume ratio J of the elements, which is 0 or negative if elements are inverted.
     volume: Callable[[jax.Array, Any], jax.Array]
-    #: The problem of a body with a finite energy for inverted elements; None if this body already has such an energy.
+    #: The problem of the body with another law, with a finite energy in inverted elements. None if the law of the body
+    #: already has such an energy.
     surrogate: Problem | None
-    #: The shape from which loads are followed if the start is a guess, and whether it is a guess; None: never a guess.
+    #: A pair: unknowns from which the load is followed if the start is only a guess, and whether the start is a guess.
+    #: None: the start is never a guess.
     rest: tuple[jax.Array, jax.Array] | None
-    #: q -> q with the optimal pressures for its positions; None: pressures are not unknowns.
+    #: Function q -> q with the optimal pressures for its positions; None if pressures are not unknowns.
     settled: Callable[[jax.Array], jax.Array] | None = None
-    #: Number of unknowns that are positions; None: all.
+    #: Number of unknowns that are positions; None: all unknowns are positions.
     positions: int | None = None
-    #: Whether a solve with a definite tangent eliminates the pressures: then it needs no stricter tolerance.
+    #: Whether a solve with a definite tangent eliminates the pressures. Such a solve needs no stricter tolerance.
     eliminates: bool = False

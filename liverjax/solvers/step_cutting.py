@@ -1,10 +1,10 @@
-"""Newton's method along a load: it follows the solution from the last equilibrium, in parts if the whole load fails.
+"""Newton's method along a load: the solution is followed from the last equilibrium, if necessary in parts of the load.
 
-The residual r(q, s) has the loads and prescribed motion of the step's beginning at s = 0, and of its end at s = 1.
-Out-of-balance forces at the beginning (inertia, a fluid) are reduced linearly: r - (1 - s) r(start, 0) is 0 where a
-step begins. Every part begins with a solve with the tangent at its beginning and the load -(r + dr/ds ds). So a
-prescribed motion enters through the tangent and not as a jump. If a part fails, it is halved. Only the root at s = 1
-counts, and derivatives are derivatives of this root.
+The residual r(q, s) contains the loads and prescribed motions at the beginning of the step for s = 0, and at its end
+for s = 1. Out-of-balance forces at the beginning (inertia, a fluid) are reduced linearly: r - (1 - s) r(start, 0) is 0
+at the beginning of the step. Every part ds begins with a linear solve, with the tangent at its beginning and the load
+-(r + dr/ds ds). So a prescribed motion enters through the tangent and not as a jump. If a part fails, it is halved.
+Only the root at s = 1 is returned and differentiated.
 """
 
 from functools import partial
@@ -28,27 +28,29 @@ from liverjax.solvers.problem import (
     StepStatistics,
 )
 
-#: A step without further progress is at roundoff if its residual is below this multiple of the precision (in float32
-#: 5e-4 of the forces; measured: 1e-4), or of the effect of rounded positions. Then shorter steps do not help.
+#: If Newton's method makes no progress, the residual counts as roundoff in two cases. It is below _PRECISIONS times the
+#: precision (in float32 5e-4 of the forces; measured: 1e-4), or below _ROUNDINGS times the effect of rounded positions.
+#: Then shorter steps do not help.
 _PRECISIONS, _ROUNDINGS = 4096, 8
 
-#: If the residual has kinks and halving does not help, the full direction is taken, at most this many times per part:
-#: the tangent is different beyond a kink.
+#: If the derivative of the residual can jump (kinks) and halving does not help, the full direction is taken, at most
+#: this many times per part. The tangent is different beyond a kink.
 _LEAPS = 8
 
-#: A guess is not used if an element has less than this fraction of its volume: it may lead to a folded shape.
+#: A guess is not used if an element has less than this fraction of its volume: the guess may lead to a folded shape.
 _FLAT = 0.1
 
-#: Maximum tolerance of the direction of a one-step solve.
+#: Maximum tolerance of the linear solve if there is only one per step.
 _ONE_STEP = 1e-4
 #: If |r| does not decrease by this factor in an iteration, a new tangent is made.
 _CONTRACTION = 0.15
-#: If the linear iterations per digit exceed this multiple of their first value, a new preconditioner is made.
+#: If the linear iterations per digit of accuracy exceed this multiple of their first value, a new preconditioner is
+#: made.
 _WEAR = 1.2
-#: Tolerance of the solves for derivatives, over the tolerance of the step.
+#: Tolerance of the solves for derivatives, divided by the tolerance of the step.
 _ADJOINT = 0.1
 
-#: Name of a step's root for checkpoints: if reverse mode keeps the root, the iterations are not repeated.
+#: Name of the root of a step for checkpoints: if reverse mode keeps the root, the iterations are not repeated.
 ROOT = "root"
 
 
@@ -57,9 +59,9 @@ class _Point(NamedTuple):
     size: jax.Array  # |r| there
     aim: jax.Array  # |load| for the last direction
     kept: Kept
-    beside: jax.Array | None  # additional unknowns there (`Problem.beside`); None: there are none
+    beside: jax.Array | None  # additional unknowns there (`Problem.beside`), or None
     looser: jax.Array  # factor on the tolerance of the next solve for `beside`
-    indefinite: jax.Array  # the tangent of the last solve was not positive
+    indefinite: jax.Array  # whether the tangent of the last solve was not positive definite
     stale: jax.Array  # dq comes from a tangent that was made before q
     remake: jax.Array  # the next evaluation is at q again, for a new tangent
     dq: jax.Array
@@ -87,7 +89,7 @@ def nothing_kept(problem: Problem, start: jax.Array) -> Kept:
     zero = jnp.zeros((), start.dtype)
     made = jax.eval_shape(lambda q: problem.tangent(q, zero, problem.residual(q, zero)[2], None), start)
     no, beside = jnp.array(False), None if problem.beside is None else problem.beside.before
-    # Solves for derivatives begin with earlier solves only if the matrix is symmetric (equal to its transpose).
+    # Solves for derivatives use earlier solves only if the matrix is symmetric (equal to its transpose).
     both = start if beside is None else jnp.concatenate([start, beside])
     adjoints = () if problem.adjoint is None else no_earlier(start, both)
     empty = (jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), a) for a in (made, beside))
@@ -103,13 +105,13 @@ def solve(
     kept: Kept | None = None,
     near: Any = None,
 ) -> tuple[jax.Array, StepStatistics, Kept]:
-    """Root in q of r(q, 1), followed from `start` (n,) at s = 0; first from `guess`, if given.
+    """Find the root q of r(q, 1), followed from `start` (n,) at s = 0. If `guess` is given, it is tried first.
 
-    Both have no derivatives.
+    `start` and `guess` have no derivatives.
 
-    Returns the root, the statistics, and the tangent for the next step. `kept` is the tangent of the last step, `near`
-    a tangent for derivatives. If the problem has an `adjoint`, the `beside` of the result is differentiated together
-    with the root.
+    Returns the root, the statistics, and the tangent for the next step. `kept` is the tangent of the last step, and
+    `near` is a nearby tangent for derivatives. If the problem has an `adjoint`, the `beside` of the result is
+    differentiated together with the root.
     """
     start = jax.lax.stop_gradient(start)
     guess = predicted = None if guess is None else jax.lax.stop_gradient(guess)
@@ -129,7 +131,7 @@ def solve(
         if problem.beside is not None:
             kept = kept._replace(beside=problem.beside.solved(root, one, problem.beside.guess(kept.beside, 1.0)))
         # Counts and node numbers are returned as floating-point numbers: implicit differentiation gives every output a
-        # tangent, and jax 0.10 refuses tangents of integers.
+        # tangent, and jax 0.10 raises an error for tangents of integers.
         return root, (statistics, jax.tree.map(lambda a: a.astype(start.dtype), kept))
 
     def found(start):
@@ -140,8 +142,8 @@ def solve(
         guessing = jnp.array(guess is not None)
         return _follow(problem, start, start if guess is None else guess, guessing, kept, options)
 
-    # Two rules: the search has no derivative, and the derivative of the root uses the tangent at the root. The first
-    # rule needs any function with a constant root.
+    # Two derivative rules: the search has no derivative, and the derivative of the root uses the tangent at the root.
+    # For the first rule, any function with a constant root is enough.
     if options.differentiable:
         found_by = jax.lax.custom_root(lambda q: q, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     else:
@@ -158,7 +160,7 @@ def solve(
 
 
 def _foretold(vector: jax.Array, before: jax.Array) -> jax.Array:
-    """Fraction (0 to 1) of a vector that the previous vector predicted."""
+    """Fraction (0 to 1) of `vector` that the vector `before` of the last step predicted."""
     square = jnp.vdot(before, before)
     return jnp.clip(jnp.vdot(vector, before) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
 
@@ -171,10 +173,10 @@ def _with_derivative(
     tolerance: Number,
     near: Any,
 ) -> tuple[jax.Array, jax.Array | None, Earlier | tuple[()]]:
-    """The root q and `beside` with the derivatives of a root, and solves with which the next derivative begins.
+    """Return the root q and `beside` with implicit derivatives, and solves with which the next derivative begins.
 
-    These solves must be carried from step to step. So they are additional unknowns, equal to `last`. Forward mode
-    carries them to the next step, and reverse mode to the previous step.
+    These solves must be carried from step to step. So they are treated as additional unknowns that are equal to `last`.
+    Forward mode carries them to the next step, and reverse mode to the previous step.
     """
     one, n = jnp.ones((), q.dtype), len(q)
     both, lacking = q, None
@@ -210,7 +212,7 @@ def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
     """Return q. A derivative through this function is NaN on purpose: a correct derivative never passes through it.
 
     Up to jax 0.10, the reverse-mode derivative of a derivative of a loop does not use the derivative rule of a root
-    (jax 0.11.2 does). It would treat the root as a constant, and give a wrong number without a warning.
+    (jax 0.11.2 does). That derivative would treat the root as a constant, and be wrong without a warning.
     """
     leaves = [jnp.ravel(leaf)[:1] for leaf in jax.tree.leaves(problem.numbers)]
     some = [leaf for leaf in leaves if leaf.size and jnp.issubdtype(leaf.dtype, jnp.floating)]
@@ -222,14 +224,14 @@ def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
 
 
 def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Array | None, looser: Number) -> tuple:
-    """The residual at q. Its solve for `beside` begins at the solution of a nearby point."""
+    """Residual at q. The solve for the additional unknowns begins with `beside`, their values at a nearby point."""
     if problem.beside is None or beside is None:
         return problem.residual(q, s)
     return problem.residual(q, s, problem.beside.guess(beside, looser))
 
 
 def _one_step(problem: Problem, start: jax.Array, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
-    """A single linear solve from the beginning of the step (chapter, section 4.1.2), with the chosen stiffness."""
+    """Do one linear solve from the beginning of the step (chapter, section 4.1.2), with the chosen stiffness."""
     if problem.potential is not None:
         problem = problem._replace(tangent=problem.potential.definite)
     zero, one = jnp.zeros((), start.dtype), jnp.ones((), start.dtype)
@@ -266,8 +268,8 @@ def _robust(
 ) -> tuple[jax.Array, jax.Array]:
     """Follow the load. If this fails, or if elements are inverted at the beginning, minimise the energy.
 
-    Without inertia another start than the reference shape is only a guess. If it is nearly flat or leads to no
-    solution, the load is followed from the reference shape.
+    Without inertia, a start that is not the reference shape is only a guess. If an element of the guess is nearly flat,
+    or if the guess leads to no solution, the load is followed from the reference shape.
     """
     zero = jnp.zeros((), start.dtype)
     nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
@@ -336,17 +338,17 @@ def _first_point(
 class _Verdict(NamedTuple):
     """The decision that follows from the residual at a trial point."""
 
-    accepted: jax.Array  # the point is the best of its part so far, or the beginning of a part
+    accepted: jax.Array  # the point is the best found in its part, or the beginning of a part
     better: jax.Array
     converged: jax.Array  # at the end of a part
     arrived: jax.Array  # at the end of the last part
     remake: jax.Array
     failed: jax.Array
-    lost: jax.Array  # the guess leads to no solution: without a cut, the last equilibrium is used next
+    lost: jax.Array  # the guess leads to no solution: the last equilibrium is tried next, and no cut is counted
     launch_now: jax.Array  # a new part begins at this point
     go_on: jax.Array  # a new direction is needed
     halvings: jax.Array
-    leap: jax.Array  # the full last direction is taken, for any |r| there
+    leap: jax.Array  # the full last direction is taken, even if |r| increases
     cuts: jax.Array
     done: jax.Array
 
@@ -360,7 +362,7 @@ def _judge(
     better = finite & ((size < c.size) | free | c.remake) & ~c.launch
     converged = better & (relative <= options.tolerance)
     arrived = converged & (s >= 1)
-    # If a direction of an earlier tangent does not help, it is not halved: first a new tangent is made.
+    # If a direction of an earlier tangent does not help, a new tangent is made first. The direction is not halved.
     remake = ~better & ~c.launch & c.stale
     halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
     small = (c.relative <= _PRECISIONS * float(jnp.finfo(size.dtype).eps)) | (c.size <= _ROUNDINGS * problem.roundoff)
@@ -409,7 +411,8 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         load = load - jax.lax.cond(v.launch_now, lambda: ds * _along(problem, trial, s), lambda: jnp.zeros_like(r))
     slow = c.remake | (size > _CONTRACTION * c.aim)
     renew = (v.launch_now & (~c.guessing | ~c.kept.made)) | (v.go_on & ~v.launch_now & slow)
-    # A direction is not solved more accurately than useful (Eisenstat and Walker 1996), or than the goal needs.
+    # The solve is not more accurate than is useful (Eisenstat and Walker 1996), or than the tolerance of the step
+    # needs.
     ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
     reach = 0.3 * jnp.where(renew, ratio**2, ratio)
     goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
@@ -448,12 +451,12 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     )
 
 
-#: Error of the solve for `beside`, over the expected residual after a direction.
+#: Error of the solve for the additional unknowns, divided by the residual that is expected after a direction.
 _BESIDE = 0.1
 
 
 def _looser(options: StepOptions, v: _Verdict, expected: jax.Array, before: jax.Array) -> jax.Array:
-    """Factor on the tolerance of the next solve for pressures, as large as the next residual allows.
+    """Factor on the tolerance of the next solve for the additional unknowns, as large as the next residual allows.
 
     At the beginning of a part the next residual is unknown, so the factor is 1.
     """
@@ -462,7 +465,7 @@ def _looser(options: StepOptions, v: _Verdict, expected: jax.Array, before: jax.
 
 
 def _along(problem: Problem, q: jax.Array, s: jax.Array) -> jax.Array:
-    """dr/ds: how prescribed motion and loads change the residual."""
+    """Derivative dr/ds of the residual: the effect of loads and prescribed motions."""
     return jax.jvp(lambda s: problem.residual(q, s)[0], (s,), (jnp.ones_like(s),))[1]
 
 
@@ -471,9 +474,9 @@ def _direction(
 ) -> tuple[jax.Array, jax.Array, Kept, jax.Array]:
     """Solve dr/dq dq = load with the tolerance `forcing`.
 
-    Return dq, the iterations, what is kept, and whether dr/dq is positive.
+    Return dq, the number of iterations, the new `kept`, and whether dr/dq seems positive definite.
 
-    `when` says whether a new tangent is made, and whether a solution is needed.
+    `when` contains two values: whether a new tangent is made, and whether a solution is needed.
     """
     near, (renew, wanted) = (kept.made & ~kept.worn, kept.tangent), when
     q, s, by = at

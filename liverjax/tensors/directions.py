@@ -1,4 +1,4 @@
-"""Directions of a material: fibres, and the axes of fibre and sheet."""
+"""Directions of a material: fibres, and orthogonal axes of fibre, sheet and normal."""
 
 import jax.numpy as jnp
 
@@ -8,7 +8,7 @@ from liverjax.tensors.matrices import IDENTITY, Matrix, Vector, add, cross, dot,
 
 
 def components(direction: Numbers | None, like: Number) -> Vector:
-    """A direction (3,), or one per element (E, 3), as the components of a unit vector in the precision of `like`."""
+    """Normalise a direction (3,), or one per element (E, 3). Return its components in the precision of `like`."""
     direction = jnp.asarray(direction, jnp.result_type(like))
     shape, elements = direction.shape, jnp.shape(like)
     if shape[-1:] != (3,) or (len(shape) > 1 and elements and shape[-2] != elements[-1]):
@@ -17,7 +17,7 @@ def components(direction: Numbers | None, like: Number) -> Vector:
 
 
 def orthogonal_axes(fibre: Numbers | None, sheet: Numbers | None, like: Number) -> Matrix:
-    """Columns fibre, sheet (made orthogonal to the fibre) and normal; without a fibre the coordinate axes.
+    """Matrix with columns fibre, sheet (made orthogonal to the fibre), normal. Without a fibre: the coordinate axes.
 
     The directions have the form that `components` accepts.
     """

@@ -1,6 +1,7 @@
 """Stress and stiffness in material axes A (columns a_m): principal directions, or fibre, sheet and normal.
 
-With f_m = F a_m and D' = A^T D, the material part of the stiffness of two nodes is sum_mn kappa_mn f_m (x) f_n.
+With f_m = F a_m, the material part of the stiffness between two nodes is sum_mn kappa_mn f_m (x) f_n. The coefficients
+kappa_mn contain the moduli and the shape vectors D' = A^T D of the two nodes in these axes.
 """
 
 from typing import Any
@@ -16,24 +17,24 @@ SIX = ((0, 0), (1, 1), (2, 2), *PAIRS)
 
 
 def symmetric(six: tuple) -> Matrix:
-    """Six components 11, 22, 33, 12, 13, 23 as a matrix."""
+    """Symmetric matrix with the six components 11, 22, 33, 12, 13, 23."""
     xx, yy, zz, xy, xz, yz = six
     return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
 
 
 def six_of(S: Matrix) -> tuple:
-    """A symmetric matrix as its components 11, 22, 33, 12, 13, 23."""
+    """Components 11, 22, 33, 12, 13, 23 of a symmetric matrix."""
     return tuple(S[i][j] for i, j in SIX)
 
 
 def rotated(S: Matrix, A: Matrix) -> Matrix:
-    """A S A^T for a symmetric S; only its six entries are computed."""
+    """Product A S A^T for a symmetric S; only its six different entries are computed."""
     AS = matmul(A, S)
     return symmetric(tuple(dot(AS[i], A[j]) for i, j in SIX))
 
 
 def orthotropic(normal: Matrix, shear: Vector, a: Vector, b: Vector) -> Matrix:
-    """kappa of nodes with shape vectors a and b, for moduli C_mmnn = `normal`, C_mnmn = `shear` (pairs 12, 13, 23)."""
+    """Coefficients kappa for shape vectors a, b and moduli C_mmnn (`normal`) and C_mnmn (`shear`: pairs 12, 13, 23)."""
     kappa = [[normal[m][n] * (a[m] * b[n]) for n in range(3)] for m in range(3)]
     for (m, n), G in zip(PAIRS, shear, strict=True):
         kappa[m][n] = kappa[m][n] + G * (a[n] * b[m])
@@ -47,7 +48,10 @@ _INDEX = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
 
 
 def half_contracted(moduli: Any, b: Vector) -> list:
-    """T_mpn = sum_q C_mpnq b_q with 6 x 6 moduli in the order of `SIX`: the part of one node in `anisotropic`."""
+    """Sums T_mpn = sum_q C_mpnq b_q for `anisotropic`, with 6 x 6 moduli in the order of `SIX`.
+
+    b is the shape vector of the second node.
+    """
     return [
         [[_contract([moduli[_INDEX[m][p]][_INDEX[n][q]] for q in range(3)], b) for n in range(3)] for p in range(3)]
         for m in range(3)
@@ -55,12 +59,12 @@ def half_contracted(moduli: Any, b: Vector) -> list:
 
 
 def anisotropic(T: list, a: Vector) -> Matrix:
-    """kappa_mn = sum_p a_p T_mpn: a is the shape vector of the first node, T is `half_contracted` of the second."""
+    """Coefficients kappa_mn = sum_p a_p T_mpn, with the shape vector a of the first node and T of `half_contracted`."""
     return tuple(tuple(_contract([T[m][p][n] for p in range(3)], a) for n in range(3)) for m in range(3))
 
 
 def _contract(values: list, a: Vector) -> jax.Array:
-    """Scalar product without the components of `a` that are the number 0, for example in coordinate directions."""
+    """Scalar product without the terms in which `a` is the Python number 0, for example in coordinate directions."""
     terms = [v if isinstance(c, float) and c == 1 else v * c for v, c in zip(values, a, strict=True) if not _is_zero(c)]
     return sum(terms[1:], terms[0])
 
@@ -70,5 +74,5 @@ def _is_zero(c: Number) -> bool:
 
 
 def pushed(FA: Matrix, kappa: Matrix) -> Matrix:
-    """sum_mn kappa_mn f_m (x) f_n."""
+    """Sum of kappa_mn f_m (x) f_n over m and n; f_m are the columns of F A."""
     return matmul(stored(matmul(FA, kappa)), transpose(FA))

@@ -1,4 +1,4 @@
-"""Deformation gradients and invariants; every component is an array over the elements.
+"""Deformation gradients and invariants. Every component is an array over the elements.
 
 A vector is a tuple of three arrays (E,), and a matrix is a tuple of three such rows. In this form XLA vectorises over
 the elements. It does not vectorise batched 3 x 3 products (tiny matrices, no fusion).
@@ -19,11 +19,11 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Invariants(NamedTuple):
-    """The strain measures (E,) on which a strain energy depends; `None`: the law does not use this measure."""
+    """Strain measures (E,) on which a strain energy depends. A measure that the law does not use is None."""
 
     I1: Any = None  # tr C
     I2: Any = None  # (I1^2 - tr C^2) / 2
-    I4: jax.Array | None = None  # a . C a of the law's fibre direction a
+    I4: jax.Array | None = None  # a . C a with the fibre direction a of the law
     J: Any = None  # det F
     stretches: Any = None  # `liverjax.tensors.principal.Stretches`
     E: Any = None  # Green's strain, a tuple matrix in the axes of the law
@@ -71,26 +71,26 @@ def matmul(A: Matrix, B: Matrix) -> Matrix:
 
 
 def cofactor(F: Matrix) -> Matrix:
-    """cof F = J F^-T from three cross products of the columns of F. It needs no inverse and is finite at J = 0."""
+    """Cofactor cof F = J F^-T, from cross products of the columns of F. It needs no inverse and is finite at J = 0."""
     c0, c1, c2 = transpose(F)
     return transpose((cross(c1, c2), cross(c2, c0), cross(c0, c1)))
 
 
 def determinant(F: Matrix) -> jax.Array:
-    """J = det F."""
+    """Determinant J = det F."""
     c0, c1, c2 = transpose(F)
     return dot(c0, cross(c1, c2))
 
 
 def right_cauchy_green(F: Matrix) -> Matrix:
-    """C = F^T F; only its six different entries are computed."""
+    """Right Cauchy-Green tensor C = F^T F; only its six different entries are computed."""
     c = transpose(F)
     xx, yy, zz, xy, xz, yz = (dot(c[a], c[b]) for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
     return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
 
 
 def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
-    """The invariants among I1, I2 and J that are in `names`."""
+    """Compute the invariants among I1, I2 and J that are in `names`."""
     values = {}
     if "I1" in names or "I2" in names:
         values["I1"] = sum(dot(row, row) for row in F)
@@ -103,38 +103,38 @@ def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
 
 
 def green_strain(FA: Matrix) -> Matrix:
-    """E = (C - Id) / 2 in the axes A, from F A."""
+    """Green's strain E = (C - Id) / 2 in the axes A, from the product F A."""
     C = right_cauchy_green(FA)
     return tuple(tuple(0.5 * (C[i][j] - (1.0 if i == j else 0.0)) for j in range(3)) for i in range(3))
 
 
 def outer(a: Vector, b: Vector) -> Matrix:
-    """a (x) b."""
+    """Tensor product a (x) b."""
     return tuple(scale(x, b) for x in a)
 
 
 def unit(a: Vector) -> Vector:
-    """a / |a|."""
+    """Unit vector a / |a|."""
     return scale(1 / jnp.sqrt(dot(a, a)), a)
 
 
 def add_matrices(A: Matrix, B: Matrix) -> Matrix:
-    """A + B."""
+    """Sum A + B of two matrices."""
     return tuple(add(a, b) for a, b in zip(A, B, strict=True))
 
 
 def unpack(F: jax.Array) -> Matrix:
-    """Array (..., 3, 3) to a tuple matrix of arrays (...)."""
+    """Convert an array (..., 3, 3) to a tuple matrix of arrays (...)."""
     return tuple(tuple(F[..., i, j] for j in range(3)) for i in range(3))
 
 
 def pack(A: Matrix) -> jax.Array:
-    """Tuple matrix of arrays (...) to an array (..., 3, 3)."""
+    """Convert a tuple matrix of arrays (...) to an array (..., 3, 3)."""
     return jnp.stack([jnp.stack(jnp.broadcast_arrays(*row), axis=-1) for row in A], axis=-2)
 
 
 def stored(values: T) -> T:
-    """The same pytree, written to memory. A branch prevents XLA:CPU from computing it again for every use.
+    """Return the same pytree, written to memory. A branch prevents XLA:CPU from computing it again for every use.
 
     The leaves are numbers or arrays; at least one of them is not empty.
     """
@@ -145,13 +145,13 @@ def stored(values: T) -> T:
 
 
 def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
-    """F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3, since the shape vectors of an element add up to zero.
+    """F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3, because the shape vectors D of an element add up to zero.
 
-    Entries are (E,), or (Q, E) if elements have Q points (`TetMesh.edges`).
+    The entries of F are (E,), or (Q, E) if elements have Q points (`TetMesh.edges`).
 
     Args:
         mesh: `TetMesh`.
-        x: current positions (V, 3) [m]. Another field (V, 3) works as well: the result is its gradient.
+        x: current positions (V, 3) [m]. For another field (V, 3), the result is the gradient of that field.
 
     Raises:
         InputError: x has another shape. Without this check, an index that is too large would silently read the last

@@ -1,4 +1,4 @@
-"""Read and add at node or edge numbers of a mesh. These numbers are valid, so the program does not check them."""
+"""Read array entries, or add to entries, at node or edge numbers. These numbers are valid and are not checked."""
 
 import jax
 

@@ -1,12 +1,13 @@
 """Principal stretches and sums of their powers, with derivatives that also exist if stretches are equal.
 
-Xi(alpha) = sum_m lambda_m^alpha = tr C^(alpha/2) is a smooth function of C, although the eigenvectors of C are not. So
-the eigenvectors are frozen. In their axes C = diag(c) + X, where X is zero but has derivatives, and
+For the principal stretches lambda_m, Xi(alpha) = sum_m lambda_m^alpha = tr C^(alpha/2) is a smooth function of C,
+although the eigenvectors of C are not. So the eigenvectors are held constant in derivatives. In their axes
+C = diag(c) + X, where X is zero but has derivatives, and
 
     tr (C + X)^q = sum f(c_i) + sum g[c_i] X_ii + 1/2 sum g[c_i, c_j] X_ij^2 + 1/3 sum g[c_i, c_j, c_k] X_ij X_jk X_ki
 
-with f(c) = c^q, g = f' and the divided differences of g (Daleckii and Krein 1965). This is exact up to the third
-derivative.
+with q = alpha/2, f(c) = c^q, g = f' and the divided differences g[...] (Daleckii and Krein 1965). This expansion is
+exact up to the third derivative.
 """
 
 import math
@@ -20,7 +21,7 @@ from liverjax.core.struct import Number
 from liverjax.tensors.material_axes import PAIRS, SIX, rotated, six_of, symmetric
 from liverjax.tensors.matrices import Matrix, Vector, determinant, dot, matvec, right_cauchy_green, transpose
 
-#: Number of cyclic Jacobi sweeps. After four, off-diagonal entries were at roundoff in all matrices that were tried.
+#: Number of cyclic Jacobi sweeps. After four sweeps, off-diagonal entries were roundoff in all tested matrices.
 SWEEPS = 5
 
 
@@ -28,14 +29,15 @@ class Stretches(NamedTuple):
     """Principal stretches of F. In derivatives `logs` are constants; `change` and `log_J` are not."""
 
     logs: Vector  # ln lambda_m
-    change: tuple  # X: `change` in principal axes
+    change: tuple  # X: result of `change`, in principal axes
     log_J: jax.Array  # NaN for J < 0: isochoric stretches do not exist there
 
 
 def principal(F: Matrix) -> tuple[Vector, Matrix]:
-    """ln lambda_m and the columns n_m. C = F^T F is diagonalised by Jacobi rotations, without LAPACK.
+    """Logarithms ln lambda_m of the principal stretches, and the matrix with the principal directions n_m as columns.
 
-    The stretches are |F n_m|, so that a small stretch has a good relative accuracy even if others are large.
+    C = F^T F is diagonalised by Jacobi rotations, without LAPACK. The stretches are |F n_m|, so that a small stretch
+    has a good relative accuracy even if others are large.
     """
     F = jax.lax.stop_gradient(F)
     axes = symmetric_axes(right_cauchy_green(F))
@@ -91,7 +93,7 @@ def stretches(F: Matrix) -> Stretches:
 
 
 def change(F: Matrix, orders: int) -> tuple:
-    """Six entries of C minus their value: they are zero, but may be differentiated `orders` times with respect to F."""
+    """Six entries of C minus their values: zeros that can be differentiated `orders` times with respect to F."""
     C = right_cauchy_green(F)
     return _counted(orders, tuple(C[i][j] for i, j in SIX))
 
@@ -109,14 +111,14 @@ def _(left, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _counted_one(left: int, C: tuple) -> jax.Array:
-    """The number 1, which may be differentiated `left` times. One more derivative would be wrong, so it is refused."""
+    """The number 1, which can be differentiated `left` times. One more derivative is wrong, so it raises an error."""
     return jnp.ones_like(C[0])
 
 
 @_counted_one.defjvp
 def _(left, primals, tangents):
     if left == 0:
-        raise NotImplementedError("stretch-based laws: derivatives with respect to positions go to the third order")
+        raise NotImplementedError("stretch-based laws: derivatives with respect to positions exist up to third order")
     return _counted_one(left, *primals), 0.0 * _counted_one(left - 1, *primals) * sum(tangents[0])
 
 
@@ -124,7 +126,7 @@ def _(left, primals, tangents):
 
 
 def power_sum(s: Stretches, alpha: Number) -> jax.Array:
-    """sum_m (J^(-1/3) lambda_m)^alpha - 3, without cancellation at rest."""
+    """Sum over m of (J^(-1/3) lambda_m)^alpha, minus 3; without cancellation error in the undeformed state."""
     return _power_sum(jnp.asarray(alpha, jnp.result_type(s.log_J)), s.logs, s.change, s.log_J)
 
 
@@ -143,7 +145,7 @@ _PAIRS_OF_NODES = ((0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1))  # i, j of g[i, i, j]
 
 
 def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -> jax.Array:
-    """The expansion in this module's docstring for (J^(-1/3) lambda)^alpha, differentiable in alpha, X and ln J.
+    """Expansion of the module docstring for (J^(-1/3) lambda)^alpha, differentiable with respect to alpha, X and ln J.
 
     Divided differences of one kind are stacked in one array. So only a tenth of the operations is compiled.
     """
@@ -169,7 +171,7 @@ def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -
 
 
 def divided_difference(p: Number, *logs: Number) -> jax.Array:
-    """Divided difference of c^p at one, two or three nodes c = exp(log). It is accurate for close or equal nodes."""
+    """Divided difference of c^p at one, two or three nodes c = exp(log), also accurate for close or equal nodes."""
     if len(logs) == 1:
         return jnp.exp(p * logs[0])
     if len(logs) == 2:
@@ -200,12 +202,12 @@ def _divided_power(p: Any, y: list) -> Number:
 
 
 def sinh_ratio(p: Number, delta: Number) -> jax.Array:
-    """sinh(p delta) / sinh(delta), which is p at delta = 0."""
+    """Ratio sinh(p delta) / sinh(delta), which is p at delta = 0."""
     return p * _sinhc(p * delta) / _sinhc(delta)
 
 
 def _sinhc(x: Number) -> Any:
-    """sinh(x)/x; for |x| < 1 by its series (last term 1/19!)."""
+    """Function sinh(x)/x. For |x| < 1 its power series is used (last coefficient 1/19!)."""
     square = x * x
     near = square < 1
     small: jax.Array = jnp.where(near, square, 0.0)

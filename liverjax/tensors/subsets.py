@@ -1,6 +1,4 @@
-"""Subsets of elements that are computed separately: select the numbers of a subset, and join the numbers of all
-subsets.
-"""
+"""Subsets of elements that are computed separately: select the values of a subset, and join those of all subsets."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -16,8 +14,8 @@ T = TypeVar("T")
 class Subsets(NamedTuple):
     """A partition of the elements: every element is in exactly one subset."""
 
-    elements: tuple[jax.Array, ...]  # element numbers (1, n) of each subset; no parameters by element have this shape
-    places: jax.Array  # place of each element if all subsets are joined: (E,), or (1, E) with several points
+    elements: tuple[jax.Array, ...]  # element numbers (1, n) of each subset; no array of element values has this shape
+    places: jax.Array  # position of each element in the joined subsets: (E,), or (1, E) with several points
 
     @property
     def number_of_elements(self) -> int:
@@ -26,7 +24,7 @@ class Subsets(NamedTuple):
 
 
 def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
-    """Make subsets: first the elements without a group, if there are any, then each group.
+    """Make subsets: first the elements without a group, if any, then each group.
 
     Args:
         groups: element numbers (n,) of groups without common elements; they may be traced.
@@ -43,7 +41,7 @@ def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
 
 
 def in_subset(s: Subsets, k: int, numbers: T) -> T:
-    """The pytree with arrays (…, E) and (…, E, 3) reduced to the elements of subset k; other arrays are not changed."""
+    """Reduce the arrays (…, E) and (…, E, 3) of a pytree to the elements of subset k. Other arrays are not changed."""
     E, own = s.number_of_elements, s.elements[k][0]
 
     def one(a: Number) -> Number:
@@ -56,7 +54,7 @@ def in_subset(s: Subsets, k: int, numbers: T) -> T:
 
 
 def put_together(s: Subsets, numbers: Sequence[T]) -> T:
-    """Numbers of all elements, from the pytrees of all subsets (with the same structure and arrays (…, n))."""
+    """Join the pytrees of all subsets (of the same structure, with arrays (…, n)) to values of all elements."""
     leaves, trees = zip(*(jax.tree.flatten(each) for each in numbers), strict=True)
     shapes = [
         jnp.broadcast_shapes(*map(jnp.shape, own), (e.shape[1],)) for own, e in zip(leaves, s.elements, strict=True)

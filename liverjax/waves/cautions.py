@@ -1,4 +1,5 @@
-"""Cautions about a scene of harmonic motion, made on the host. Each caution is one sentence."""
+"""Cautions (warnings in one sentence) about a scene with harmonic motion. They are computed on the host, without JAX
+tracing."""
 
 import jax
 import numpy as np
@@ -9,32 +10,35 @@ from liverjax.physics.contact.obstacle import Obstacle, touches_without_pressure
 from liverjax.scenes.scene import Scene, named_physics
 from liverjax.simulation.cautions import cautions_of_mesh, of_drained_layer, of_locking
 
-#: Elements per shear wave below which even quadratic elements show no wave.
+#: Minimum number of element edges per wavelength of a shear wave. With fewer, even quadratic elements show no wave.
 _LEAST_PER_WAVE = 2.0
 
 
 def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]:
-    """Sentences about the mesh, the volumes, the masses and the drive of a scene of harmonic motion.
+    """Return warnings about the mesh, the volume constraint, the density and the excitation of a scene with harmonic
+    motion.
 
     Args:
         scene: `Scene`, not traced.
-        about: positions (V, 3) [m] about which the body vibrates; None: the reference shape.
+        about: positions (V, 3) [m] about which the body vibrates. None means the reference shape.
     """
     said = [*cautions_of_mesh(scene.mesh), *of_locking(scene)]
     if scene.body is None:
         said.append("the scene has no [body], so the motion has no inertia: write density = 1060.0 in [body]")
     inlets = () if scene.porosity is None else scene.porosity.inlet
     if not scene.displaced and not scene.traction and not inlets:
-        said.append("nothing drives the motion: give amplitudes as [[displaced]] or [[traction]]")
+        said.append("the scene has no excitation: give amplitudes as [[displaced]] or [[traction]]")
     x = scene.mesh.points if about is None else about
     for name, physics in named_physics(scene):
         if isinstance(physics, Ligament) and physics.is_straight_without_tension(scene.mesh, x):
             said.append(
-                f"{name} is straight but has no tension: it pulls only, but here it acts as a spring in both directions"
+                f"{name} is straight but has no tension. A ligament can only pull, but here it acts as a spring in "
+                "both directions"
             )
         if isinstance(physics, Obstacle) and touches_without_pressure(physics, scene.mesh, x):
             said.append(
-                f"{name} touches the body without pressure: it cannot pull, and here it holds in both directions"
+                f"{name} touches the body without pressure. An obstacle can only push, but here it holds the body in "
+                "both directions"
             )
     if scene.solve.frequencies is None:
         return said
@@ -46,12 +50,12 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
 
 
 def _of_short_waves(scene: Scene, hertz: float) -> list[str]:
-    """A sentence if the shear waves of the elastic body at this frequency are not much longer than the elements."""
+    """Return a warning if the shear waves of the elastic body at this frequency [Hz] are too short for the elements."""
     if scene.body is None:
         return []
     try:
         shear = float(np.median(np.asarray(scene.law.shear_modulus())))
-    except InputError:  # a law need not state its moduli
+    except InputError:  # not every law states its shear modulus
         return []
     low, high = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.pattern.edges)]
     edge = float(np.median(np.linalg.norm(high - low, axis=1)))
@@ -60,5 +64,5 @@ def _of_short_waves(scene: Scene, hertz: float) -> list[str]:
         return []
     return [
         f"at {hertz:.3g} Hz shear waves are about {length:.2g} m long, and the edges of the elements {edge:.2g} m: the "
-        "mesh is too coarse for these waves; take a finer mesh, or lower frequencies (see --mesh-error)"
+        "mesh is too coarse for these waves. Use a finer mesh, or lower frequencies (see --mesh-error)"
     ]

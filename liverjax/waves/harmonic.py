@@ -27,7 +27,7 @@ from liverjax.waves.operator import Operator, free_part, operator
 from liverjax.waves.rest import under_its_weight, without_history
 
 MASSES = ("consistent", "lumped")
-#: Values of [solve] for the equations of one instant.
+#: Settings of [solve] for which the equations of one instant are set up, without time.
 _STILL: Content = {
     "kind": "static",
     "frequencies": None,
@@ -44,17 +44,18 @@ class Harmonic:
 
     frequencies_Hz: jax.Array = param("Hz", "(F,)")
     displacement: jax.Array = param("m", "u, complex (F, V, 3)")
-    reactions: jax.Array = param("N", "complex (F, V, 3), force of the support on the body where motion is given")
-    residual: jax.Array = param("1", "(F,) out-of-balance forces where the body is free, over the forces at work")
-    pressure: jax.Array | None = param("Pa", "of the fluid, complex (F, V), of a porous scene", default=None)
+    reactions: jax.Array = param("N", "complex (F, V, 3), force of the support on the body at constrained nodes")
+    residual: jax.Array = param("1", "(F,) out-of-balance forces at free nodes, divided by the size of all forces")
+    pressure: jax.Array | None = param("Pa", "complex (F, V), fluid pressure in a porous scene", default=None)
 
     def check(self) -> "Harmonic":
-        """The result itself, or `RuntimeError` with advice if a frequency has no answer; host side."""
+        """Return the result itself. Raise `RuntimeError` with advice if a frequency has no solution. Call it on the
+        host."""
         wrong = np.flatnonzero(~(np.asarray(self.residual) < 1e-6))
         if wrong.size:
             raise RuntimeError(
                 f"{float(self.frequencies_Hz[wrong[0]]):g} Hz: {status.advice(status.NOT_FINITE)}; a body without "
-                "viscosity has no answer at its resonances"
+                "viscosity has no solution at its resonance frequencies"
             )
         return self
 
@@ -67,31 +68,32 @@ def harmonic(
     motion: Number | None = None,
     mass: str = "consistent",
 ) -> Harmonic:
-    """Small motion of the scene at these frequencies, driven by its tractions, prescribed motions and inlets.
+    """Compute the small harmonic motion of the scene, caused by its tractions, prescribed motions and inlets.
 
-    Their numbers are amplitudes. Law, viscosity, porosity, density, gravity, supports, held nodes and regions act.
-    Time steps and histories have no effect; an obstacle stays at its place at time 0. It may be differentiated in both
-    modes and jitted; every derivative costs one more solve per frequency, without a new factorisation.
+    The values of these loads are amplitudes. Law, viscosity, porosity, density, gravity, supports, fixed nodes and
+    regions are included. Time steps and histories have no effect. An obstacle stays at its position at time 0. The
+    function may be differentiated in both modes and jitted. Every derivative needs one more solve per frequency,
+    without a new factorisation.
 
     Args:
         scene: `Scene`. The motion of `displaced` is an amplitude with phase 0.
-        frequencies_Hz: (F,), above 0; default: those of scene.solve.
-        factors: G*/G0 by which the part of the stress that relaxes is multiplied, complex (F,), or (F, E) by element;
-            default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or of its springpots; else 1.
-            Pressures of nodes (volumetric "mixed", "nodal", or of a sponge) do not relax.
-        about: positions (V, 3) [m] of an equilibrium that has rested for long, as in `simulate`; default: the state
-            of rest under gravity, found by a static run, or the reference shape without gravity. The law's stress there
-            stiffens the body. A fluid has flowed until its pressure is 0. If gravity is traced, its value is not known:
-            the program then has this run even for a gravity of 0, unless `about` is given.
-        motion: amplitudes of prescribed motion, complex (V, 3) or (F, V, 3) [m], in place of the scene's.
-        mass: "consistent" (each element's integrals), or "lumped" as in runs in time.
+        frequencies_Hz: (F,), above 0; default: the frequencies of scene.solve.
+        factors: G*/G0, the complex factor of the part of the stress that relaxes, (F,), or (F, E) with one value for
+            each element. Default: the factor 1 - sum g_k/(1 + i omega tau_k) of the scene's Prony series, or the factor
+            of its springpots; 1 without viscosity. Nodal pressures (volumetric "mixed" or "nodal", or a porous body) do
+            not relax.
+        about: positions (V, 3) [m] of a long-time equilibrium, for example from `simulate`. The stress in this state
+            changes the stiffness; the fluid pressure is 0. Default: the state of rest under gravity, from a static run,
+            or the reference shape without gravity. A traced gravity always causes this run, unless `about` is given.
+        motion: complex amplitudes of the prescribed motion (V, 3) or (F, V, 3) [m]. They replace those of the scene.
+        mass: "consistent" (mass matrix of each element), or "lumped" as in transient runs.
 
     Returns:
-        `Harmonic`. A matrix without an inverse leaves NaN at its frequency.
+        `Harmonic`. The result is NaN at a frequency with a singular matrix.
 
     Raises:
-        InputError: parts that have no harmonic motion here (pressures that follow, friction, rigid plates), shapes and
-            values that cannot be used; no state of rest under gravity.
+        InputError: parts of the scene have no harmonic motion here (pressures that follow the surface, friction, rigid
+            plates); shapes or values cannot be used; there is no state of rest under gravity.
     """
     weighed = scene
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
@@ -108,10 +110,10 @@ def harmonic(
         motion = prescribed(mesh, tuple(replace(d, times=None, history=None) for d in scene.displaced), 0.0, 1.0)
     motion = jnp.asarray(motion, complex)
     if motion.shape not in (mesh.points.shape, (number, *mesh.points.shape)):
-        raise InputError(f"motion has shape {motion.shape}: give {mesh.points.shape} or one more axis of frequencies")
+        raise InputError(f"motion has shape {motion.shape}: give {mesh.points.shape}, or this for each frequency")
     if about is not None and scene.porosity is not None and not _drains(scene.porosity):
         raise InputError(
-            "a state under load (gravity, about) does not give the pressure that a sealed sponge keeps: give "
+            "a loaded state (gravity, about) does not determine the pressure in a porous body that cannot drain: give "
             "porosity.drained"
         )
     if about is not None and jnp.shape(about) != mesh.points.shape:
@@ -121,7 +123,7 @@ def harmonic(
 
 
 def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "consistent") -> Operator:
-    """The dynamic stiffness of `harmonic` by element, for programs that build their own equations with it.
+    """Return the dynamic stiffness of each element as in `harmonic`, for programs that build other equations with it.
 
     Args:
         scene, about, mass: as in `harmonic`.
@@ -137,13 +139,13 @@ def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
     none = jnp.zeros(())
     e = equations(still, initial_state(still), 1.0, Sizes(none, none))
     if e.free.tied:
-        raise InputError("nodes that turn together (a rigid plate) have no harmonic motion: prescribe their motion")
+        raise InputError("a rigid plate cannot be used in harmonic motion: prescribe the motion of its nodes")
     return operator(e._replace(scene=scene), scene.mesh.points if about is None else about, about is not None, mass)
 
 
 @partial(jax.jit, static_argnames="mass")
 def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, about: Any, mass: str) -> Harmonic:
-    """Motion, reactions and residuals; `at` are factors and angular frequencies."""
+    """Return motion, reactions and residuals. `at`: factors G*/G0 and angular frequencies [rad/s]."""
     A, omegas = _operator(scene, about, mass), at[1]
     held, load = _prescribed_and_loads(A, omegas, motion, nodal_tractions(scene.mesh, scene.traction))
     moved = sparse.motions(A, *at, jax.tree.map(jnp.subtract, load, sparse.at_every(A, *at, held)))
@@ -152,7 +154,7 @@ def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, ab
     out, unbalanced = jax.vmap(lambda *m: free_part(A, m))(f, balance)
     residual = _part(out, jnp.abs(f - out) + jnp.abs(load[0]))
     if unbalanced is not None and p is not None:
-        # Volumes that the motion changes at the pressures' nodes, or the fluid that enters.
+        # The scale is the change of volume at the nodes of the pressures, or the fluid that enters.
         taken: Any = sparse.at_every(A, *at, (u, jnp.zeros_like(p)))[1]
         residual = jnp.maximum(residual, _part(unbalanced, jnp.abs(taken) + jnp.abs(load[1])))
     return Harmonic(
@@ -167,7 +169,7 @@ def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, ab
 def _prescribed_and_loads(
     A: Operator, omegas: jax.Array, motion: jax.Array, traction: jax.Array
 ) -> tuple[sparse.Motions, Any]:
-    """The prescribed amplitudes, and the loads, of every frequency."""
+    """Return the prescribed amplitudes and the loads at every frequency."""
     number, own = len(omegas), A.pressures
     held = (1 - A.free.mask)[None] * motion
     force = jnp.broadcast_to(jnp.asarray(traction, complex)[None], motion.shape)
@@ -179,7 +181,7 @@ def _prescribed_and_loads(
 
 
 def _part(out: jax.Array, work: jax.Array) -> jax.Array:
-    """Norms (F,) of the forces out of balance, over those of the forces at work."""
+    """Return the norms (F,) of the out-of-balance forces, divided by the norms of all forces."""
     sizes = [jnp.linalg.norm(a.reshape(len(a), -1), axis=1) for a in (out, work)]
     return sizes[0] / jnp.where(sizes[1] > 0, sizes[1], 1.0)
 
@@ -199,7 +201,7 @@ def _frequencies(frequencies_Hz: Any) -> jax.Array:
 
 
 def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
-    """Factors G*/G0 (F,), or (F, E), of the scene's viscosity."""
+    """Return the factors G*/G0 (F,), or (F, E), of the scene's viscosity."""
     prony = scene.viscosity
     if prony is None:
         return jnp.ones(omegas.shape, complex)
@@ -210,24 +212,25 @@ def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
 
 
 def _drains(porosity: Porosity) -> bool:
-    """Whether the fluid can leave the sponge at a pressure of 0."""
+    """Return whether fluid can leave the porous body somewhere, at a boundary with a given pressure."""
     return porosity.drained is not None or any(inlet.nodes is not None for inlet in porosity.inlet)
 
 
 def _small(scene: Scene, mass: str) -> Scene:
-    """The scene without time and weight, for small motion. Physics that have no small motion are refused."""
+    """Return the scene without time and gravity, for small motion. Raise InputError for parts without small motion."""
     if mass not in MASSES:
         raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
     if scene.points_are == "loaded":
         raise InputError(
-            '[mesh] is = "loaded" has no harmonic motion: take the scene of lj.unloaded(scene), and its run as about'
+            '[mesh] is = "loaded" cannot be used in harmonic motion: use the scene of lj.unloaded(scene), and the last '
+            "positions of its run as about"
         )
     if any(isinstance(physics, RoughObstacle | PressedObstacle) for physics in scene.physics):
         raise InputError(
-            "friction and pressed obstacles have no harmonic motion here: leave them out, or run the scene in time"
+            "friction and pressed obstacles cannot be used in harmonic motion: remove them, or do a transient run"
         )
     if follows(scene.traction):
-        raise InputError("a pressure that follows the body has no harmonic motion here: give a traction as value")
+        raise InputError("a pressure that follows the body cannot be used in harmonic motion: give a traction as value")
     solve = replace(scene.solve, **_STILL)
     traction = tuple(replace(t, times=None, history=None) for t in scene.traction)
     body = None if scene.body is None else replace(scene.body, gravity=jnp.zeros(3), times=None, history=None)

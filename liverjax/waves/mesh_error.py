@@ -1,4 +1,5 @@
-"""Mesh error of harmonic motion: the same problem is solved again in the next richer space of functions."""
+"""Mesh error of harmonic motion. The same problem is solved again with shape functions of the next higher order, or on
+a refined mesh."""
 
 from functools import partial
 
@@ -19,12 +20,12 @@ from liverjax.waves.rest import under_its_weight
 
 @struct
 class HarmonicError:
-    """Estimated error of amplitudes: the difference that an infinitely fine mesh would add."""
+    """Estimated error of the amplitudes: amplitude on an infinitely fine mesh minus computed amplitude."""
 
     displacement: jax.Array = param("m", "complex (F, V, 3)")
-    reactions: jax.Array = param("N", "complex (F, V, 3); sums over the nodes of a support count")
+    reactions: jax.Array = param("N", "complex (F, V, 3); add them over the nodes of each support")
     pressure: jax.Array | None = param(
-        "Pa", "complex (F, V), of a fluid; None: no fluid, or its pressures' error is not known", default=None
+        "Pa", "complex (F, V), pressure of the fluid; None without fluid, or if the error is unknown", default=None
     )
 
 
@@ -35,7 +36,10 @@ def harmonic_mesh_error(
     about: jax.Array | None = None,
     motion: Number | None = None,
 ) -> jax.Array:
-    """Estimated error of displacements, complex (F, V, 3) [m]. `harmonic_errors` also gives the error of reactions."""
+    """Return the estimated mesh error of the displacements, complex (F, V, 3) [m].
+
+    The arguments are those of `harmonic_errors`, which also returns the errors of reactions and pressures.
+    """
     return harmonic_errors(scene, found, factors, about, motion).displacement
 
 
@@ -46,24 +50,25 @@ def harmonic_errors(
     about: jax.Array | None = None,
     motion: Number | None = None,
 ) -> HarmonicError:
-    """Estimated error of amplitudes that the mesh causes.
+    """Estimate the errors of the amplitudes that are due to the mesh.
 
-    Linear elements are replaced by quadratic ones, and quadratic elements by cubic ones. With too few elements per wave
-    the phase is wrong, and the error is as large as the motion. The mesh has then eight (quadratic: three) times the
-    unknowns, with a corresponding cost. The pressures of a fluid are linear in all elements. With a fluid, the scene is
-    therefore solved again on a mesh in which every element is cut into eight, and the estimate is 4/3 of the change.
+    Linear elements are replaced by quadratic ones, and quadratic elements by cubic ones. The new mesh has about eight
+    times (linear elements) or three times (quadratic elements) as many unknowns, with a corresponding cost. If there
+    are too few elements per wavelength, the phase is wrong, and the error is as large as the motion. The pressures of a
+    fluid are linear in all elements. So a scene with a fluid is solved again, if possible, on a mesh with every element
+    divided into eight, and the estimate is 4/3 of the change.
 
     Args:
         scene, factors, about, motion: as in `harmonic`.
         found: result of `harmonic`.
 
     Raises:
-        InputError: a scene with another mesh, and what `harmonic` refuses.
+        InputError: the scene has another mesh than the result, or `harmonic` cannot be used for the scene.
     """
     nodes = scene.mesh.number_of_nodes
     if found.displacement.shape[1] != nodes:
         raise InputError(
-            f"the result has {found.displacement.shape[1]} nodes, the scene {nodes}: give the scene of the result"
+            f"the result has {found.displacement.shape[1]} nodes, but the scene {nodes}: give the scene of the result"
         )
     about = under_its_weight(scene) if about is None else about
     finer = scene.porosity is not None and can_be_refined(scene)
@@ -95,19 +100,19 @@ def _richer_elements(scene: Scene) -> Scene:
 
 
 def _on_nodes(mesh: TetMesh, rich: TetMesh, within: Within | None, forces: jax.Array) -> jax.Array:
-    """Forces (F, V, 3) on the nodes of the run, from those on the richer functions."""
+    """Return forces (F, V, 3) on the nodes of the original mesh, from the forces on the richer mesh."""
     nodes = mesh.number_of_nodes
     if within is not None:
         return jax.vmap(lambda f: within.forces(f, nodes))(forces)
     if mesh.order > 1:
         return forces[:, :nodes]
-    # The force of a quadratic function belongs to the two linear ones that it refines, half to each.
+    # The force at a node in the middle of an edge is divided equally between the two ends of the edge.
     columns = jnp.moveaxis(forces, 1, -1)
     return jnp.moveaxis(jax.vmap(jax.vmap(lambda f: restricted(rich, f)))(columns), -1, 1)
 
 
 def _padded(rich: TetMesh, within: Within | None, x: jax.Array) -> jax.Array:
-    """The field x (…, V, 3) in the richer space."""
+    """Return the field x (…, V, 3) on the richer mesh."""
     if within is not None:
         return jnp.moveaxis(within.field(jnp.moveaxis(x, -2, 0)), 0, -2)
     if rich.order == 2:

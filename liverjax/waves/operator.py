@@ -1,14 +1,16 @@
 """Dynamic stiffness of small harmonic motion, K(omega) - omega^2 M, stored as element matrices.
 
-The body moves about a state x in which it has rested for a long time. There the relaxing stress has decreased to m_inf
-S_h. A small motion adds m(omega) times the instantaneous change of this stress, with m = G*/G0 and m_inf = 1 - sum g_k.
-With the tangent split into a material and a geometric part (superposed small motion: Lockett 1972, Nonlinear
-Viscoelastic Solids, chapter 7), the stiffness is
+The body moves about a state x in which it has rested for a long time. Let S_h be the instantaneous elastic stress of
+the relaxing part. In the state x it has decreased to m_inf S_h, with m_inf = 1 - sum g_k and the ratios g_k of the
+Prony series. A small motion adds m(omega) times the change of S_h, with m = G*/G0. The tangent is divided into a
+material and a geometric part (superposed small motion: Lockett 1972, Nonlinear Viscoelastic Solids, chapter 7). The
+stiffness is
 
     K(omega) = m(omega) (K_h - K_geometric) + m_inf K_geometric + K_rest,
 
-where K_rest is the stiffness that does not relax: of the volumetric part of the law if only the isochoric part relaxes,
-of a sponge, of supports, membranes and springs. Unknown pressures are in `liverjax.waves.pressures`.
+with the tangent K_h of the elastic stress S_h and its geometric part K_geometric. K_rest is the stiffness that does not
+relax: of the volumetric part of the law if only the isochoric part relaxes, of a porous body, of supports, membranes
+and springs. Unknown pressures are in `liverjax.waves.pressures`.
 """
 
 from typing import NamedTuple
@@ -39,26 +41,27 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
 
 class Operator(NamedTuple):
-    """Matrices of the elements with n nodes each, and matrices of nodes."""
+    """Matrices of the E elements with n nodes each, and matrices of the V nodes."""
 
     points: jax.Array  # (V, 3) [m] reference positions of the nodes
     nodes: jax.Array  # (n, E)
-    relaxing: jax.Array  # (n, 3, n, 3, E) [N/m] part that is multiplied by m(omega)
-    rest: jax.Array | None  # (n, 3, n, 3, E) [N/m]
-    mass: jax.Array | None  # (n, n, E) [kg] for each component, or lumped (V,)
-    springs: Block | None  # diagonal blocks 3 x 3 of (V,) [N/m]
+    relaxing: jax.Array  # (n, 3, n, 3, E) [N/m] stiffness that is multiplied by m(omega)
+    rest: jax.Array | None  # (n, 3, n, 3, E) [N/m] stiffness that does not relax
+    mass: jax.Array | None  # (n, n, E) [kg], the same for each component, or lumped masses (V,)
+    springs: Block | None  # stiffness of springs at the nodes: 3 x 3 entries (V,) [N/m]
     attached: tuple[Attached, ...]
     free: Free
     pressures: Pressures | None = None
 
 
 def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
-    """The operator about positions x (V, 3) [m].
+    """Return the dynamic stiffness for small motion about positions x (V, 3) [m].
 
     Args:
         e: equations of the scene without its viscosity.
-        loaded: whether x is not the reference shape, so that there is stress.
-        mass: "consistent" or "lumped", as in runs in time.
+        x: positions (V, 3) [m].
+        loaded: whether x differs from the reference shape, so that there is stress.
+        mass: "consistent", or "lumped" as in transient runs.
     """
     scene, mesh, F = e.scene, e.mesh, deformation_gradient(e.mesh, x)
     volume, pressures = scalars_and_pressures(scene, x, F)
@@ -81,7 +84,11 @@ def _shape_vectors(mesh: TetMesh) -> list[Vector]:
 
 
 def _blocks(scene: Scene, law: Law, F: Matrix, loaded: bool) -> tuple[list[Matrix], list[Matrix] | None]:
-    """Blocks per volume of corners 1, 2, 3 (`_OWN`): first those to multiply by m(omega), then the others or None."""
+    """Return stiffness blocks, per unit volume, for pairs (`_OWN`) of the corners 1, 2 and 3 of an element.
+
+    The first list is the relaxing part, which is multiplied by m(omega). The second list is the part that does not
+    relax, or None if there is no such part.
+    """
     mesh, prony, D = scene.mesh, scene.viscosity, _shape_vectors(scene.mesh)
     if prony is None:
         return invariant_terms.blocks(invariant_terms.state(law, F), D, _OWN), None
@@ -105,7 +112,7 @@ def _times_identity(value: jax.Array) -> Matrix:
 
 
 def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
-    """Element matrices (n, 3, n, 3, E) [N/m] from blocks per volume at the integration points."""
+    """Return element matrices (n, 3, n, 3, E) [N/m] from blocks per unit volume at the integration points."""
     weighted = {(a + 1, b + 1): scale_matrix(mesh.weights, K) for (a, b), K in zip(_OWN, blocks, strict=True)}
     corners = jnp.stack([jnp.stack([_stacked(K) for K in row]) for row in mjed.all_blocks(weighted)])
     if mesh.order == 1:
@@ -115,7 +122,8 @@ def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
 
 
 def _both_ways(mesh: TetMesh, K: jax.Array) -> jax.Array:
-    """Matrices (n, …, n, …, E) times the signs of functions on both sides: functions of order 3 have a direction."""
+    """Multiply matrices (n, …, n, …, E) by the signs of the shape functions on both sides. Shape functions of order 3
+    have a direction, so their sign depends on the element."""
     if mesh.order < 3:
         return K
     n, E, half = len(K), K.shape[-1], K.ndim // 2
@@ -143,13 +151,13 @@ Motion = tuple[jax.Array, jax.Array | None]
 
 
 def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion) -> Motion:
-    """Complex forces (V, 3) [N] of a motion, and the balance (P,) [m^3] if there are pressures.
+    """Return the complex forces (V, 3) [N] of a motion, and the volume balance (P,) [m^3] (None without pressures).
 
     Args:
         A: `Operator`.
         factor: m(omega), () or (E,).
         omega: angular frequency [rad/s].
-        motion: complex amplitudes.
+        motion: complex amplitudes of displacements and pressures.
     """
     u, p = motion
     own = u[A.nodes]  # (n, E, 3)
@@ -171,13 +179,13 @@ def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion)
 
 
 def _stored(own: Pressures, omega: Number, near: jax.Array) -> jax.Array:
-    """(store + flow / (i omega)) p at the vertices of every element, (4, E) [m^3]."""
+    """Return (store + flow / (i omega)) p at the vertices of every element, (4, E) [m^3]."""
     stored = jnp.einsum("vwe,we->ve", own.store, near)
     return stored if own.flow is None else stored + jnp.einsum("vwe,we->ve", own.flow, near) / (1j * omega)
 
 
 def _of_nodes_alone(A: Operator, omega: Number, u: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] of lumped masses, springs and elements between nodes."""
+    """Return the forces (V, 3) [N] of lumped masses, springs and attached elements."""
     total = jnp.zeros_like(u)
     if A.mass is not None and A.mass.ndim == 1:
         total = total - (omega**2 * A.mass)[:, None] * u
@@ -190,6 +198,6 @@ def _of_nodes_alone(A: Operator, omega: Number, u: jax.Array) -> jax.Array:
 
 
 def free_part(A: Operator, motion: Motion) -> Motion:
-    """The part of a motion, or of forces, along free directions."""
+    """Return the part of a motion, or of forces, in the directions that are free to move."""
     u, p = motion
     return A.free.vectors(u), None if A.pressures is None or p is None else A.pressures.mask * p

@@ -1,13 +1,16 @@
-"""Pressures at the vertices in harmonic motion: of a flowing fluid, or of nearly incompressible volumes.
+"""Pressures at the vertices in harmonic motion: of a flowing fluid, or of a nearly incompressible material.
 
-A motion u changes the volume on which the pressures act by B^T u. Both cases lead to a symmetric system,
+A motion u changes the volumes on which the pressures p act by B^T u. Both cases lead to a symmetric system,
 
-    K u + B p = f,    B^T u - (store + flow / (i omega)) p = -enters / (i omega).
+    K u + B p = f,    B^T u - (store + flow / (i omega)) p = -enters / (i omega),
 
-In a sponge (`liverjax.physics.porosity`), B^T u is minus the change of the volumes of the vertices. The second equation
-is then Darcy's law over i omega: (1/K_lim) i omega p = kappa lap p - i omega (dJ/J), with the volumes of the state
-about which the body moves. With averaged or mixed volumes (`liverjax.physics.volumes`) nothing flows, and `store` is
-the compliance of the pressures.
+with the dynamic stiffness K, the forces f, the storage and flow matrices `store` and `flow`, and the inflow `enters`.
+
+In a porous body (`liverjax.physics.porosity`), B^T u is minus the change of the volumes at the vertices. The second
+equation is then Darcy's law divided by i omega. The law is (1/K_lim) i omega p = kappa lap p - i omega (dJ/J), with the
+volume ratio J, the bulk modulus K_lim of the storage and the permeability kappa. Volumes are those of the state about
+which the body moves. With averaged or mixed volumes (`liverjax.physics.volumes`) nothing flows, and `store` is the
+compliance of the pressures.
 """
 
 from typing import Any, NamedTuple
@@ -31,26 +34,29 @@ from liverjax.tensors.matrices import Matrix, determinant, dot, scale
 
 
 class Pressures(NamedTuple):
-    """Matrices of the elements with n nodes each, and given data of the P pressures."""
+    """Matrices of the E elements with n nodes each, and given data of the P pressures."""
 
     nodes: jax.Array  # (4, E) vertices
     pull: jax.Array  # (n, 3, 4, E) [m^2]: B
     store: jax.Array  # (4, 4, E) [m^3/Pa]
-    flow: jax.Array | None  # (4, 4, E) [m^3/(Pa s)]; None: nothing flows
-    mask: jax.Array  # (P,) 0 where the pressure is given
+    flow: jax.Array | None  # (4, 4, E) [m^3/(Pa s)]; None if nothing flows
+    mask: jax.Array  # (P,) 0 where the pressure is given, 1 elsewhere
     given: jax.Array  # (P,) [Pa] given amplitudes, 0 elsewhere
-    enters: jax.Array | None  # (P,) [m^3/s] amplitude of the inflow; None: no inflow
+    enters: jax.Array | None  # (P,) [m^3/s] amplitude of the inflow; None without inflow
 
 
 def law_beside(scene: Scene) -> Any:
-    """The law without the volumetric energy that the pressures replace."""
+    """Return the law without the volumetric energy, which the pressures replace."""
     if scene.solve.volumetric in ("nodal", "mixed"):
         return isochoric_part(scene.law)
     return law_in_force(scene.porosity, scene.law)
 
 
 def scalars_and_pressures(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars | None, Pressures | None]:
-    """Volumetric stress and slope at given pressures, at positions x (V, 3) [m], and `Pressures`; or None, None."""
+    """Return the volumetric stress and its derivative with respect to J at given pressures, and `Pressures`.
+
+    Both are computed at positions x (V, 3) [m]. Both are None if the scene has no unknown pressures.
+    """
     mesh, J = scene.mesh, determinant(F)
     if scene.porosity is not None:
         own = scene.porosity
@@ -87,7 +93,7 @@ def _of_mixed(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars, Pressures
 
 
 def _compliance(mesh: TetMesh, volume: Mixed) -> jax.Array:
-    """Compliance matrix (4, 4, E) of every element; see `Mixed.compliance`."""
+    """Return the compliance matrix (4, 4, E) of every element, as in `Mixed.compliance`."""
     if mesh.order > 1:
         L = jnp.asarray(basis(mesh.order).L, mesh.volumes.dtype)
         return jnp.einsum("aq,bq,qe->abe", L, L, mesh.weights / volume.rest, optimize=True)
@@ -113,7 +119,8 @@ def _sealed(mesh: TetMesh, pull: jax.Array, store: jax.Array) -> Pressures:
 
 
 def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Diagonal matrices (4, 4, E): contribution of each element to the `integrals` of a density at the points."""
+    """Return diagonal matrices (4, 4, E): the contribution of each element to the integrals, at the vertices, of a
+    density that is given at the integration points."""
     if mesh.order == 1:
         share = jnp.broadcast_to(mesh.volumes * density / 4, (4, mesh.number_of_elements))
     else:
@@ -122,7 +129,8 @@ def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _pull(mesh: TetMesh, g: list) -> jax.Array:
-    """Forces (n, 3, 4, E) on the nodes per pressure at the vertices, from the vectors g of the four corners."""
+    """Return the nodal forces (n, 3, 4, E) [m^2] of unit pressures at the four vertices. `g`: gradients of the volume
+    ratio with respect to the positions of the four corners."""
     own = mesh.weights[None, None] * jnp.stack([jnp.stack(vector) for vector in g])  # (4, 3, E), or (4, 3, Q, E)
     if mesh.order == 1:
         return jnp.broadcast_to(own[:, :, None] / 4, (4, 3, 4, mesh.number_of_elements))

@@ -18,17 +18,19 @@ from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared, simulate
 from liverjax.simulation.unloaded import resting
 
-#: Forces in the reference shape count as 0 if they are below the second number times the forces of this strain.
+#: Forces in the reference shape are regarded as 0 if they are below _NONE times the forces at the strain _STRAIN.
 _STRAIN, _NONE = 1e-6, 1e-3
-#: A time [s] that is so long that all flow has ended.
+#: A time [s] after which all flow has ended.
 _FOR_LONG = 1e12
 
 
 def under_its_weight(scene: Scene) -> jax.Array | None:
-    """Positions (V, 3) [m] at rest under gravity and pre-tension, with relaxed stresses; None if nothing acts.
+    """Return the positions (V, 3) [m] at rest under gravity and pre-tension, with relaxed stresses. Return None if
+    neither acts.
 
-    Pre-tension is what pulls in the reference shape, for example a ligament. Tractions and inlets are amplitudes of the
-    motion, so they do not act here. If the scene is traced and no state of rest is found, the positions are NaN.
+    Pre-tension is a force that acts already in the reference shape, for example the force of a tight ligament.
+    Tractions and inlets are amplitudes of the motion, so they do not act here. If the scene is traced and no state of
+    rest is found, the positions are NaN.
 
     Raises:
         InputError: no state of rest was found.
@@ -39,7 +41,7 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
     still = resting(replace(by_element(scene), traction=(), **changed))
     if not (_is_heavy(scene) or _is_pulled(still)):
         return None
-    # With a sponge the steps are so long that its fluid stops flowing within a step.
+    # In a porous body the time step is so long that the flow ends within one step.
     dt = None if scene.porosity is None else _FOR_LONG
     solve = replace(still.solve, dt=dt, steps=4, frequencies=None)
     found = simulate(replace(still, solve=solve))
@@ -50,13 +52,14 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
         return found.check().positions[-1]
     except RuntimeError as error:
         raise InputError(
-            f"no state of rest under gravity or tension was found ({error}): hold the body, or give a state "
+            f"no state of rest under gravity or tension was found ({error}): fix the body, or give a state "
             "with the argument about"
         ) from None
 
 
 def without_history(physics: Physics) -> Physics:
-    """The same physics without a history: a support with its unscaled stiffness, an obstacle at its place at time 0."""
+    """Return the physics object (load, support, contact …) without a history. A support has its unscaled stiffness, and
+    an obstacle is at its position at time 0."""
     changed: Content = {name: None for name in ("times", "history") if getattr(physics, name, None) is not None}
     if isinstance(physics, Obstacle):
         changed |= {"by": None, "position": jnp.asarray(physics.position) + physics.displacement(0, 1, 0.0)}
@@ -64,7 +67,7 @@ def without_history(physics: Physics) -> Physics:
 
 
 def _without_inflow(sponge: Porosity | None) -> Porosity | None:
-    """The sponge without fluxes, and with the pressure 0 where an inlet gives a pressure."""
+    """Return the porosity without prescribed fluxes, and with a pressure of 0 where an inlet prescribes a pressure."""
     if sponge is None:
         return None
     open_ones = [inlet for inlet in sponge.inlet if inlet.nodes is not None]
@@ -73,13 +76,14 @@ def _without_inflow(sponge: Porosity | None) -> Porosity | None:
 
 
 def _is_heavy(scene: Scene) -> bool:
-    """Whether gravity acts, or is traced."""
+    """Return whether gravity is not zero, or is traced."""
     leaves = [] if scene.body is None else jax.tree.leaves(scene.body.gravity)
     return any(isinstance(leaf, jax.core.Tracer) or bool(np.any(np.asarray(leaf))) for leaf in leaves)
 
 
 def _is_pulled(still: Scene) -> bool:
-    """Whether a physics acts on free nodes in the reference shape; if traced, whether there is a ligament."""
+    """Return whether forces other than gravity act on free nodes in the reference shape. If the scene is traced, return
+    whether there is a ligament."""
     if not still.physics:
         return False
     alone = replace(still, fixed=(), displaced=(), body=None, porosity=None)

@@ -1,8 +1,9 @@
-"""Complex sparse solves of harmonic motion, by a factorisation on the host for every frequency.
+"""Complex sparse linear systems of harmonic motion, solved by one factorisation on the host for every frequency.
 
-The matrix is symmetric, not Hermitian, so one factor serves the equations, their derivatives and their adjoints: it is
-kept for them (`KEPT`). See `liverjax.solvers.factors.multifrontal`; SciPy's SuperLU, which chooses its pivots in the
-whole matrix, is used if that fails.
+The matrix is symmetric but not Hermitian, so the same factor solves the equations, their derivatives and their adjoint
+equations. Therefore the factor is kept in memory (`KEPT`). The factorisation is the one of
+`liverjax.solvers.factors.multifrontal`. If it fails, SciPy's SuperLU is used, which chooses its pivots in the whole
+matrix.
 """
 
 import hashlib
@@ -24,10 +25,10 @@ from liverjax.waves.operator import Motion, Operator, forces_of_motion, free_par
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Motions of every frequency: (F, V, 3), and (F, P) or None.
+#: Displacements (F, V, 3) at every frequency, and pressures (F, P) or None.
 Motions = Motion
-#: Memory [bytes] of the factors that are kept for derivatives; factors of other matrices are dropped first. If those
-#: of all frequencies do not fit, they are kept as 16-bit integers, half as large.
+#: Maximum memory [bytes] of the factors that are kept for derivatives. Factors of other matrices are deleted first. If
+#: the factors of all frequencies do not fit, they are kept as 16-bit integers, which need half the memory.
 KEPT = 2e9
 
 _factors: dict[bytes, multifrontal.Factor] = {}
@@ -35,15 +36,17 @@ _orders: dict[bytes, "_Order"] = {}
 
 
 def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: Motions) -> Motions:
-    """Free motions of every frequency with P A P x = P b, where P projects onto free directions; 0 along others.
+    """Return the motions x of every frequency that solve P A P x = P b, where P projects onto free directions. The
+    motion in directions that are not free is 0.
+
+    The function is differentiable in both modes with respect to everything except the free directions. If the matrix
+    of a frequency is singular, the motion at this frequency is NaN.
 
     Args:
         A: `Operator`.
         factors: m(omega) of every frequency, complex (F,) or (F, E).
         omegas: angular frequencies (F,) [rad/s].
-        b: forces (F, V, 3) complex [N], and the balance of pressures (F, P) [m^3] or None.
-
-    Differentiable in both modes by everything except the free directions. If a matrix has no inverse, its row is NaN.
+        b: complex forces (F, V, 3) [N], and right sides of the volume balance (F, P) [m^3] or None.
     """
 
     V = b[0].shape[1]
@@ -60,14 +63,14 @@ def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: Motions) -> M
         given = (A, factors, omegas, load)
         return jax.pure_callback(_host, shape, *jax.lax.stop_gradient(given), vmap_method="sequential")
 
-    # One array: JAX has no derivative of a linear solve for several arrays if one of them is not used.
+    # One array, because JAX cannot differentiate a linear solve of several arrays if one of them is not used.
     x = jax.lax.custom_linear_solve(product, free(_in_one_row(b)), factorised, symmetric=True)
     u, p = _parted(x, V)
     return u, None if b[1] is None else p
 
 
 def _in_one_row(x: Motions) -> jax.Array:
-    """(F, 3 V + P): all x of the nodes first, the pressures last."""
+    """Return one array (F, 3 V + P): x of all nodes, then y, then z, then the pressures."""
     u, p = x
     columns = jnp.swapaxes(u, 1, 2).reshape(len(u), -1)
     return columns if p is None else jnp.concatenate([columns, p], axis=1)
@@ -79,20 +82,20 @@ def _parted(x: jax.Array, V: int) -> Motions:
 
 
 def at_every(A: Operator, factors: jax.Array, omegas: jax.Array, x: Motions) -> Motions:
-    """`forces_of_motion` at every frequency, one after the other: element matrices are read once each."""
+    """Return `forces_of_motion` at every frequency, computed one after another."""
     return jax.lax.map(lambda at: forces_of_motion(A, *at), (factors, omegas, x))
 
 
 class _Order(NamedTuple):
-    """Places of the entries, and the order of elimination: the same for all moduli and frequencies.
+    """Positions of the matrix entries and order of elimination, which are the same for all moduli and frequencies.
 
-    Here x, y, z of a node follow each other, and the pressures are last.
+    In this numbering, x, y, z of a node follow each other, and the pressures are last.
     """
 
-    pairs: np.ndarray  # (n n E,) place among the blocks of each pair of nodes of an element
-    blocks: "scipy.sparse.csr_array"  # (V, V): two nodes of an element
+    pairs: np.ndarray  # (n n E,) index of the block for each pair of nodes of an element
+    blocks: "scipy.sparse.csr_array"  # (V, V): pairs of nodes with a common element
     free: np.ndarray  # numbers of the free unknowns
-    entries: "scipy.sparse.csr_array | None"  # of free unknowns: places among the blocks; None: there are other entries
+    entries: "scipy.sparse.csr_array | None"  # positions of the free entries in the blocks; None if others exist
     plan: list[multifrontal.Front]
 
 
@@ -125,7 +128,7 @@ def _free_unknowns(A: Any) -> np.ndarray:
 
 
 def _digest(A: Any) -> bytes:
-    """Digest of all arrays of A: it is equal for equal numbers."""
+    """Return a digest of all arrays of A. Equal numbers have an equal digest."""
 
     def of_leaf(leaf: np.ndarray) -> bytes:
         return hashlib.blake2b(np.ascontiguousarray(leaf).data, digest_size=16).digest()
@@ -135,8 +138,8 @@ def _digest(A: Any) -> bytes:
 
 
 def _order(A: Any, free: np.ndarray) -> _Order:
-    """The order for this mesh: the stored one, if the mesh is the same."""
-    import scipy.sparse  # slow to import (a fifth of the package): only where it is used
+    """Return the order for this mesh. If the mesh is the same as before, the stored order is returned."""
+    import scipy.sparse  # imported only where it is used, because it takes a fifth of the package's import time
 
     V, widths = len(A.points), [A.nodes, *(own.nodes for own in A.attached)]
     alone = _elements_alone(A)
@@ -160,13 +163,13 @@ def _order(A: Any, free: np.ndarray) -> _Order:
 
 
 def _elements_alone(A: Any) -> bool:
-    """Whether all entries come from the elements' stiffness and mass, and no node slides."""
+    """Return whether all entries come from stiffness and mass of the elements, and no node slides."""
     other = (A.springs, A.pressures, A.free.normals)
     return all(own is None for own in other) and not A.attached and (A.mass is None or A.mass.ndim == 3)
 
 
 def _entries_of_free(blocks: "scipy.sparse.csr_array", free: np.ndarray) -> "scipy.sparse.csr_array":
-    """Places of the entries of free unknowns among those of all blocks."""
+    """Return the positions of the entries of free unknowns among the entries of all blocks."""
     import scipy.sparse
 
     every = np.arange(9 * blocks.nnz).reshape(-1, 3, 3)
@@ -175,7 +178,7 @@ def _entries_of_free(blocks: "scipy.sparse.csr_array", free: np.ndarray) -> "sci
 
 
 def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
-    """K(omega) - omega^2 M of the free unknowns."""
+    """Return K(omega) - omega^2 M of the free unknowns."""
     import scipy.sparse
 
     V, blocks = len(A.points), order.blocks
@@ -191,7 +194,7 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
         K.resize((size, size))
         K = (K + scipy.sparse.coo_array((values, (lines, columns)), shape=(size, size))).tocsr()
     if A.free.normals is not None:
-        # Nodes that slide: n n^T of each.
+        # Nodes that slide cannot move along their normal n: I - n n^T removes this direction from the equations.
         by_node = np.concatenate([np.arange(3 * V).reshape(3, V).T.ravel(), np.arange(3 * V, size)])
         normals = _with_empty_lines(across(A.free.normals, 3 * V), size)[by_node][:, by_node]
         inside = scipy.sparse.eye_array(size) - normals
@@ -200,9 +203,10 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
 
 
 def _blocks_of_nodes(A: Any, order: _Order, factor: np.ndarray, omega: float) -> np.ndarray:
-    """Sums over the elements, (blocks, 3, 3) complex.
+    """Return the sums over the elements, (blocks, 3, 3) complex.
 
-    Sums are real, and none is computed twice: here large new arrays cost more than the arithmetic.
+    The sums are computed with real numbers, and no sum is computed twice, because large new arrays cost more here than
+    the arithmetic.
     """
     number = order.blocks.nnz
 
@@ -213,7 +217,7 @@ def _blocks_of_nodes(A: Any, order: _Order, factor: np.ndarray, omega: float) ->
     inertia = None if A.mass is None or A.mass.ndim == 1 else omega**2 * summed(A.mass)
     for r, s in np.ndindex(3, 3):
         own, to = A.relaxing[:, r, :, s], data[:, r, s]
-        if factor.ndim:  # by element
+        if factor.ndim:  # one value for each element
             to.real, to.imag = summed(factor.real * own), summed(factor.imag * own)
         else:
             whole = summed(own)
@@ -226,7 +230,8 @@ def _blocks_of_nodes(A: Any, order: _Order, factor: np.ndarray, omega: float) ->
 
 
 def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept: tuple[bytes, bool]) -> np.ndarray:
-    """The solution; its factor is kept for later calls (`kept`: the key, and whether 16 bits are enough)."""
+    """Return the solution, and keep the factor for later calls. `kept`: key of the factor, and whether it is kept as
+    16-bit integers."""
     for single in (True, False):
         if single and K.shape[0] < multifrontal.SINGLE_FROM:
             continue
@@ -247,15 +252,18 @@ def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept:
 def _has_to_be_small(
     K: "scipy.sparse.csr_array", plan: list[multifrontal.Front], single: bool, small: bool
 ) -> bool | None:
-    """Whether the factor has to be kept as 16-bit integers, because `small` asks for it or for lack of memory. None,
-    with a warning, if even this does not fit: without it, the system would end the process without a word."""
+    """Return whether the factor has to be kept as 16-bit integers, either because of `small` or for lack of memory.
+
+    If there is not enough memory even for this, warn and return None. Otherwise the operating system would end the
+    process without a message.
+    """
     free, needed = free_memory(), np.inf
-    for own in (small, single):  # in double precision there are no such integers
+    for own in (small, single):  # 16-bit integers are used only in single precision
         needed = multifrontal.needed_bytes(plan, K.dtype, single, single and own)
         if needed < free:
             return own
     warnings.warn(
-        f"{K.shape[0]} equations of harmonic motion need at least {needed / 1e9:.3g} GB of memory, and "
+        f"{K.shape[0]} equations of harmonic motion need at least {needed / 1e9:.3g} GB of memory, but only "
         f"{free / 1e9:.3g} GB are free: use a coarser mesh, order = 1, or a machine with more memory",
         stacklevel=2,
     )
@@ -263,7 +271,7 @@ def _has_to_be_small(
 
 
 def _keep(key: bytes, factor: multifrontal.Factor) -> None:
-    """Keep factors up to `KEPT` bytes; of one matrix, the factors of the first frequencies."""
+    """Keep a factor if all factors need less than `KEPT` bytes. Factors of other matrices are deleted."""
     for other in [other for other in _factors if other[:16] != key[:16]]:
         del _factors[other]
     if factor.nbytes + sum(own.nbytes for own in _factors.values()) < KEPT:
@@ -280,7 +288,7 @@ def _pivoted(K: Any, b: np.ndarray) -> np.ndarray:
 
 
 def _entries_beside(A: Any, omega: float) -> list[tuple]:
-    """Values, rows and columns of all other entries: masses and springs of nodes, elements between nodes, pressures."""
+    """Return values, rows and columns of all other entries: lumped masses, springs, attached elements and pressures."""
     every, found = 3 * np.arange(len(A.points)), []
     if A.mass is not None and A.mass.ndim == 1:
         found += [(-(omega**2) * A.mass + 0j, every + r, every + r) for r in range(3)]
@@ -303,7 +311,7 @@ def _entries_beside(A: Any, omega: float) -> list[tuple]:
 
 
 def _with_empty_lines(N: Any, size: int) -> Any:
-    """The matrix with rows and columns of 0 appended."""
+    """Return the matrix with appended rows and columns of zeros."""
     import scipy.sparse
 
     N = N.tocoo()

@@ -32,7 +32,7 @@ class Label(NamedTuple):
 
 
 def contains(general: Label, special: Label) -> bool:
-    """Whether the first model equals the second for some values of its parameters."""
+    """Return whether the first model equals the second for some values of its parameters."""
     if general.name == special.name:
         return False
     if general.name == "spectrum" or special.name in SPECIAL_CASES.get(general.name, ()):
@@ -43,8 +43,8 @@ def contains(general: Label, special: Label) -> bool:
 
 
 def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
-    """Index of the model with the lowest criterion. A model counts only if it is better than its special cases by
-    `GENERAL`."""
+    """Return the index of the model with the lowest criterion. A model counts only if its criterion is lower than that
+    of its special cases by `GENERAL`."""
     beaten = {
         j
         for j, general in enumerate(labels)
@@ -68,5 +68,5 @@ class OfAKind(Protocol):
 
 
 def label_of(fit: OfAKind) -> Label:
-    """The label of a fit. Only models made of Prony modes have a number of modes."""
+    """Return the label of a fit. Only models made of Prony modes have a number of modes."""
     return Label(fit.kind.name, fit.modes if fit.kind.values is None else 0)

@@ -1,4 +1,4 @@
-"""Hyperelastic laws as families of models: the parameters to be fitted, and start values for these parameters."""
+"""Hyperelastic laws as families of models: the parameters to be fitted, and starting points for the fit."""
 
 from collections.abc import Callable
 from functools import partial
@@ -22,22 +22,22 @@ class Candidate(NamedTuple):
     units: tuple[str, ...]
     values: Callable[[jax.Array, Any], jax.Array]  # (u, modulus scale [Pa]) -> parameters in the order of `names`
     law: Callable[[jax.Array], Law]  # law with these values, without volumetric energy
-    random: Callable[[np.random.Generator, int], np.ndarray]  # starts (n, len(u))
+    random: Callable[[np.random.Generator, int], np.ndarray]  # random starting points (n, len(u))
     notes: tuple[str, ...] = ()  # sentences on parameters that are not fitted
 
 
 def candidates(name: str, terms: int | None = None) -> list[Candidate]:
-    """The law with this name or at FILE.py:LAW. The name `all` gives all laws of this package. Without `terms`, Ogden's
-    law is returned several times, with different numbers of terms.
+    """Return the law with this name. FILE.py:LAW names the law LAW in a file, and `all` names all laws of this package.
+    Without `terms`, Ogden's law is returned several times, with different numbers of terms.
 
     Raises:
         InputError: unknown law, or a law whose energy is not an isochoric energy plus U(J).
     """
     if terms is not None and name not in ("ogden", "all"):
-        raise InputError(f"--terms {terms} is for ogden only, not for {name}: leave it out")
+        raise InputError(f"--terms {terms} cannot be used with {name}, only with ogden: leave out --terms")
     if name == "all":
         singles = [c for n in laws.LAWS if n != "ogden" and incompressible_form(n) for c in candidates(n)]
-        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term is bogen
+        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term is the law bogen
     typical = gradient_check.load(name)
     if laws.isochoric_part(typical) is None:
         usable = ", ".join(n for n in laws.LAWS if incompressible_form(n))
@@ -48,7 +48,7 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
 
 
 def _candidate(label: str, law: Law) -> Candidate:
-    """The candidate for one law, or for a sum of laws."""
+    """Return the candidate for one law, or for a sum of laws."""
     parts = [s for s in laws.summands(law) if not isinstance(s, laws.Volumetric)]
     if len(parts) > 1:
         return _sum(label, [_candidate(f"{label}, summand {k}", s) for k, s in enumerate(parts)])
@@ -59,7 +59,8 @@ def _candidate(label: str, law: Law) -> Candidate:
 
 
 def _sum(label: str, parts: list[Candidate]) -> Candidate:
-    """The candidate for a sum of laws; parameters are named as in a scene: `1.mu` is mu of the second law."""
+    """Return the candidate for a sum of laws. Parameters have the same names as in a scene: `1.mu` is mu of the second
+    law."""
     ends = np.cumsum([len(p.names) for p in parts])[:-1]  # there are as many unconstrained variables as parameters
 
     def values(u, scale):
@@ -83,7 +84,7 @@ def _sum(label: str, parts: list[Candidate]) -> Candidate:
 
 
 def incompressible_form(name: str) -> bool:
-    """Whether a law is an isochoric energy plus U(J)."""
+    """Return whether a law is an isochoric energy plus U(J)."""
     return laws.isochoric_part(laws.typical(name)) is not None
 
 
@@ -93,7 +94,7 @@ def _single(label: str, typical: Law) -> Candidate:
     middle = np.array([float(getattr(typical, n)) for n in names])
     positive = np.array([f.metadata.get("above") == 0 for f in fields])
     modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
-    # A law with only higher terms has G = 0.
+    # A law with only higher terms has G = 0; its largest modulus is the scale.
     size = abs(ground_state_modulus(typical)) or np.abs(middle[modulus]).max(initial=0.0)
     middle = middle / np.where(modulus, size, 1.0)
 
@@ -115,7 +116,7 @@ def _single(label: str, typical: Law) -> Candidate:
 
 
 def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
-    """The fields to be fitted (their value is not 0), and notes on the fields that are not fitted.
+    """Return the fields to be fitted (their value is not 0), and notes on the fields that are not fitted.
 
     Raises:
         InputError: a parameter is a list, or no parameter is left to be fitted.
@@ -126,24 +127,27 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
     for f in given:
         if isinstance(getattr(law, f.name), Law) or np.ndim(getattr(law, f.name)) > 0:
             raise InputError(
-                f"law {label}: {f.name} of {type(law).__name__} is not a single number: the fit of curves needs a law "
-                "whose parameters are single numbers"
+                f"law {label}: {f.name} of {type(law).__name__} is not a single number, but the fit of curves needs a "
+                "law whose parameters are single numbers"
             )
     zero = [f.name for f in given if float(getattr(law, f.name)) == 0]
     fitted = [f for f in given if f.name not in zero]
     if not fitted:
-        raise InputError(f"law {label}: none of its parameters has a value other than 0: give one to be fitted")
+        raise InputError(
+            f"no parameter of law {label} has a value other than 0: give a value to each parameter that is to be fitted"
+        )
     notes = []
     if zero:
         notes.append(f"{', '.join(zero)} kept at 0 as given")
     if absent:
-        notes.append(f"{', '.join(absent)} left out: to fit them, give them values in a law of your own (FILE.py:LAW)")
-    told = f"{label}: fitted are {', '.join(f.name for f in fitted)}; " + "; ".join(notes)
+        notes.append(f"{', '.join(absent)} are left out (to fit them, give them values in a law FILE.py:LAW)")
+    told = f"{label}: the fitted parameters are {', '.join(f.name for f in fitted)}; " + "; ".join(notes)
     return fitted, (told,) if notes else ()
 
 
 def ground_state_modulus(law: Law) -> float:
-    """Shear modulus in the undeformed state [Pa]. If the law does not give it, dP12/dF12 in this state is returned."""
+    """Return the shear modulus [Pa] in the undeformed state. If the law does not give this modulus, dP12/dF12 in this
+    state is returned."""
     try:
         return float(law.shear_modulus())
     except InputError:
@@ -162,7 +166,8 @@ def _ogden_starts(rng: np.random.Generator, n: int, terms: int) -> np.ndarray:
 
 
 def _ogden(terms: int) -> Candidate:
-    """Ogden's law with G_k = mu_k alpha_k / 2 > 0 in every term, so that it is stable at every stretch."""
+    """Return the candidate for Ogden's law with G_k = mu_k alpha_k / 2 > 0 in every term, so that the law is stable at
+    every stretch."""
     names = tuple(f"{n}[{k}]" for n in ("mu", "alpha") for k in range(terms))
 
     def values(u, scale):
@@ -177,7 +182,7 @@ def _ogden(terms: int) -> Candidate:
 
 
 def _bogen() -> Candidate:
-    """The law `Bogen`: one term of Ogden's law."""
+    """Return the candidate for the law `Bogen`, which is one term of Ogden's law."""
 
     def law(p):
         return laws.Bogen(mu=p[0], alpha=p[1], bulk=None)

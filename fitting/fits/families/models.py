@@ -1,5 +1,5 @@
-"""Further models besides free Prony modes (springpots, a spectrum on a grid, fluids), and the choice between them.
-Their moduli are known in closed form, without simulation.
+"""Further models besides free Prony modes (springpots, a spectrum on a grid, fluids), and the choice between them. The
+moduli of all models are known in closed form, without simulation.
 
 The same information criterion compares all models and chooses the number of modes. For the simulation, each model is
 converted to Prony modes. The fit gives the error of this conversion over the band.
@@ -34,9 +34,9 @@ SHARP = 1e-4
 
 
 def fractional(sweep: Sweep) -> list[Fit]:
-    """Fits every model of `springpots.FRACTIONAL`. Each fit is the best minimum from 24 start points."""
+    """Fit every model of `springpots.FRACTIONAL`. Each fit is the best minimum from 24 starting points."""
     starts = springpots.starting_points(sweep)
-    # A model with as many parameters as data fits any data without residuals. Its fit would prove nothing.
+    # A model with as many parameters as data fits any data without residuals, so its fit would prove nothing.
     most = 2 * len(np.unique(sweep.angular_frequency))
     out = []
     for model in springpots.FRACTIONAL:
@@ -70,8 +70,8 @@ def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution,
 
 
 def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = None) -> Fit:
-    """Fit a smooth, non-negative spectrum with 2 or 3 relaxation times per decade. `found`: a spectrum computed
-    before."""
+    """Fit a smooth, non-negative spectrum with 2 or 3 relaxation times per decade. `found`: the spectrum, if it was
+    computed before."""
     found = found or relaxation_spectrum.fit(sweep)
     solid = int(found.equilibrium > 0)
     strengths = np.concatenate([[found.equilibrium], found.strengths])[1 - solid :]
@@ -125,7 +125,7 @@ def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> as_prony_modes.Conver
 
 
 def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
-    """Add the error of the conversion, and the sentences about the model."""
+    """Add the error of the conversion to Prony modes, and the warnings about the model."""
     sentences = [_cut_off(fit)] if fit.kind.name != "fractional_zener" and fit.kind.effective is None else []
     if made.error > as_prony_modes.ALLOWED:
         sentences.append(
@@ -141,12 +141,13 @@ def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
 def _cut_off(fit: Fit) -> str:
     return (
         f"the model {fit.kind.name} has no finite instantaneous modulus: shear_modulus belongs to the {fit.modes} "
-        "Prony modes that represent the model over the measured band, and is not valid at higher frequencies"
+        "Prony modes that represent the model over the measured band. It is not valid at higher frequencies"
     )
 
 
 def undetermined(fit: Any) -> list[str]:
-    """Sentences on the parameters of a fractional model that the data do not determine. The fit may be of any kind."""
+    """Return warnings about the parameters of a fractional model that the data do not determine. `fit` may be a fit of
+    any data."""
     if fit.parameters is None or fit.kind.effective is not None:
         return []
     free = [n for n, ok in zip(fit.kind.names, determined(fit.parameters), strict=True) if not ok]
@@ -157,7 +158,7 @@ def undetermined(fit: Any) -> list[str]:
 
 
 def at_bounds(own: Estimate) -> list[str]:
-    """A sentence for each exponent at its bound. The standard error of such an exponent has no meaning."""
+    """Return a warning for each exponent at its bound. The standard error of such an exponent has no meaning."""
     out = []
     for name, value, bound in zip(own.names, own.values, _bounded(own), strict=True):
         if bound:
@@ -170,22 +171,22 @@ def at_bounds(own: Estimate) -> list[str]:
 
 
 def determined(own: Estimate) -> np.ndarray:
-    """For each parameter: whether the data determine it. Its error is below half its value, or it is an exponent at 0
-    or 1."""
+    """Return whether the data determine each parameter. A parameter is determined if its standard error is below half
+    its value, or if it is an exponent at 0 or 1."""
     return (own.standard_errors < 0.5 * np.abs(own.values)) | _bounded(own)
 
 
 def _bounded(own: Estimate) -> np.ndarray:
-    """For each parameter: whether it is an exponent at 0 or 1. A nearly elastic solid may have a small exponent with a
-    small error; this exponent is not at its bound."""
+    """Return whether each parameter is an exponent at 0 or 1. A nearly elastic solid may have a small exponent with a
+    small error; such an exponent is not at its bound."""
     off = np.minimum(own.values, 1 - own.values)
     known = (own.standard_errors < 0.1 * np.abs(off)) & (off > SHARP)
     return np.array(["exponent" in name for name in own.names]) & (off < BOUND) & ~known
 
 
 def identifiable(fit: Fit, sweep: Sweep) -> bool:
-    """Whether the fit converged and the data determine every parameter. A spectrum need only converge: it has a
-    prior."""
+    """Return whether the fit converged and the data determine every parameter. A spectrum only has to converge, because
+    it has a prior."""
     if fit.parameters is None:
         return viscoelastic.identifiable(fit, sweep)
     return fit.converged and (fit.kind.effective is not None or bool(np.all(determined(fit.parameters))))
@@ -211,7 +212,7 @@ def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
 
 
 def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> list[Fit]:
-    """The fits from which `choose` chooses. The arguments are the same as for `choose`."""
+    """Return the fits of all models that `choose` compares. The arguments are the same as for `choose`."""
     tried: list[Fit] = []
     if model in ("fractional", "auto"):
         tried += fractional(sweep)
@@ -225,19 +226,21 @@ def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) ->
 
 
 def best_of_models(tried: Sequence[Fit], sweep: Sweep) -> tuple[Fit, list[Fit]]:
-    """The best model, and all models whose parameters the data determine. If there is no such model, all of `tried`."""
+    """Return the best model, and all models whose parameters the data determine. If there is no such model, all of
+    `tried` are returned."""
     able = [fit for fit in tried if identifiable(fit, sweep)] or list(tried)
     return able[preferred([label_of(f) for f in able], [information_criterion(f) for f in able])], able
 
 
 def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
-    """The model with the lowest criterion (`preferred`) among the models whose parameters the data determine.
+    """Return the fit with the lowest information criterion (`preferred`) among the models whose parameters the data
+    determine.
 
     Args:
         sweep: data.
         model: one of `MODELS` except "prony".
-        prony: the best fit of Prony modes; with "auto" it is compared too.
-        dense: the same argument as in `viscoelastic.closed_form`.
+        prony: the best fit of Prony modes, which is compared too if `model` is "auto".
+        dense: spectrum of the sweep, as in `viscoelastic.closed_form`.
     """
     tried = every_model(sweep, model, prony, dense)
     chosen, able = best_of_models(tried, sweep)
@@ -251,7 +254,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
 
 
 def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
-    """The criterion of each model, best first."""
+    """Return the criterion of each model, best first."""
     best = min(information_criterion(fit) for fit in tried)
     rows = [
         {
@@ -269,8 +272,8 @@ def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
 
 
 def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
-    """Sentences if another model fits the data about as well, or if it fits them better but the data do not determine
-    all its parameters."""
+    """Return warnings if another model fits the data about as well, or if another model fits better but the data do not
+    determine all its parameters."""
     best, out = min(tried, key=information_criterion), []
     if information_criterion(best) < information_criterion(chosen) - STRONG:
         apart = information_criterion(chosen) - information_criterion(best)
@@ -288,13 +291,13 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     return [
         *out,
         f"{second.kind.name} explains the data about as well as {chosen.kind.name} (criterion {apart:.2g} higher; 10 "
-        "is strong evidence): the data do not decide between these models, and outside the measured band they may "
-        "differ much",
+        "is strong evidence). The data do not decide between these models, which may differ much outside the measured "
+        "band",
     ]
 
 
 def comparison(fit: Fit) -> list[str]:
-    """Lines with the criterion of each model, best first; no lines if only one model was fitted."""
+    """Return lines with the criterion of each model, best first. There are no lines if only one model was fitted."""
     rows = fit.details.get("models_compared", [])
     if len(rows) < 2:
         return []

@@ -1,7 +1,9 @@
-"""A smooth spectrum on a fixed grid of relaxation times, from a test in time or from several tests together.
+"""A smooth spectrum on a fixed grid of relaxation times, from one relaxation or creep test or from several tests
+together.
 
-Stress is linear in the strengths, so sweeps and relaxation tests need one solution only (`relaxation_spectrum`). Creep
-and shear waves are not linear in the strengths. For them the linearised problem is solved repeatedly.
+Stress is linear in the strengths of the spectrum, so one linear problem is enough for sweeps and relaxation tests
+(`relaxation_spectrum`). Creep and shear waves are not linear in the strengths. For them the linearised problem is
+solved repeatedly.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,8 +25,8 @@ from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 from liverjax.solvers.blas import one_blas_thread
 
-#: Weights of the second differences that are tried, largest first; and the maximum number of iterations for each
-# weight.
+#: WEIGHTS: tried weights of the second differences, largest first. MOST_TANGENTS: maximum number of iterations for each
+#: weight.
 WEIGHTS, MOST_TANGENTS = np.logspace(4, -6, 21), 30
 #: A search ends if the cost decreases by less than this part (STILL). A strength of 0 is replaced by NONE, in the unit
 # of the grid.
@@ -32,19 +34,20 @@ STILL, NONE = 1e-9, 1e-12
 
 
 class SpectrumFit(NamedTuple):
-    """A spectrum with everything that the reports of tests need."""
+    """A spectrum with all results for the reports of tests."""
 
     kind: Kind
-    model: Maxwell  # few Prony modes that represent it
+    model: Maxwell  # few Prony modes that represent the spectrum
     solution: Solution
-    spread: Estimate  # of these modes
+    spread: Estimate  # parameters of these modes
     own: Estimate  # equilibrium modulus and strengths
     details: Content
     sentences: tuple[str, ...]
 
 
 def _modes_on_grid(grid: GridOfTimes) -> Callable[[np.ndarray], Maxwell]:
-    """A NumPy function from equilibrium modulus and strengths (…, 1 + K) in units of the grid to Prony modes."""
+    """Return a NumPy function from equilibrium modulus and strengths (…, 1 + K), in units of the grid, to Prony
+    modes."""
 
     def maxwell(x):
         strengths = grid.unit * (x + NONE)
@@ -62,8 +65,8 @@ class _Minimum(NamedTuple):
 
 
 def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> _Minimum:
-    """Least squares with x >= 0 and the smoothness of the grid. Gauss-Newton begins at x and halves each step until the
-    cost falls."""
+    """Return the least-squares minimum for x >= 0 and the smoothness of the grid. Gauss-Newton begins at x and halves
+    each step until the cost falls."""
     L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
     kind = Kind("spectrum", _modes_on_grid(grid))
 
@@ -94,11 +97,11 @@ def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> 
 def spectrum_of(
     tests: Sequence[Measured], near: Maxwell, noise: np.ndarray
 ) -> tuple[GridSpectrum, GridOfTimes, _Minimum]:
-    """The spectrum with the grid and the smoothness weight that have the best evidence.
+    """Return the spectrum for the grid and the smoothness weight with the best evidence, this grid, and the minimum.
 
     Args:
-        tests: one or more.
-        near: Prony modes with about the same moduli. They give the unit of each strength.
+        tests: one or more tests.
+        near: Prony modes with about the same moduli. These modes give the unit of each strength.
         noise: relative noise of each test.
     """
     low, high = together.resolved_by(tests)
@@ -111,7 +114,7 @@ def spectrum_of(
         x = np.concatenate([[0.5], np.full(len(times), 1 / per_decade)])
         for weight in WEIGHTS / np.exp(np.mean(np.log(noise))) ** 2:
             grid = GridOfTimes(times, unit, per_decade, float(weight))
-            with one_blas_thread():  # the matrices are small
+            with one_blas_thread():  # small matrices are faster with one thread
                 found = _minimum(kinds, data, grid, x)
             x, told = found.x, relaxation_spectrum.described(found.x, found.J, found.r, grid)
             if best is None or told.evidence < best[0].evidence:
@@ -128,14 +131,14 @@ def _weighed_parts(tests: Sequence[Measured], noise: np.ndarray) -> list:
 def _as_a_fit(
     tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, told: GridSpectrum, over: Callable | None = None
 ) -> SpectrumFit:
-    """The spectrum as a fit. `over` divides the residuals at the minimum by their noise; with None, the noise is
-    estimated."""
+    """Return the spectrum as a fit. `over` divides the residuals at the minimum by their noise. If `over` is None, the
+    noise is estimated."""
     low, high = together.resolved_by(tests)
     kept = found.x[1:] > 1e-10 * found.x.max()
     solid = told.equilibrium > 0
     free = np.concatenate([[solid], kept])
     strengths = np.concatenate([[told.equilibrium], told.strengths])[1 - int(solid) :]
-    slopes = (found.J / grid.unit)[:, free] * strengths  # derivatives by the logarithms of the strengths
+    slopes = (found.J / grid.unit)[:, free] * strengths  # derivatives with respect to the logs of the strengths
     prior = told.prior[:, 1 - int(solid) :] * strengths
 
     def moduli(u, omega):
@@ -177,7 +180,7 @@ def _as_a_fit(
 
 
 def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
-    """The spectrum of a relaxation or creep test; `near`: Prony modes of about the same moduli."""
+    """Return the spectrum of a relaxation or creep test. `near`: Prony modes with about the same moduli."""
     told, grid, found = spectrum_of([test], near, np.ones(1))
     fit = _as_a_fit([test], grid, found, told)
     _, answer, scales = together.reported_numbers(test)
@@ -187,7 +190,8 @@ def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
 
 
 def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -> Together:
-    """The spectrum of several tests, each with its own noise. `near` and `noise` are the same as in `spectrum_of`."""
+    """Return the spectrum of several tests, each with separate noise. `near` and `noise` are the same as in
+    `spectrum_of`."""
     parts = [together.reported_numbers(t) for t in tests]
     for _ in range(2):
         told, grid, found = spectrum_of(tests, near, noise)

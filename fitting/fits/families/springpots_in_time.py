@@ -1,8 +1,8 @@
-"""Springpot models for tests in time and for several tests together, and the choice between all models.
+"""Springpot models for relaxation and creep tests and for several tests together, and the choice between all models.
 
-The response of a springpot model is computed with many modes of its relaxation spectrum (`springpots.as_modes`). Drive,
-ramp and creep are therefore computed as for Prony modes. The fit varies and reports only the few parameters of the
-springpot model.
+The response of a springpot model is computed with many modes of its relaxation spectrum (`springpots.as_modes`). The
+responses to any load are therefore computed as for Prony modes. The fit varies and reports only the few parameters of
+the springpot model.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,17 +33,17 @@ from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 
-#: Number of starts for each model; standard deviation of the random starts around the start from Prony modes; maximum
-# number of iterations.
+#: STARTS: number of starting points for each model. AROUND: standard deviation of the random starting points around the
+#: point from Prony modes. MOST_STEPS: maximum number of iterations.
 STARTS, AROUND, MOST_STEPS = 10, 1.0, 80
-#: An exponent is a logistic function of its variable. For variables above this size, the slope is too small to begin a
-# search.
+#: An exponent is a logistic function of its variable. For variables above this size, the derivative is too small to
+#: begin a search.
 MOST_LOGIT = 2.0
 
 
 class Spans(NamedTuple):
-    """Times [s] of the modes with which springpots are computed, and the frequency [rad/s] to which their parameters
-    refer."""
+    """Times [s] of the modes that represent springpots, and the frequency [rad/s] to which the parameters of the
+    springpots refer."""
 
     low: float  # shortest time [s] that the tests resolve
     high: float
@@ -52,13 +52,14 @@ class Spans(NamedTuple):
 
 
 def spans_of(tests: Sequence[Measured]) -> Spans:
-    """The spans of all times that the tests resolve."""
+    """Return the times and the frequency for all times that the tests resolve."""
     low, high = together.resolved_by(tests)
     return Spans(low, high, springpots.times_of_modes(low, high), float(1 / np.sqrt(low * high)))
 
 
 def _dense_modes(case: Fractional, spans: Spans) -> Callable[[Array], Maxwell]:
-    """A function, in NumPy or JAX, from the variables u of the model to the Prony modes of its relaxation spectrum."""
+    """Return a function, in NumPy or JAX, from the variables u of the model to the Prony modes of its relaxation
+    spectrum."""
 
     def maxwell(u):
         return springpots.as_modes(springpots.full(case, u), case.switches, spans.times, spans.reference)
@@ -67,7 +68,7 @@ def _dense_modes(case: Fractional, spans: Spans) -> Callable[[Array], Maxwell]:
 
 
 def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], jax.Array]:
-    """A JAX function from the variables u of the model to the residuals (m,) of a relaxation or creep test."""
+    """Return a JAX function from the variables u of the model to the residuals (m,) of a relaxation or creep test."""
     (case,) = (c for c in FRACTIONAL if c.name == name)
     maxwell, (at, measured, scales) = _dense_modes(case, spans_of([test])), together.reported_numbers(test)
 
@@ -78,7 +79,7 @@ def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], j
 
 
 def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.ndarray, data: list) -> Solution:
-    """The best minimum of a model for tests from starts (S, P).
+    """Return the best minimum of a model for tests, from starting points (S, P).
 
     `data`: for each test, the arrays from which it is predicted, its measured values, and the divisors of its
     residuals.
@@ -89,8 +90,8 @@ def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.nda
 
 
 def _starts_near(model: Maxwell, spans: Spans) -> list[np.ndarray]:
-    """Starts (STARTS, P) for each model. The first start fits the model to the moduli of Prony modes; the others lie
-    around it."""
+    """Return starting points (STARTS, P) for each model. The first point fits the model to the moduli of Prony modes;
+    the others lie around the first."""
     omega = np.geomspace(1 / spans.high, 1 / spans.low, 24)
     like, rng = Sweep(omega, *generalised_maxwell.moduli(model, omega)), np.random.default_rng(0)
     first = [np.asarray(fit.solution.u) for fit in models.fractional(like)]
@@ -98,7 +99,8 @@ def _starts_near(model: Maxwell, spans: Spans) -> list[np.ndarray]:
 
 
 def _around(u: np.ndarray, case: Fractional, rng: np.random.Generator) -> np.ndarray:
-    """Random starts (STARTS - 1, P) around the variables u (P,) of a model. Exponents do not begin near 0 or 1."""
+    """Return random starting points (STARTS - 1, P) around the variables u (P,) of a model. Exponents do not begin near
+    0 or 1."""
     near = np.where(np.array(case.free) % 2 == 1, np.clip(u, -MOST_LOGIT, MOST_LOGIT), u)
     return near + AROUND * rng.standard_normal((STARTS - 1, len(u)))
 
@@ -108,16 +110,17 @@ class _Springpot(NamedTuple):
 
     case: Fractional
     kind: Kind
-    model: Maxwell  # few Prony modes that represent it
+    model: Maxwell  # few Prony modes that represent the springpot model
     solution: Solution
-    spread: Estimate  # of the Prony modes
-    own: Estimate  # of the springpot model's parameters
+    spread: Estimate  # parameters of the Prony modes
+    own: Estimate  # parameters of the springpot model
     sentences: tuple[str, ...]
     error: float  # largest relative error of the few Prony modes over the band
 
 
 def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise: bool) -> _Springpot:
-    """A model at its minimum. `over_noise`: the residuals are divided by a known noise, so no noise is estimated."""
+    """Return a model at its minimum. `over_noise`: whether the residuals are divided by a known noise, so that no noise
+    is estimated."""
 
     def at(u, omega):
         return springpots.moduli(springpots.full(case, u), case.switches, omega / spans.reference)
@@ -148,15 +151,14 @@ def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise
 
 
 def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
-    """Whether the fit converged and the data determine every parameter."""
+    """Return whether the fit converged and the data determine every parameter."""
     if fit.parameters is not None:
         return fit.converged and (fit.kind.effective is not None or bool(np.all(models.determined(fit.parameters))))
     return fit.converged and not uncertainty.superfluous(data, fit.uncertainty)
 
 
 def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
-    """Fits every springpot model to a relaxation or creep test. `near`: Prony modes from which the starts are
-    computed."""
+    """Fit every springpot model to a relaxation or creep test. `near`: Prony modes that give the starting points."""
     spans, data = spans_of([test]), [together.reported_numbers(test)]
     _, answer, scales = data[0]
     out = []
@@ -172,7 +174,7 @@ def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
 
 
 def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> TimeFit:
-    """The model with the lowest criterion among the models whose parameters the test determines.
+    """Return the fit with the lowest information criterion among the models whose parameters the test determines.
 
     Args:
         test: data.
@@ -197,7 +199,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
 def _with_ends_of_record(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
     fit = fit._replace(details=fit.details | {CONSTANT_NOISE: test.constant_noise})
     if time_tests.ELASTIC in fit.details and not fit.converged:
-        return fit  # its modes mean nothing
+        return fit  # its modes have no meaning
     fit = with_rise_of_load(fit, test, prony)
     return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise]), test)
 
@@ -206,12 +208,12 @@ AFit = TypeVar("AFit", TimeFit, Together)
 
 
 def _preferred_of(fits: Sequence[AFit], criterion: Callable[[AFit], float]) -> AFit:
-    """The fit to choose, by `choice.preferred`."""
+    """Return the fit that `choice.preferred` selects."""
     return fits[choice.preferred([choice.label_of(f) for f in fits], list(map(criterion, fits)))]
 
 
 def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Band) -> list[Content]:
-    """The criterion of each model compared, best first."""
+    """Return the criterion of each compared model, best first."""
     best = min(map(criterion, tried))
     rows: list[Content] = [
         {
@@ -225,7 +227,7 @@ def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Ban
     return sorted(rows, key=lambda row: row["above_the_lowest"])
 
 
-#: Minimum number of answers of a test whose residuals are asked for the size of its noise.
+#: Minimum number of measured values of a test for a check whether its noise has a constant size.
 _ENOUGH = 10
 #: Fields that are times in seconds.
 TIMES = ("run_time", "compile_time")
@@ -242,8 +244,8 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
 
 
 def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
-    """Fits every springpot model to several tests, each with its own noise. `near`: Prony modes that give the
-    starts."""
+    """Fit every springpot model to several tests, each with separate noise. `near`: Prony modes that give the starting
+    points."""
     spans, parts = spans_of(tests), [together.reported_numbers(t) for t in tests]
     out = []
     for case, starts in zip(FRACTIONAL, _starts_near(near, spans), strict=True):
@@ -267,9 +269,10 @@ def choose_together(
     progress: Callable[[str], None] = lambda text: None,
     relative: float = 0.0,
 ) -> Together:
-    """The model with the lowest criterion for several tests. Arguments: see `choose_in_time` and `together.fit`.
+    """Return the fit with the lowest information criterion for several tests. See `choose_in_time` and `together.fit`
+    for the arguments.
 
-    `relative`: relative error of all moduli of a test that comes from the size of its sample.
+    `relative`: relative error of all moduli of a test due to the size of its sample.
     """
     tests = [_by_its_noise(test) for test in tests]
     prony = together.fit(tests, modes, progress)
@@ -279,14 +282,15 @@ def choose_together(
 
 
 def _by_its_noise(test: Measured) -> Measured:
-    """The test; a test in time is told whether its noise has a constant size, if it has enough answers."""
+    """Return the test. A relaxation or creep test with enough values is marked if its noise has a constant size
+    (`constant_noise`)."""
     if not isinstance(test, TimeTest) or np.sum(test.used) < _ENOUGH:
         return test
     return fitted_by_its_noise(test)[0]
 
 
 def _best_of_models(tests: list[Measured], model: str, prony: Together, progress: Callable[[str], None]) -> Together:
-    """The model with the lowest criterion among `prony` and the other models that `model` asks for."""
+    """Return the fit with the lowest information criterion among `prony` and the other models that `model` selects."""
     band = together.ResolvedBand(spans_of(tests)[:2])
     tried = [prony] if model == "auto" else []
     if model in ("fractional", "auto"):
@@ -313,7 +317,7 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
 
 
 def _shares_of_springpots(fit: Together) -> list[Share]:
-    """Errors of the springpot's parameters without each test, and the misfit of a fit to each test alone."""
+    """Return the errors of the springpot parameters without each test, and the misfit of a fit to each test alone."""
     (case,) = (c for c in FRACTIONAL if c.name == fit.kind.name)
     parts = [together.reported_numbers(t) for t in fit.tests]
     assert fit.kind.values is not None and fit.parameters is not None

@@ -1,5 +1,5 @@
-"""Noise that neighbouring answers of a test in time share. If the noise is treated as independent, the standard errors
-of the parameters are too small. Here they are corrected."""
+"""Noise that is correlated between neighbouring measured values of a relaxation or creep test. If the noise is treated
+as independent, the standard errors of the parameters are too small. This module corrects the standard errors."""
 
 from collections.abc import Callable
 from functools import partial
@@ -20,10 +20,10 @@ _UNEVEN_FROM = 1.3
 
 
 def fitted_by_its_noise(test: TimeTest, modes: int | str = "auto") -> tuple[TimeTest, TimeFit]:
-    """Prony modes of a test whose noise may have a constant size, and the test with `constant_noise` if it has.
+    """Return the test and the fit of its Prony modes. The test has `constant_noise` if its noise has a constant size.
 
-    The first fit takes the noise in proportion to the answers. If its residuals show noise of a constant size, the
-    test is fitted again with equal scales. Otherwise small answers would have too much weight.
+    The first fit assumes noise that is proportional to the measured values. If its residuals show noise of a constant
+    size, the test is fitted again with equal scales. Otherwise small values would have too much weight.
     """
     fit = time_tests.fit(test, modes)
     if test.constant_noise or not _has_constant_noise(fit):
@@ -33,7 +33,8 @@ def fitted_by_its_noise(test: TimeTest, modes: int | str = "auto") -> tuple[Time
 
 
 def _has_constant_noise(fit: TimeFit) -> bool:
-    """Whether the residuals are noise of a constant size. Residuals with a structure say nothing about the noise."""
+    """Return whether the residuals are noise of a constant size. Residuals with a structure contain no information
+    about the noise."""
     if not (fit.converged and fit.uncertainty.noise > 0 and np.all(np.isfinite(fit.uncertainty.standard_errors))):
         return False
     if fit.relative_errors.max() <= viscoelastic.EXACT or time_tests.structured_misfit(fit):
@@ -42,8 +43,9 @@ def _has_constant_noise(fit: TimeFit) -> bool:
 
 
 def with_own_noise(fit: TimeFit) -> TimeFit:
-    """The fit with standard errors for its real noise. Neighbours may share noise (`with_alike_noise`). The noise may
-    also be larger at some answers than at others, for example if it grows with time.
+    """Return the fit with standard errors for its real noise. The noise of neighbours may be correlated
+    (`with_alike_noise`). The noise may also be larger for some values than for others, for example if the noise grows
+    with time.
     """
     own = fit.parameters
     if fit.kind.effective is not None or not np.all(np.isfinite((own or fit.uncertainty).standard_errors)):
@@ -61,8 +63,8 @@ def with_own_noise(fit: TimeFit) -> TimeFit:
 
 
 def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
-    """The estimate with its errors raised to the errors of a covariance, given by its square root (P, k), where the
-    latter are much larger."""
+    """Return the estimate with larger errors, where another covariance gives much larger ones. `root` (P, k): square
+    root of this covariance."""
     ratio = np.linalg.norm(root, axis=1) / np.where(estimate.standard_errors > 0, estimate.standard_errors, np.inf)
     factor = np.where(np.isfinite(ratio) & (ratio > _UNEVEN_FROM), ratio, 1.0)
     return estimate._replace(
@@ -71,10 +73,11 @@ def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
 
 
 def with_alike_noise(fit: TimeFit) -> TimeFit:
-    """The fit with standard errors for noise that neighbouring answers share, if the residuals show such noise.
+    """Return the fit with standard errors for noise that is correlated between neighbouring values, if the residuals
+    show such noise.
 
-    Neighbours may be near each other in time, for example in a drift. Or they may be near in the order of the answers,
-    for example if the instrument averages or the model misses a part of the spectrum. The more probable case is used.
+    Neighbours may be near each other in time, for example in a drift. Or they may be near in the order of the values,
+    for example if the instrument averages or the model lacks a part of the spectrum. The more probable case is used.
     """
     r, J = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian)
     numbers = fit.parameters or fit.uncertainty
@@ -100,8 +103,8 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
     if own is not None and fit.kind.values is not None:
         own = _of_such_noise(own, fit.kind.values, u, alike.root, alike.independent)
     sentence = (
-        f"neighbouring answers share their noise, or the model misses something: {len(r)} answers measure as much as "
-        f"{alike.independent:.0f} of independent noise; the standard errors are those of such noise"
+        f"neighbouring values share their noise (it is correlated), or the model is inadequate. The {len(r)} values "
+        f"carry the information of {alike.independent:.0f} independent values; the standard errors include this"
     )
     details = fit.details | {INDEPENDENT: float(alike.independent)}
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, sentence), details=details)
@@ -111,16 +114,17 @@ def _modes_of(fit: TimeFit) -> Callable:
     return partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
 
 
-#: The noise counts as constant in size if this raises the logarithm of the probability by more than this value.
+#: The noise counts as constant in size if this assumption raises the log of the probability by more than this value.
 _CONSTANT = 3.0
 
 
 def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Standard deviations of the residuals r (m,), and whether the noise has a constant size. Otherwise the noise is in
-    proportion to the answers. The residuals decide which case is more probable."""
-    # The scales contain the measured answers with their noise, and this noise would seem to depend on J. So the fitted
-    # answers are used here.
-    if np.ptp(fit.scales) == 0:  # the fit knows already that the noise is constant
+    """Return the standard deviations of the residuals r (m,), and whether the noise has a constant size. Otherwise the
+    standard deviation of the noise is proportional to the measured response. The residuals decide which case is more
+    probable."""
+    # The scales contain the measured values with their noise, and this noise would seem to depend on J. So the fitted
+    # values are used here.
+    if np.ptp(fit.scales) == 0:  # the fit already assumes constant noise
         equal = np.ones(len(r))
         return probability_of_sizes(J, r, equal)[1] * equal, True
     lower = fit.scales**2 - fit.measured**2
@@ -134,7 +138,7 @@ def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool
 def _of_such_noise(
     estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray, independent: float | None = None
 ) -> Estimate:
-    """The estimate with the errors of a covariance of u, given by its square root (p, k)."""
+    """Return the estimate with the errors of a covariance of u, given by its square root `root` (p, k)."""
     root = host.with_jacobian(natural_of, u)[1] @ root
     errors, correlation = errors_and_correlation(root)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)

@@ -1,6 +1,6 @@
-"""Noise that neighbouring frequencies of a sweep share, for example in a drift. If the noise is treated as independent,
-the standard errors of the parameters are too small. Here they are corrected. A model that misses a part of the spectrum
-leaves residuals of this kind too.
+"""Noise that is correlated between neighbouring frequencies of a sweep, for example because of a drift. If the noise is
+treated as independent, the standard errors of the parameters are too small. This module corrects the standard errors. A
+model that lacks a part of the spectrum leaves residuals of this kind too.
 """
 
 from collections.abc import Callable
@@ -14,18 +14,20 @@ from fitting.methods.estimate import Estimate, errors_and_correlation, wider
 from fitting.methods.noise.alike_noise import LOST, Alike, along_rows
 from fitting.readers.frequency_sweep import Sweep
 
-#: Key in `Fit.details`: so many moduli with independent noise would tell as much as the measured moduli.
+#: Key in `Fit.details`: the number of moduli with independent noise that carry the same information as the measured
+#: moduli.
 INDEPENDENT = "independent_moduli"
-#: Key in `Fit.details`: the standard errors that independent noise would give, by name.
+#: Key in `Fit.details`: the standard errors for independent noise, by name.
 OF_INDEPENDENT = "errors_of_independent_noise"
-#: If there is such noise, a sentence on structured residuals ends with these words about the standard errors.
-CONTAINED = "the standard errors contain it as noise that neighbours share"
-#: First words of the sentence on noise that neighbours share.
+#: If there is such noise, a warning about structured residuals ends with these words about the standard errors.
+CONTAINED = "the standard errors contain it as correlated noise of neighbours"
+#: First words of the warning about noise that is correlated between neighbours.
 SHARED = "neighbouring frequencies share their noise"
 
 
 def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
-    """The fit with standard errors for noise that neighbouring frequencies share, if the residuals show such noise."""
+    """Return the fit with standard errors for noise that is correlated between neighbouring frequencies, if the
+    residuals show such noise."""
     repeated = len(np.unique(sweep.angular_frequency)) < len(sweep.angular_frequency)
     alike = None if repeated else alike_of(fit)
     if alike is None:
@@ -35,17 +37,18 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
     if own is not None and fit.kind.values is not None:
         own = not_below(own, fit.kind.values, u, alike.root)
     told = (
-        f"{SHARED}, or the model misses something: {2 * len(fit.storage)} moduli measure as much as "
-        f"{alike.independent:.0f} of independent noise; the standard errors are those of such noise"
+        f"{SHARED} (it is correlated), or the model is inadequate. The {2 * len(fit.storage)} moduli carry the "
+        f"information of {alike.independent:.0f} independent moduli; the standard errors include this"
     )
     fluid = uncertainty.like_a_fluid(modes, uncertainty.LOWER) if fit.kind.name == "prony" else []
-    fluid = [] if any("(a fluid)" in w for w in fit.warnings) else fluid  # told before, with smaller errors
+    fluid = [] if any("(a fluid)" in w for w in fit.warnings) else fluid  # reported before, with smaller errors
     details = fit.details | {INDEPENDENT: float(alike.independent)}
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, *fluid, told), details=details)
 
 
 def alike_of(fit: Fit) -> Alike | None:
-    """The noise that neighbouring frequencies share; None if the residuals show none. No frequency may occur twice.
+    """Return the noise that is correlated between neighbouring frequencies, or None if the residuals show none. No
+    frequency may occur twice.
 
     The result is also None for spectra, because their errors come from a prior, and for exact data.
     """
@@ -61,8 +64,8 @@ def alike_of(fit: Fit) -> Alike | None:
 
 
 def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray) -> Estimate:
-    """The estimate with its errors from noise raised to the errors of a covariance of u, where the latter are larger.
-    `root`: square root (p, k) of this covariance. Errors that all points share are added again unchanged.
+    """Return the estimate with larger errors from noise, where another covariance of u gives larger ones. `root`:
+    square root (p, k) of this covariance. Errors that are common to all points are added again unchanged.
     """
     shared = np.zeros((len(estimate.values), 0)) if estimate.shared is None else estimate.shared
     noise = np.asarray(estimate.root)[:, : np.shape(estimate.root)[1] - shared.shape[1]]

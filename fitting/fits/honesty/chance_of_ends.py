@@ -1,4 +1,4 @@
-"""How far noise alone moves the parameters of a fit if points at one end of the band are left out."""
+"""Change of the fitted parameters due to noise alone, if points at one end of the band are left out."""
 
 from functools import partial
 
@@ -21,17 +21,17 @@ SMOOTH, ENOUGH = 0.5, 16
 
 
 def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]:
-    """For each parameter of `edges.values`: standard deviation of its change by noise alone, if only the points `kept`
-    (n,) are fitted. It is of first order in the noise.
+    """Return, for each parameter of `edges.values`, the standard deviation of its change due to noise alone if only the
+    points `kept` (n,) are fitted. This estimate is of first order in the noise.
 
-    Both fits share the kept points. The variance of the change is therefore the variance of the difference between the
-    two fits, not the variance of the new fit.
+    Both fits contain the kept points. The variance of the change is therefore that of the difference between the two
+    fits, not that of the new fit.
     """
     J, names, slope = np.asarray(fit.solution.jacobian), *_slopes_of_reported(fit)
     points = 2 * len(kept)
     if not (np.all(np.isfinite(J)) and len(J) >= points and len(kept) == len(fit.storage)):
         return dict.fromkeys(names, 0.0)
-    rows = np.concatenate([kept, kept, np.ones(len(J) - points, bool)])  # rows of a prior stay
+    rows = np.concatenate([kept, kept, np.ones(len(J) - points, bool)])  # residuals of a prior stay
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     change = -np.linalg.pinv(J / scale)
     change[:, rows] += np.linalg.pinv(J[rows] / scale)
@@ -40,17 +40,19 @@ def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]
 
 
 def farthest_by_chance(fit: Fit | TimeFit, numbers: int) -> float:
-    """Quantile of Student's t: in a part `CHANCE` of all fits, the largest change at the two ends exceeds it by chance.
+    """Return a quantile of Student's t. The largest change at the two ends, divided by its standard deviation, exceeds
+    this quantile by chance in a part `CHANCE` of all fits.
 
     Args:
         fit: the fit whose residuals give the noise.
-        numbers: how many parameters are compared at each end.
+        numbers: number of parameters that are compared at each end.
     """
     return float(scipy.special.stdtrit(max(1.0, fit.uncertainty.freedom), 1 - CHANCE / (4 * max(1, numbers))))
 
 
 def _slopes_of_reported(fit: Fit) -> tuple[list[str], np.ndarray]:
-    """Names of the reported parameters, and their derivatives by u (P, p). This also holds for a compressed sample."""
+    """Return the names of the reported parameters, and their derivatives (P, p) with respect to u, also for a
+    compressed sample."""
     u = np.asarray(fit.solution.u)
     if fit.parameters is not None:
         assert fit.kind.values is not None
@@ -68,14 +70,14 @@ def _slopes_of_reported(fit: Fit) -> tuple[list[str], np.ndarray]:
 
 
 def _as_reported(slope: np.ndarray, natural: np.ndarray, reported: np.ndarray) -> np.ndarray:
-    """Derivatives (P, p) of the reported parameters. If the sample was compressed, they are the fit's derivatives times
-    a factor."""
+    """Return the derivatives (P, p) of the reported parameters. If the sample was compressed, each parameter is the
+    fitted value times a factor, and so is its derivative."""
     return slope * np.divide(reported, natural, out=np.ones_like(natural), where=natural != 0)[:, None]
 
 
 def _noise_of_residuals(fit: Fit, sweep: Sweep, J: np.ndarray) -> np.ndarray:
-    """Noise of each residual (2n,), divided by its scale. Residuals that are smooth from point to point are not
-    noise."""
+    """Return the noise (2n,) of the residuals, divided by their scales. Residuals that are smooth from point to point
+    are not noise."""
     r, n = np.asarray(fit.solution.residuals)[: len(J)], len(J) // 2
     own = None if fit.kind.effective is not None else grouped_sizes(J, r, np.arange(2 * n) >= n)
     sizes = np.full(2 * n, fit.uncertainty.noise) if own is None else own

@@ -1,7 +1,9 @@
-"""Tests that contradict each other: would they agree if all moduli of one test were multiplied by one factor?
+"""For tests that contradict each other, this module checks whether they agree if all moduli of one test are multiplied
+by one factor.
 
 Another temperature, a wrong size of the sample or a wrong calibration changes all moduli of a test by the same factor.
-A common fit lies between such tests and follows none of them. Here this factor is one more parameter of the fit.
+A common fit lies between such tests and follows none of them. In this module, the factor is one more parameter of the
+fit.
 """
 
 from collections.abc import Callable
@@ -20,12 +22,12 @@ CERTAIN, LEAST = 4.0, 0.005
 
 
 def told(fit: Together, relative: float = 0.0) -> list[str]:
-    """A sentence on the test whose factor makes all tests agree. No sentence if the tests agree already, or if no
-    factor helps.
+    """Return a warning that names the test and the factor that make all tests agree. There is no warning if the tests
+    agree already, or if no factor makes them agree.
 
-    Ratios and times can compensate a factor of a few percent: the common fit then follows each test nearly as well as a
-    fit to this test alone. Wrong sizes of the samples explain a small factor; `relative` is the relative error of the
-    moduli of each test from these sizes.
+    Ratios and times can compensate a factor of a few percent. The common fit then follows each test nearly as well as a
+    fit to this test alone. Wrong sizes of the samples explain a small factor. `relative` is the relative error of the
+    moduli of each test due to these sizes.
     """
     if fit.kind.effective is not None:
         return []
@@ -42,20 +44,20 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
     if abs(np.log(factor)) < 2 * np.sqrt(2) * relative:
         return [
             said + "errors in the sizes of the samples explain this factor, and the errors that include these "
-            "sizes contain it"
+            "sizes contain this factor"
         ]
     return [
         said
-        + "look for another temperature, another sample, or a wrong size of the sample; until this is clear, fit the "
-        "tests one by one"
+        + "look for another temperature, another sample, or a wrong size of the sample. Until the cause is known, fit "
+        "each test separately"
     ]
 
 
 def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
-    """Factor of all moduli of test k [1], its standard error, and the largest remaining misfit of a test, divided by
-    the misfit of a fit to this test alone.
+    """Return the factor [1] of all moduli of test k, its standard error, and the largest remaining relative misfit. The
+    relative misfit of a test is its misfit divided by that of a fit to this test alone.
 
-    None if the factor is 1 within its error, or if the fit still misses a test.
+    Returns None if the factor is 1 within its error, or if the misfit of a test is still large.
     """
     names = list(map(together.name_of, fit.tests))
     parts = [together.reported_numbers(t) for t in fit.tests]
@@ -71,7 +73,7 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
         return np.concatenate(r, axis=-1), np.concatenate(J, axis=-2)
 
     counts, common = [len(y) for _, y, _ in data], np.append(np.asarray(fit.solution.u), 0.0)[None]
-    if fit.kind.values is not None:  # a springpot: it cannot begin at starts of modes
+    if fit.kind.values is not None:  # a springpot cannot begin at starting points of modes
         return _certain(from_starts(evaluate, common), counts)
     # If tests contradict each other, their common fit may have too few modes.
     more, answer = together.MORE if together.disagreements(fit.shares) else 0, None
@@ -85,7 +87,7 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
 
 
 def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] | None:
-    """The result of `factor_of` from the solution. `counts`: the number of residuals of each test."""
+    """Return the result of `factor_of` from the solution. `counts`: the number of residuals of each test."""
     left = np.split(np.asarray(found.residuals), np.cumsum(counts)[:-1])
     worst = max(float(np.sqrt(np.mean(r**2))) for r in left)
     last = np.eye(len(found.u))[-1:]
@@ -97,8 +99,8 @@ def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] |
 
 
 def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
-    """Starts that follow the other tests, with the factor that moves their prediction to test k. The common fit is no
-    good start for a large factor.
+    """Return starting points that follow the other tests, with the factor that shifts their prediction of test k to the
+    measured values. The common fit is not a good starting point for a large factor.
     """
     others = [t for j, t in enumerate(fit.tests) if j != k]
     band = together.ResolvedBand(together.resolved_by(others))
@@ -108,7 +110,7 @@ def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
     with np.errstate(all="ignore"):
         apart = np.abs(np.log(np.abs(measured / (residuals * scales + measured))))
     size = np.nan_to_num(np.median(apart, axis=-1), nan=0.0, posinf=0.0)
-    # A compliance falls if moduli grow, so the sign of the logarithm is not known: one of both signs is right.
+    # A compliance falls if moduli grow, so the sign of the logarithm is unknown and both signs are tried.
     return np.concatenate([np.column_stack([found, sign * size]) for sign in (1, -1)])
 
 

@@ -16,14 +16,14 @@ from fitting.methods.least_squares import from_starts
 from fitting.readers.rheometer import Sweep, some
 
 HALF_DECADE = float(np.sqrt(10))
-#: Name of the check of the data, as its sentences contain it; and names of the two repeated fits in the report.
+#: KRAMERS_KRONIG: name of the check of the data in its warnings. PARTS: names of the two repeated fits in the report.
 KRAMERS_KRONIG = "Kramers-Kronig"
 PARTS = ("without_first_half_decade", "without_last_half_decade")
 
 
 def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
-    """Add to the fit the influence of the ends, the structure of its residuals, and the checks that need only the
-    data."""
+    """Add to the fit the influence of the ends of the band, a check of its residuals for structure, and the checks that
+    need only the data."""
     wider = with_alike_points(fit, sweep)
     if wider is not fit:
         own = {name: error for name, (_, error) in values(fit).items()}
@@ -60,7 +60,7 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
 
 
 def _with_long_times(fit: Fit, sweep: Sweep) -> Fit:
-    """Adds the interval of the equilibrium modulus, if the unknowns of the fit are only those of Prony modes."""
+    """Add the interval of the equilibrium modulus, if the only unknowns of the fit are Prony modes."""
     if fit.parameters is not None or len(fit.solution.u) != 2 * fit.modes + (fit.kind.name != FLUID.name):
         return fit
     fluid = fit.kind.name == FLUID.name
@@ -73,32 +73,33 @@ def _with_long_times(fit: Fit, sweep: Sweep) -> Fit:
 
 
 def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
-    """A sentence: no model can fit much better, because most of the misfit comes from the data."""
+    """Return a warning that no model can fit much better, because most of the misfit comes from the data."""
     errors, closer = fit.relative_errors(sweep), fit.kind.effective is None
     return (
-        f"{MISSES} by {100 * errors.mean():.2g} % on average and by {100 * errors.max():.3g} % at most; the best "
-        f"spectrum of any shape still misses them by {100 * misfit:.2g} % ({KRAMERS_KRONIG}), so a part is in the "
-        f"data: look for drift, or strain beyond the linear range{'; --model auto shows what comes closer' * closer}"
+        f"{MISSES} by {100 * errors.mean():.2g} % on average and by {100 * errors.max():.3g} % at most. The best "
+        f"spectrum of any shape still misses them by {100 * misfit:.2g} % ({KRAMERS_KRONIG}), so the data cause a part "
+        "of the misfit: look for drift, or strain beyond the linear "
+        f"range{'; --model auto shows what comes closer' * closer}"
     )
 
 
 def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
-    """Change of each parameter, by name, if the first or the last half decade is left out.
+    """Return the change of each parameter, by name, if the first or the last half decade is left out.
 
-    The entry is None if too few points are left. For a spectrum, only the equilibrium modulus is compared.
+    The changes of an end are None if too few points are left. For a spectrum, only the equilibrium modulus is compared.
     """
     return {part: _change(fit, sweep, kept) for part, kept in _points_left(sweep).items()}
 
 
 def _points_left(sweep: Sweep) -> dict[str, np.ndarray]:
-    """For each point (n,): whether it is kept if the first half decade is left out, and if the last one is left out."""
+    """Return whether each point (n,) is kept if the first half decade is left out, and if the last one is left out."""
     omega = sweep.angular_frequency
     kept = (omega > omega[0] * HALF_DECADE * (1 + 1e-9), omega < omega[-1] / HALF_DECADE * (1 - 1e-9))
     return dict(zip(PARTS, kept, strict=True))
 
 
 def values(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
-    """Parameters that are compared, with their standard errors, by their names in the report."""
+    """Return the compared parameters with their standard errors. Their names in the report are the keys."""
     from fitting.methods.uncertainty import equilibrium_error
 
     if fit.parameters is not None:
@@ -112,17 +113,17 @@ def values(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
 
 
 def moved(fit: Fit) -> set[str]:
-    """Names of the parameters that the ends of the band decide (`decided_by`)."""
+    """Return the names of the parameters that depend strongly on the ends of the band (`decided_by`)."""
     return {name for part in PARTS for name in decided_by(fit, part)}
 
 
 def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
-    """Parameters that change by more than their standard error and by more than noise explains, if the half decade of
-    `part` is left out. The value is the change divided by the larger of these two limits.
+    """Return the parameters that change by more than their standard error and by more than noise explains, if the half
+    decade of `part` is left out. The value is the size of the change, divided by the larger of these two limits.
     """
     changes, known = (fit.details.get("band_sensitivity") or {}).get(part) or {}, values(fit)
     by_noise = (fit.details.get("band_scatter") or {}).get(part) or {}
-    # If a model misses the data, its smooth residuals are not noise. They do not explain a change.
+    # If a model misses the data, its smooth residuals are not noise and do not explain a change.
     known |= {name: (known[name][0], e) for name, e in fit.details.get(OF_INDEPENDENT, {}).items() if name in known}
     far, out = chance_of_ends.farthest_by_chance(fit, len(changes)), {}
     for name, change in changes.items():
@@ -134,10 +135,10 @@ def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
 
 
 def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None:
-    """New values minus old values, where the new values are fitted to the kept points."""
+    """Return new values minus old values. The new values are fitted to the kept points."""
     if len(np.unique(sweep.angular_frequency[kept])) <= max(2, len(fit.solution.u) // 2 + 1):
         return None
-    # Each kept point keeps its weight from the whole sweep: curves and standard deviations are smoothed only once.
+    # Each kept point has its weight from the whole sweep, because standard deviations are smoothed only once.
     storage_sd, loss_sd = sweep.deviations
     part = some(sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd), kept)
     old = {name: value for name, (value, _) in values(fit).items()}
@@ -172,7 +173,8 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
 
 
 def _moved_most(fit: Fit) -> list[str]:
-    """A sentence on both ends. For each end it names the three parameters that change most."""
+    """Return a warning about both ends of the band. For each end, the warning names the three parameters that change
+    most."""
     known, told = values(fit), []
     for part, end in zip(PARTS, ("first", "last"), strict=True):
         beyond = decided_by(fit, part)
@@ -185,8 +187,8 @@ def _moved_most(fit: Fit) -> list[str]:
     if not told:
         return []
     return [
-        f"{'; '.join(told)}: more than independent noise explains, so the ends of the band decide them: take the total "
-        "errors, or measure a wider band"
+        f"{'; '.join(told)}. Independent noise does not explain such changes, so these parameters depend on the ends "
+        "of the band: use the total errors, or measure a wider band"
     ]
 
 

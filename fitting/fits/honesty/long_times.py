@@ -1,8 +1,9 @@
-"""Interval of the equilibrium modulus that a test leaves open, because parts of the material may relax after its end.
+"""Interval of the equilibrium modulus that is possible because parts of the material may relax after the end of the
+test.
 
 The standard error is a linear estimate at the minimum, for the chosen modes. The data hardly distinguish a mode from
-the equilibrium modulus if its relaxation time is near the end of the test or beyond it. So the equilibrium modulus is
-held at several values, and all other parameters are fitted again (a profile likelihood). Relaxation times may be up to
+the equilibrium modulus if its relaxation time is near the end of the test or longer. So the equilibrium modulus is
+fixed at several values, and all other parameters are fitted again (a profile likelihood). Relaxation times may be up to
 `BEYOND` times the longest time that the test resolves. If one more mode follows the data much more closely, the
 interval is computed with this mode.
 """
@@ -26,16 +27,16 @@ from liverjax.core.struct import Content
 
 #: Factor by which relaxation times may lie beyond the shortest and the longest time that the test resolves.
 BEYOND = 10.0
-#: One more mode is needed if it lowers the sum of squares, divided by the variance of the noise, by more than this.
+#: One more mode is used if it lowers the sum of squares, divided by the variance of the noise, by more than this.
 CLOSER = 10.0
-#: Start values for the relaxation time of this additional mode, divided by the longest time that the test resolves.
+#: Starting values of the relaxation time of this additional mode, divided by the longest time that the test resolves.
 SLOW = (0.3, 1.0, 3.0)
-#: Start value for the strength of the additional mode in a fluid, divided by the sum of all strengths (G0).
+#: Starting value of the strength of the additional mode in a fluid, divided by the sum of all strengths (G0).
 SLOW_PART = 0.1
-#: Number of bisections for each end, and maximum number of iterations of each fit.
+#: BISECTIONS: number of bisections for each end of the interval. ITERATIONS: maximum number of iterations of each fit.
 BISECTIONS, ITERATIONS = 6, 60
-#: An interval is reported if the distance of its farther end exceeds two limits: WIDER times the half width of the 95 %
-#: interval from the standard error, and LARGE times the modulus.
+#: An interval is reported if the distance of its farther end exceeds two limits. The first is WIDER times the half
+#: width of the 95 % interval from the standard error. The second is LARGE times the modulus.
 WIDER, LARGE = 2.0, 0.05
 #: Half width of a 95 % interval, divided by the standard error, for many independent residuals.
 NORMAL = 1.96
@@ -47,7 +48,7 @@ class Interval(NamedTuple):
     low: float  # [Pa]
     high: float
     longest: float  # relaxation time [s] up to which materials are considered
-    modes: int  # of the model
+    modes: int  # number of modes of the model
 
 
 class _Family(NamedTuple):
@@ -58,7 +59,7 @@ class _Family(NamedTuple):
     ends: tuple[float, float]  # logs of the shortest and the longest time
 
     def unknowns(self, strengths: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """u (2 N,) of strengths [Pa] and times [s]."""
+        """Return u (2 N,) from strengths (N,) [Pa] and times (N,) [s]."""
         part = (np.log(times) - self.ends[0]) / (self.ends[1] - self.ends[0])
         return np.concatenate([np.log(strengths), scipy.special.logit(np.clip(part, 1e-3, 1 - 1e-3))])
 
@@ -66,12 +67,12 @@ class _Family(NamedTuple):
 def equilibrium_interval(
     tests: Sequence[Measured], noises: Sequence[float], model: Maxwell, error: float, independent: float = 1.0
 ) -> Interval | None:
-    """The 95 % interval of the equilibrium modulus of Prony modes; None if no fit succeeded.
+    """Return the 95 % interval of the equilibrium modulus of Prony modes. Returns None if no fit succeeded.
 
     Args:
         tests: the fitted tests, one or more.
-        noises: a factor for the scales of each test, known or from the fit.
-        model: the modes that were chosen.
+        noises: for each test, a known or fitted factor that turns its scales into standard deviations.
+        model: the chosen modes.
         error: standard error [Pa] of the equilibrium modulus; it may be infinite.
         independent: number of independent residuals, divided by the number of all residuals.
     """
@@ -121,7 +122,7 @@ def _family(tests: Sequence[Measured], noises: Sequence[float], times: tuple[flo
 def _with_one_more(
     family: _Family, model: tuple[float, np.ndarray, np.ndarray], longest: float, found: Solution
 ) -> tuple[float, Solution]:
-    """The equilibrium modulus and the fit at the minimum; with one more slow mode if the data need this mode."""
+    """Return the equilibrium modulus and the fit at the minimum. One more slow mode is used if the data need it."""
     rest, strengths, times = model
     noise = max(1.0, 2 * float(found.cost) / max(1, len(found.residuals) - len(found.u) - 1))
     best = (rest, found)
@@ -136,7 +137,7 @@ def _with_one_more(
 
 
 def _end(family: _Family, modulus: float, found: Solution, limit: float, step: float, whole: float) -> float:
-    """The equilibrium modulus on one side of the minimum at which the sum of squares reaches its limit."""
+    """Return the equilibrium modulus at which the sum of squares reaches its limit, on one side of the minimum."""
     u, inside, outside = np.asarray(found.u), modulus, None
     while outside is None:
         trial = max(0.0, inside + step)
@@ -163,13 +164,13 @@ AFit = TypeVar("AFit", Fit, TimeFit, Together)
 
 
 def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float], factor: float = 1.0) -> AFit:
-    """The fit of Prony modes with the interval of its equilibrium modulus, and a warning if this interval is much wider
-    than the standard error says. Fits of other models are returned unchanged.
+    """Return the fit of Prony modes with the interval of its equilibrium modulus. A warning is added if this interval
+    is much wider than the interval from the standard error. Fits of other models are returned unchanged.
 
     Args:
         fit: the fit of these tests.
         tests, noises: see `equilibrium_interval`.
-        factor: equilibrium modulus in the fit divided by that in the data; not 1 if the sample was compressed.
+        factor: equilibrium modulus in the fit divided by the one in the data, different from 1 for a compressed sample.
     """
     if fit.parameters is not None or not fit.converged:
         return fit
@@ -192,10 +193,10 @@ def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float],
 
 
 def _told_interval(ends: tuple[float, float, float], error: float, found: Interval, whole: float) -> list[str]:
-    """A sentence if an end of (low, value, high) lies much farther from the value than two standard errors.
+    """Return a warning if an end of (low, value, high) lies much farther from the value than two standard errors.
 
-    The comparison uses the factor `NORMAL` even for few independent residuals, where Student's t is larger: a reader
-    takes the number after ± as a standard error.
+    The comparison uses the factor `NORMAL` even for few independent residuals, where Student's t is larger, because
+    readers understand the number after ± as a standard error.
     """
     low, rest, high = ends
     where = f"if parts of the material relax in up to {found.longest:.3g} s"
@@ -203,12 +204,12 @@ def _told_interval(ends: tuple[float, float, float], error: float, found: Interv
         if high < LARGE * whole:
             return []
         return [
-            f"a solid follows the data as well as the fluid: {where}, its equilibrium modulus is 0 to {high:.3g} Pa "
-            "(95 %): only a longer test can decide"
+            f"a solid follows the data as well as the fluid. Its equilibrium modulus may be 0 to {high:.3g} Pa (95 %), "
+            f"{where}: only a longer test can decide"
         ]
     if max(rest - low, high - rest) <= max(WIDER * NORMAL * error, LARGE * rest):
         return []
     return [
-        f"{SHORT}: {where}, the equilibrium modulus is {low:.3g} to {high:.3g} Pa (95 %); {rest:.4g} ± "
+        f"{SHORT}: the equilibrium modulus may be {low:.3g} to {high:.3g} Pa (95 %), {where}. The value {rest:.4g} ± "
         f"{error:.2g} Pa holds only for the chosen modes"
     ]

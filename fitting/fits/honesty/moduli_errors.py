@@ -1,8 +1,8 @@
-"""Errors of the fitted moduli, with the error from the choice of the model.
+"""Errors of the fitted moduli. They contain the error due to the choice of the model.
 
 Models that explain the data about equally well differ in their moduli. Each model gets its Akaike weight, and the
-weighted differences between the models become part of the error (Buckland, Burnham and Augustin 1997, Biometrics 53,
-603; for few data Hurvich and Tsai 1989, Biometrika 76, 297).
+weighted differences between the models become part of the error. Sources: Buckland, Burnham and Augustin 1997,
+Biometrics 53, 603; for few data Hurvich and Tsai 1989, Biometrika 76, 297.
 """
 
 import numpy as np
@@ -19,13 +19,14 @@ NEGLIGIBLE = 1e-4
 
 
 def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
-    """G' then G'' (2n,) [Pa] of a fit in closed form, by the delta method.
+    """Return G' then G'' (2n,) [Pa] of a fit in closed form, with errors by the delta method (linear propagation of
+    errors).
 
     The errors come from noise and from the choice of the model. They also contain the errors of gap and instrument if
-    the fit has these.
+    the fit has them.
 
     Args:
-        fit: the fit; `rivals` has the other models if it was chosen from several.
+        fit: the fit; its field `rivals` has the other models if several were fitted.
         omega: angular frequencies (n,) [rad/s].
         noise_given: whether the data have standard deviations.
     """
@@ -45,14 +46,14 @@ def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
 
 
 def model_weights(fit: Fit) -> dict[str, float]:
-    """Weight of each model [1] in the errors of the moduli, by name, with the chosen model first. Empty if there is no
-    other model."""
+    """Return the weight [1] of each model in the errors of the moduli, by name, with the chosen model first. The result
+    is empty if there is no other model."""
     others = {other.kind.name: weight for weight, other in _weighed(fit)}
     return {fit.kind.name: 1 - sum(others.values())} | others if others else {}
 
 
 def _weighed(fit: Fit) -> list[tuple[float, Fit]]:
-    """The rivals whose weight is above `NEGLIGIBLE`, with their weights."""
+    """Return the other models whose weight is above `NEGLIGIBLE`, with their weights."""
     evidence = np.array([_akaike(own) for own in (fit, *fit.rivals)])
     shares = np.exp(-0.5 * (evidence - evidence.min()))
     shares /= shares.sum()
@@ -60,13 +61,14 @@ def _weighed(fit: Fit) -> list[tuple[float, Fit]]:
 
 
 def _akaike(fit: Fit) -> float:
-    """Akaike's criterion with the correction for few data."""
+    """Return Akaike's information criterion with the correction for few data."""
     m, k = 2 * len(fit.storage), number_of_parameters(fit)
     return float(m * np.log(mean_square(fit)) + 2 * k * m / max(1.0, m - k - 1))
 
 
 def _shared_errors(fit: Fit, omega: np.ndarray) -> np.ndarray:
-    """Change (s, 2n) [Pa] of the moduli by one standard deviation of each shared error (gap, instrument)."""
+    """Return the change (s, 2n) [Pa] of the moduli if a systematic error (gap, instrument), common to all points,
+    changes by one standard deviation. There is one row for each error."""
     shared, n = fit.uncertainty.shared, fit.modes
     if shared is None:
         return np.zeros((0, 2 * len(omega)))

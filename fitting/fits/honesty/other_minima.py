@@ -1,9 +1,9 @@
-"""Other parameters of a law that follow the tests equally well: do they predict the same stress in tension and
-compression?
+"""Other parameters of a law may follow the tests equally well. This module checks whether they predict the same stress
+in tension and compression.
 
 In simple shear and pure shear one principal stretch is 1 and the other two are l and 1/l. In these tests, one term (mu,
 alpha) of Ogden's law equals the term (-mu, -alpha). In tension and compression, the stresses of the two terms differ by
-a factor of several.
+a large factor.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,23 +13,25 @@ import numpy as np
 
 from liverjax.laws import Law, homogeneous
 
-#: Widest range of stretches over which stresses are compared; and the ratio of stresses above which a sentence is
-#: given.
+#: _STRETCHES: widest range of stretches in which stresses are compared. _RATIO: a warning is given if stresses differ
+#: by more than this factor.
 _STRETCHES, _RATIO = (0.7, 1.4), 1.1
-#: Parameters within this relative difference are the same; maximum number of parameter sets that are compared.
+#: _SAME: parameter sets within this relative difference count as equal. _MOST: maximum number of compared parameter
+#: sets.
 _SAME, _MOST = 0.02, 12
 
 
 def of_other_minima(
     names: Sequence[str], law_of: Callable[..., Law], values: np.ndarray, every: np.ndarray, F: np.ndarray
 ) -> list[str]:
-    """A sentence if another minimum has the same cost as the best one, but another stress in tension or compression.
+    """Return a warning if another minimum has the same cost as the best one, but another stress in tension or
+    compression.
 
     Args:
         names: names of the parameters of the law (P,).
         law_of: function from parameters (P,) to the law with these parameters.
         values: fitted parameters (P,).
-        every: parameters (S, P) from all starts that reached the cost of the fit.
+        every: parameters (S, P) of all searches that reached the cost of the fit.
         F: deformation gradients (n, 3, 3) of the tests. The compared stretches stay within the stretches of the tests,
             or within 1 % of 1.
     """
@@ -49,8 +51,8 @@ def of_other_minima(
         if not 1 / _RATIO < ratios[k] < _RATIO:
             numbers = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, other, strict=True))
             return [
-                f"other parameters follow these tests as well ({numbers}), but their stress at a stretch of "
-                f"{stretches[k]:.2g} is {ratios[k]:.2g} times that of the given parameters: add a test of tension or "
+                f"other parameters follow these tests as well ({numbers}). At a stretch of {stretches[k]:.2g}, their "
+                f"stress is {ratios[k]:.2g} times the stress of the given parameters: add a test in tension or "
                 "compression"
             ]
     return []

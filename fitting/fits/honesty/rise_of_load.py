@@ -1,7 +1,9 @@
-"""A load that changes between two rows of a test in time. No row shows how, so a straight change is assumed.
+"""A load that changes between two rows of the file of a relaxation or creep test. No row shows how the load changed, so
+a linear change is assumed.
 
-If the load was a step at the later row, less had relaxed until then, and G0 is smaller. If the rows begin under load,
-it may have been a step at 0 s. The change matters if relaxation times are as short as the time between the two rows.
+If the load was a step at the later row, the material had relaxed less until then, and G0 is smaller. If the sample is
+already loaded in the first row, the load may have been a step at 0 s. The change matters if relaxation times are as
+short as the time between the two rows.
 """
 
 from fitting.fits import time_tests
@@ -9,20 +11,20 @@ from fitting.fits.families import limits
 from fitting.fits.time_tests import TimeFit
 from fitting.readers.time_tests import BEFORE_ROWS, TimeTest, with_steps
 
-#: Key in `TimeFit.details`: changes of G0, ratios, times and equilibrium modulus if the load was a step, by name.
+#: Key in `TimeFit.details`: changes, by name, of G0, ratios, times and equilibrium modulus if the load was a step.
 OF_A_STEP = "change_if_the_load_was_a_step"
-#: The change is told if that of G0 exceeds this many standard errors.
+#: The changes are reported if the change of G0 exceeds this many standard errors.
 SHOWN = 2.0
 
 
 def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
-    """The fit with a sentence, if G0 changes by more than `SHOWN` standard errors where changes of the load that no row
-    shows were steps. A fit of Prony modes also gets the changes of its parameters.
+    """Return the fit with a warning, if G0 changes by more than `SHOWN` standard errors when each change of the load
+    between rows is a step. A fit of Prony modes also gets the changes of its parameters.
 
     Args:
-        fit: of any model.
+        fit: fit of any model.
         test: data.
-        prony: the fit of Prony modes. It tells the change of G0 for other models.
+        prony: the fit of Prony modes, which gives the change of G0 for other models.
     """
     own = prony if fit.parameters is not None else fit
     if not len(test.jumps) or not own.converged:
@@ -67,6 +69,7 @@ def _remedy_of_jumps(test: TimeTest) -> str:
 
 
 def share_of_rise(fit: TimeFit, names: list[str]) -> dict[str, float]:
-    """Size of the change of each parameter if the load was a step; 0 if `with_rise_of_load` has told none."""
+    """Return the size of the change of each parameter if the load was a step. The size is 0 if `with_rise_of_load`
+    found no change."""
     changes = fit.details.get(OF_A_STEP, {})
     return {name: abs(changes.get(name, 0.0)) for name in names}

@@ -1,10 +1,10 @@
-"""Stress that relaxes before the first answer of a test in time is missing in G0. The way in which the stress begins
-to fall tells how much may be missing.
+"""Stress that relaxes before the first measured value of a relaxation or creep test is missing in G0. The missing part
+is estimated from the decrease of the stress at the beginning of the record.
 
-Let r be the fall in one half decade divided by the fall in the next one. If r < 1 stays the same, the falls before the
-record are r, r^2, … times the fall in its first half decade. One relaxation time far longer than the first time of the
-record gives r = 0.32, and nothing is missing in G0. A stress that falls as a power of time gives r >= 1, and G0 has no
-upper bound.
+Let r be the decrease of the stress in one half decade, divided by the decrease in the next one. If r < 1 is constant,
+the decreases before the record are r, r^2, … times the decrease in its first half decade. One relaxation time far
+longer than the first time of the record gives r = 0.32, and nothing is missing in G0. If the stress is a negative power
+of time, r >= 1 and G0 has no upper bound.
 """
 
 import numpy as np
@@ -16,18 +16,18 @@ from fitting.readers.time_tests import TimeTest
 HALF_DECADE = float(np.sqrt(10))
 #: Key in `TimeFit.details`: part of G0 [Pa] that the record does not show.
 MISSING = "relaxed_before_the_record"
-#: Above this ratio of two falls, the fall before the record has no bound.
+#: If the ratio r of two decreases is above this value, the decrease before the record has no bound.
 LEAST_SLOWING = 0.9
-#: The fall, or the missing part of G0, is reported if it exceeds this many standard errors of G0.
+#: The decrease, or the missing part of G0, is reported if it exceeds this many standard errors of G0.
 SHOWN = 2.0
 
 
 def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
-    """The fit of Prony modes with the part that may be missing in G0, and a sentence, if this part exceeds `SHOWN`
-    standard errors of G0.
+    """Return the fit of Prony modes. If the part that may be missing in G0 exceeds `SHOWN` standard errors of G0, this
+    part and a warning are added.
 
-    Fits of other models, of records shorter than a decade, and of records with an answer at the moment of the load are
-    returned unchanged.
+    The fit is returned unchanged in three cases: the model is not a Prony series; the record covers less than one
+    decade of time; the record contains a value at the instant of loading.
     """
     first, last = test.resolved
     if fit.parameters is not None or not fit.converged or test.answers_at_once or last < HALF_DECADE**2 * first:
@@ -42,8 +42,8 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
         what = "stress" if test.kind == "relaxation" else "relaxation modulus"
         told = (
             f"the {what} falls by {100 * fall / whole:.2g} % in the first half decade of the record, and by "
-            f"{100 * max(next_fall, 0.0) / whole:.2g} % in the next: nothing tells how much relaxed before {first:.3g} "
-            "s, and G0 does not contain it; begin earlier, or compare --model auto"
+            f"{100 * max(next_fall, 0.0) / whole:.2g} % in the next. It is unknown how much relaxed before {first:.3g} "
+            "s, and G0 does not contain this part: begin the record earlier, or compare --model auto"
         )
         return fit._replace(warnings=(*fit.warnings, told))
     missing = fall * ratio / (1 - ratio) - (whole - G[0])
@@ -58,6 +58,6 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
 
 
 def _relaxation_modulus(model: Maxwell, time: np.ndarray) -> np.ndarray:
-    """G(t) [Pa] at times (n,) [s]."""
+    """Return the relaxation modulus G(t) (n,) [Pa] at times (n,) [s]."""
     relaxed = -np.expm1(-time[:, None] / np.asarray(model.relaxation_times))
     return np.asarray(float(model.shear_modulus) * (1 - relaxed @ np.asarray(model.ratios)))

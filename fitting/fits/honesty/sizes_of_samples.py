@@ -1,7 +1,7 @@
-"""Several tests: the errors of the parameters that come from errors in the sizes of the samples.
+"""Errors of the parameters of several tests due to errors in the sizes of the samples.
 
-Torque over twist is G pi R^4 / 2 h, so a wrong gap h or radius R multiplies all moduli of a test by a factor. In one
-test this factor changes G0 alone. If tests are fitted together and each has another factor, ratios and times change
+Torque divided by twist is G pi R^4 / (2 h), so a wrong gap h or radius R multiplies all moduli of a test by a factor.
+In one test this factor changes G0 alone. If tests with different factors are fitted together, ratios and times change
 too.
 """
 
@@ -17,7 +17,8 @@ from fitting.waves.dispersion import Dispersion
 
 
 def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, float]]:
-    """Errors of each parameter from noise and from the sizes of the samples. The strengths of a spectrum are left out.
+    """Return the errors of each parameter due to noise and due to the sizes of the samples. The strengths of a spectrum
+    are left out.
 
     Args:
         fit: the common fit.
@@ -39,7 +40,8 @@ def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, flo
 
 
 def _by_sizes(fit: Together) -> np.ndarray:
-    """Derivative (P, K) of each parameter by the logarithm of the factor of each test's moduli."""
+    """Return the derivatives (P, K) of the P parameters with respect to the logarithms of the factors of the K tests.
+    The factor of a test multiplies all its moduli."""
     J, u = np.asarray(fit.solution.jacobian), fit.solution.u
     of = fit.kind.values if fit.parameters is not None else None
     _, slope = with_slope(of or partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)

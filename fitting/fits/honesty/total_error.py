@@ -1,4 +1,4 @@
-"""The total error of every parameter: the share from noise, and the shares from other sources.
+"""The total error of every parameter. It has one share from noise, and one share from each of several other sources.
 
 The shares are independent of each other, so the total is the root of the sum of their squares. The scatter between
 samples is not included: the parameters describe the measured curve, not the material.
@@ -15,12 +15,13 @@ from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.uncertainty import equilibrium_change
 
-#: Usual standard deviations [m] of the gap that the instrument displays, and of the radius of the plates.
+#: Usual standard deviations [m]: GAP of the gap that the instrument displays, RADIUS of the radius of the plates.
 GAP, RADIUS = 50e-6, 10e-6
 
 
 def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
-    """Relative error of all moduli from the size of the sample between its plates. Torque over twist is G pi R^4 / 2 h.
+    """Return the relative error of all moduli due to the size of the sample between the plates. Torque divided by twist
+    is G pi R^4 / (2 h) for the radius R and the gap h.
 
     If a `gap_error` [m] is given, the standard errors contain it already, and it is not counted here.
     """
@@ -29,14 +30,14 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
 
 
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
-    """Errors by their source, then by the names of `edges.values`.
+    """Return the errors by source and then by parameter, with the names of `edges.values`.
 
     The share `band` is the larger change of a parameter if one end of the band is left out. It counts only if noise
-    does not explain the change (`edges.decided_by`); the square of the change by noise is subtracted from its square.
-    If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter. The share `long_times`
-    comes from the farther end of `long_times.equilibrium_interval`, as a standard deviation. The share `short_times` is
-    the part of G0 that `short_times` finds to be missing.
-    The share `rise_of_load` is the change if the load was a step at the row that shows it first.
+    does not explain the change (`edges.decided_by`), and the square of the change due to noise is subtracted from its
+    square. If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter. The share
+    `long_times` comes from the farther end of `long_times.equilibrium_interval`, as a standard deviation. The share
+    `short_times` is the part of G0 that `short_times` finds to be missing. The share `rise_of_load` is the change if
+    the load was a step at the row that shows it first.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -51,8 +52,8 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
         for name in edges.decided_by(fit, part):
             change, scatter = (fit.details[key][part][name] for key in ("band_sensitivity", "band_scatter"))
             beyond = np.sqrt(max(0.0, change**2 - max(noise[name], scatter) ** 2))
-            # If the other points do not determine a parameter, its change may have any size. Then its error is its
-            # size.
+            # If the other points do not determine a parameter, its change may have any size, so the size of the
+            # parameter is used as the error.
             own = max(abs(known[name][0]), noise[name])
             out["band"][name] = max(out["band"][name], float(own if beyond > edges.RUNS_AWAY * own else beyond))
     for source, moved in (("mesh", fit.uncertainty.mesh_bias), ("time_step", fit.uncertainty.time_step_bias)):
@@ -72,12 +73,12 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
 
 
 def total_errors(fit: Fit | TimeFit) -> dict[str, float]:
-    """Root of the sum of the squares of `error_shares`, by the names of `edges.values`."""
+    """Return the total error of each parameter: the root of the sum of the squares of its `error_shares`."""
     return root_of_squares(error_shares(fit))
 
 
 def root_of_squares(shares: dict[str, dict[str, float]]) -> dict[str, float]:
-    """Total errors by name, from shares of independent sources."""
+    """Return the total errors by name, from the errors of independent sources."""
     return {name: float(np.sqrt(sum(part[name] ** 2 for part in shares.values()))) for name in shares["noise"]}
 
 
@@ -88,7 +89,8 @@ def _moduli(fit: Fit | TimeFit) -> set[str]:
 
 
 def _of_modes(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
-    """Absolute changes by name: `moved` (P,) of G0, ratios and times, and the change of the equilibrium modulus."""
+    """Return absolute changes by name, from the changes `moved` (P,) of G0, ratios and times. The change of the
+    equilibrium modulus is added."""
     out = {name: abs(float(d)) for name, d in zip(fit.uncertainty.names, moved, strict=True)}
     out["equilibrium_modulus"] = abs(float(equilibrium_change(fit.uncertainty.values, moved)))
     return {name: out[name] for name in edges.values(fit)}

@@ -1,5 +1,5 @@
-"""If the misfit of a stress-stretch curve has structure: what its columns may contain instead of stretch and nominal
-stress."""
+"""Errors in the columns of a stress-stretch curve. If the misfit has structure, this module tests whether the columns
+contain other quantities than stretch and nominal stress."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,17 +14,18 @@ from fitting.methods.kramers_kronig import CHANCE, runs_probability
 from fitting.readers.curves import Curve
 from liverjax.laws import Law, homogeneous
 
-#: Minimum number of points of a curve whose residuals are tested; below the second value, residuals are roundoff.
+#: _FEWEST: minimum number of points of a curve whose residuals are tested. _EXACT: residuals below this value are
+#: roundoff.
 _FEWEST, _EXACT = 8, 1e-6
-#: A cause is reported if it lowers the criterion by more than _BETTER and if the order of the remaining residuals has a
-#: probability above _RANDOM.
+#: A cause is reported if it lowers the criterion by more than _BETTER and if the remaining residuals look random
+#: (probability of their order above _RANDOM).
 _BETTER, _RANDOM = 10.0, 0.05
 _stress = jax.jit(homogeneous.nominal_stress)
 
 
 class _Cause(NamedTuple):
-    """Another meaning of the columns of a curve, as two functions: (driven, number) -> true driven quantity, and
-    (nominal stress, driven, number) -> stress column.
+    """Another meaning of the columns of a curve. The function `driven` computes the true driven quantity from (driven,
+    number). The function `column` computes the stress column from (nominal stress, driven, number).
 
     The fitted number is in units of the range of `driven`, or in units of the stress scale of the curve.
     """
@@ -32,8 +33,8 @@ class _Cause(NamedTuple):
     words: str
     driven: Callable[[np.ndarray, float], np.ndarray]
     column: Callable[[np.ndarray, np.ndarray, float], np.ndarray]
-    free: bool = False  # whether it has a number
-    of_stress: bool = False  # whether this number is in units of the stress
+    free: bool = False  # whether a number is fitted
+    of_stress: bool = False  # whether this number is a stress
 
 
 _CAUSES = (
@@ -45,7 +46,8 @@ _CAUSES = (
 
 
 def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> list[str]:
-    """A sentence for the curves whose residuals keep their sign over many points, with the cause if one is found.
+    """Return a warning about the curves whose residuals keep their sign over many points, with the cause if one is
+    found.
 
     Args:
         curves: the curves.
@@ -62,13 +64,13 @@ def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> 
     curve = min(odd, key=lambda c: runs[c.label][1])
     (count, chance), names = runs[curve.label], ", ".join(c.label for c in odd)
     said = (
-        f"{names}: structured misfit of {fit.label}: the residuals change sign {count - 1} times over "
-        f"{len(curve.stress)} points (by chance: {chance:.1g})"
+        f"{names}: structured misfit of {fit.label}. The residuals change sign only {count - 1} times in "
+        f"{len(curve.stress)} points (probability by chance {chance:.1g})"
     )
     cause = _named_cause(curves, odd, fit)
     if cause:
         return [f"{said}; {cause}"]
-    return [f"{said}; the law misses something" + ("" if every else ": try other laws (LAW = all)")]
+    return [f"{said}; the law is inadequate" + ("" if every else ": try other laws (LAW = all)")]
 
 
 def _model(law: Law, curve: Curve, F: np.ndarray | None = None) -> np.ndarray:
@@ -77,13 +79,14 @@ def _model(law: Law, curve: Curve, F: np.ndarray | None = None) -> np.ndarray:
 
 
 def _nearest_factor(law: Law, curve: Curve, named: bool) -> float:
-    """The factor with which the law is nearest to the curve's stress; 1 if the fit reported no factors."""
+    """Return the factor that brings the stress of the law nearest to the curve, or 1 if the fit reported no factors."""
     P = _model(law, curve) / curve.scale
     return float(P @ (curve.stress / curve.scale) / (P @ P)) if named and P @ P > 0 else 1.0
 
 
 def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
-    """The cause that lowers the criterion most and leaves random residuals; empty if there is none."""
+    """Return the cause that lowers the criterion most and leaves random residuals. The text is empty if there is no
+    such cause."""
     found = [(_criterion(fit.law, curves, odd, None), "")]
     limit = found[0][0].value - _BETTER
     for cause in _CAUSES:
@@ -95,19 +98,21 @@ def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
             number = refit.number * (odd[0].scale if cause.of_stress else np.ptp(odd[0].driven))
             words = cause.words.format(driven="stretch", number=number)
             modulus = _slope_at_rest(refit.law)
-            found.append((refit, f"the same law would follow {words}, with G0 {modulus:.4g} Pa: check that"))
+            found.append(
+                (refit, f"the same law would follow the curve {words}, with G0 {modulus:.4g} Pa: check the columns")
+            )
     return min(found, key=lambda each: each[0].value)[1]
 
 
 class _Refit(NamedTuple):
     value: float  # Akaike's criterion, corrected for few points
-    chance: float  # probability of the order of the residuals, the smallest among the odd curves
+    chance: float  # probability of the order of the residuals, the smallest of the curves with structure
     number: float
     law: Law
 
 
 def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | None) -> _Refit:
-    """Fit the law again from its best parameters, with another meaning of the columns of the odd curves."""
+    """Fit the law again from its best parameters, with another meaning of the columns of the curves `odd`."""
     leaves, tree = jax.tree.flatten(law)
     every = np.array([float(leaf) for leaf in leaves])
     start = every[every != 0]

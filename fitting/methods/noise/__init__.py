@@ -1,1 +1,1 @@
-"""Noise that residuals show: noise that neighbours share, or noise of different size at different points."""
+"""Models of noise that the residuals show: correlated noise of neighbouring points, and noise of different size."""

@@ -1,12 +1,13 @@
-"""Noise that neighbouring points share: the standard errors for such noise.
+"""Standard errors for noise that is correlated between neighbouring points.
 
-Registration and image correlation smooth the data. So neighbours share their noise, and there are fewer independent
-values than points. Consider two components of the same direction, instant and scene. Their covariance is assumed to be
-s^2 (a k(d / l) + (1 - a) [same row]), where d is the distance of their points. k is the Matérn function of order 3/2
-(smoothed noise) or 1/2 (drifting noise). Order, length l, part a and level s are chosen so that the residuals are most
-probable (restricted maximum likelihood: Patterson and Thompson 1971). The likelihood is restricted because a fit
-removes from the residuals the part of the noise that looks like its parameters. The fitted parameters do not change.
-Their covariance is J^+ C (J^+)^T instead of s^2 J^+ (J^+)^T.
+Registration and image correlation smooth the data. So the noise of neighbouring points is correlated, and there are
+fewer independent values than points. Consider two residuals of the same group (direction, instant and scene) at points
+with the distance d. Their covariance is assumed to be s^2 (a k(d / l) + (1 - a) delta), where delta is 1 for a residual
+and itself, and otherwise 0. k is the Matérn function of order 3/2 (smoothed noise) or 1/2 (drifting noise). The order,
+the length l, the correlated part a and the level s are chosen so that the residuals are most probable (restricted
+maximum likelihood: Patterson and Thompson 1971). The likelihood is restricted because the fitted parameters absorb a
+part of the noise, which is then missing in the residuals. The fitted parameters do not change. With the Jacobian J and
+the covariance C of the residuals, the covariance of the parameters is J^+ C (J^+)^T instead of s^2 J^+ (J^+)^T.
 """
 
 import itertools
@@ -19,53 +20,57 @@ import scipy.spatial
 
 from liverjax.solvers.blas import one_blas_thread
 
-#: Parts a that are tried; and number of lengths that are tried, between a third of the distance of neighbours and the
-#: size of the body.
+#: PARTS: values of a that are tried. LENGTHS: number of lengths that are tried, from a third of the distance between
+#: neighbours to the size of the body.
 PARTS, LENGTHS = (0.3, 0.6, 0.9, 0.99), 8
 #: Orders of the Matérn function: for smoothed noise, and for drifting noise.
 ORDERS = ("3/2", "1/2")
-#: Maximum number of groups for the probability, and maximum number of points in each. Half of the points are near each
-#: other, half are scattered over the body.
+#: FEW: maximum number of groups for which the likelihood is computed. MOST: maximum number of points in each group.
+#: Half of these points are near each other, half are scattered over the body.
 FEW, MOST = 12, 400
-#: Noise counts as shared if this raises the logarithm of the probability by more than this. Chance reaches it once in a
-#: thousand cases.
+#: Noise counts as correlated if the correlation raises the log likelihood by more than this value. By chance, this
+#: happens once in a thousand cases.
 GAIN = 7.0
-#: If the root mean square of the residuals is below this, they are not the stated noise, for example in synthetic data
-#: without noise.
+#: If the root mean square of the residuals is below this value, they are not the stated noise, for example in synthetic
+#: data without noise.
 LEAST = 0.2
-#: Residuals are clipped at this many robust standard deviations: a single wrong point must not look like noise that
-#: many points share.
+#: Residuals are clipped at this many robust standard deviations: a single wrong point must not look like correlated
+#: noise.
 OUTLIER = 5.0
-#: The chosen groups must have at least this part of the derivatives by an unknown.
+#: An unknown counts if the norm of its derivatives in the chosen groups, divided by their norm in all groups, exceeds
+#: this value.
 SHOWN = 1e-9
-#: If a singular value of the scaled derivatives, divided by the largest, is below this, its direction is left out.
+#: If a singular value of the scaled derivatives, divided by the largest one, is below this value, its direction is left
+#: out.
 LOST = 1e-6
-#: Number of rows of C that are computed at once.
+#: Number of rows of the covariance C that are computed at once.
 ROWS = 500
 
 
 class Alike(NamedTuple):
-    """What the residuals tell about noise that neighbours share."""
+    """Correlated noise of neighbouring points, as the residuals show it."""
 
     length: float  # [m]
-    part: float  # shared part of the variance
-    level: float  # standard deviation / stated standard deviation
+    part: float  # correlated part a of the variance
+    level: float  # level s: standard deviation / stated standard deviation
     root: np.ndarray  # (p, p) square root of the covariance of the unknowns
-    gain: float  # gain in the logarithm of the probability, against independent noise
-    independent: float  # number of residuals with independent noise that would tell as much
+    gain: float  # gain of the log likelihood compared with independent noise
+    independent: float  # number of independent residuals with the same information
 
 
 def alike_noise(
     places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray, inverse: np.ndarray | None = None
 ) -> Alike | None:
-    """The noise that neighbours share; None if it is no more than chance.
+    """Estimate the noise that is correlated between neighbouring points. Returns None if chance may explain the
+    correlation.
 
     Args:
         places: position of each residual (n, 3) [m].
-        group: index (n,) of the group of each residual. Different groups (directions, instants, scenes) share no noise.
+        group: index (n,) of the group of each residual. The noise of different groups (directions, instants, scenes) is
+            uncorrelated.
         r: residuals (n,) of a fit, divided by the stated standard deviations.
         J: derivatives of the residuals (n, p), of full rank.
-        inverse: derivatives of the unknowns by r (p, n); default J^+.
+        inverse: derivatives (p, n) of the unknowns with respect to r; default J^+.
     """
     with one_blas_thread():  # the matrices are small
         return _alike_noise(places, group, r, J, np.linalg.pinv(J) if inverse is None else inverse)
@@ -83,7 +88,7 @@ def _alike_noise(
     if not 0 < neighbour < size or len(r) <= 2 * J.shape[1]:
         return None
     lengths = np.geomspace(neighbour / 3, size, LENGTHS)
-    # If the chosen groups do not depend on an unknown, this unknown removes nothing from their residuals.
+    # If the chosen groups do not depend on an unknown, this unknown absorbs no noise of their residuals.
     shown = np.linalg.norm(J[np.concatenate(chosen)], axis=0) > SHOWN * np.linalg.norm(J, axis=0)
     if sum(map(len, chosen)) <= shown.sum():
         return None
@@ -95,8 +100,8 @@ def _alike_noise(
     choices = itertools.product(ORDERS, lengths, PARTS)
     tried = [(*_probability_at(data, far, order, l, a), order, l, a) for order, l, a in choices]
     best, level, order, length, part = max(tried)
-    # The test is `not best > ...`, so that it is also right if both are -inf. The level is not tested: it is small if
-    # the noise is smoother than the Matérn function.
+    # The test is written as `not best > ...`, so that it is also right if both values are -inf. The level is not
+    # tested: it is small if the noise is smoother than the Matérn function.
     if not np.isfinite(alone) or not best > alone + GAIN or np.sqrt(np.mean(r**2)) < LEAST:
         return None
     parts = [_of_unknowns(places[own], (order, length, part), inverse[:, own]) for own in groups]
@@ -106,8 +111,8 @@ def _alike_noise(
 
 
 def _determined(J: np.ndarray) -> np.ndarray:
-    """Directions (p, k) of the unknowns that the derivatives J (n, p) determine. If a parameter is at its bound, one
-    direction is not determined, and its determinant would be only roundoff.
+    """Return the directions (p, k) of the unknowns that the derivatives J (n, p) determine. If a parameter is at its
+    bound, one direction is not determined, and a determinant with it would be only roundoff.
     """
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
@@ -116,19 +121,20 @@ def _determined(J: np.ndarray) -> np.ndarray:
 
 
 def along_rows(counts: list[int], r: np.ndarray, J: np.ndarray, deviation: float, inverse: np.ndarray) -> Alike | None:
-    """The result of `alike_noise` for series that were measured row after row. Lengths are in rows.
+    """Estimate correlated noise, as `alike_noise` does, for series that were measured one row after the other. Lengths
+    are numbers of rows.
 
     Args:
-        counts: number of rows of each series. Different series share no noise.
-        r, J: residuals (n,) and their derivatives (n, p).
+        counts: number of rows of each series. The noise of different series is uncorrelated.
+        r, J: residuals (n,) and their derivatives (n, p) with respect to the unknowns.
         deviation: standard deviation of a residual.
-        inverse: derivatives of the unknowns by r (p, n).
+        inverse: derivatives (p, n) of the unknowns with respect to r.
     """
     if not (deviation > 0 and np.all(np.isfinite(J))):
         return None
     places = np.concatenate([np.arange(n) for n in counts])[:, None] * np.array([1.0, 0.0, 0.0])
-    # Noise of the imposed quantity (depth, stretch) is in J and in the residuals, and would look like shared noise. So
-    # J is smoothed.
+    # Noise of the imposed quantity (depth, stretch) is in J and in the residuals, and would look like correlated noise.
+    # So J is smoothed.
     parts = np.split(J, np.cumsum(counts)[:-1])
     smooth = [scipy.signal.savgol_filter(p, max(3, len(p) // 10 | 1), 1, axis=0) if len(p) > 3 else p for p in parts]
     group = np.repeat(np.arange(len(counts)), counts)
@@ -136,14 +142,16 @@ def along_rows(counts: list[int], r: np.ndarray, J: np.ndarray, deviation: float
 
 
 def _to_neighbours(distance: np.ndarray) -> float:
-    """Mean distance to the nearest other position. Several rows may have one position."""
+    """Return the mean distance from a position to the nearest different position. Several residuals may have the same
+    position."""
     nearest = np.where(distance > 0, distance, np.inf).min(axis=1)
     known = np.isfinite(nearest)
     return float(nearest[known].mean()) if known.any() else 0.0
 
 
 def _subset(places: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """At most `MOST` of the residuals `own` (m,): half of them around one point, the other half from everywhere."""
+    """Return at most `MOST` of the residuals `own` (m,): half of them near one point, the other half from the whole
+    body."""
     if len(own) <= MOST:
         return own
     rng = np.random.default_rng(0)
@@ -161,7 +169,7 @@ def _matern(distance: np.ndarray, order: str, length: float) -> np.ndarray:
 
 
 def _probability_at(data: list, far: list[np.ndarray], order: str, length: float, part: float) -> tuple[float, float]:
-    """Logarithm of the restricted likelihood, up to a constant, and the most probable level s."""
+    """Return the logarithm of the restricted likelihood, up to a constant, and the most probable level s."""
     p = data[0][1].shape[1]
     determinant, squares, b, A = 0.0, 0.0, np.zeros(p), np.zeros((p, p))
     for (r, J), distance in zip(data, far, strict=True):
@@ -178,10 +186,10 @@ def _probability_at(data: list, far: list[np.ndarray], order: str, length: float
 
 
 def _of_unknowns(places: np.ndarray, shape: tuple[str, float, float], inverse: np.ndarray) -> tuple[np.ndarray, float]:
-    """J^+ C (J^+)^T (p, p) of one group, computed a few rows of C at a time; and its number of independent residuals,
-    n^2 / sum(C).
+    """Return the covariance J^+ C (J^+)^T (p, p) of one group and its number of independent residuals, n^2 / sum(C).
+    Only a few rows of C are computed at a time.
 
-    `shape`: order, length and part.
+    `shape`: order, length l and part a.
     """
     order, length, part = shape
     total, sum_of_C = (1 - part) * inverse @ inverse.T, (1 - part) * len(places)

@@ -1,5 +1,5 @@
-"""Standard errors of least squares if each series has another unknown factor, for example from the size of its
-sample."""
+"""Standard errors of least squares if each series has an individual unknown factor, for example because the size of its
+sample is not exactly known."""
 
 from typing import NamedTuple
 
@@ -7,47 +7,48 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-#: Series have factors if this raises the logarithm of the restricted likelihood by this value. Chance reaches it in 1
-#: of 140 cases.
+#: The residuals show factors if these raise the logarithm of the restricted likelihood by at least this value. By
+#: chance, this happens in 1 of 140 cases.
 _GAIN = 3.0
-#: At the end of a 95 % interval of the factors' standard deviation, this logarithm is lower by this value.
+#: At the end of a 95 % interval of the factors' standard deviation, this logarithm is below its maximum by this value.
 _FALL = 1.92
-#: Maximum standard deviation of factors that is considered if the residuals do not show the factors. It is typical for
-#: sizes of samples.
+#: Upper bound of the standard deviation of factors if the residuals do not show them. The value is typical of the
+#: errors of sample sizes.
 HIDDEN = 0.1
-#: Singular values below this part of the size of the factors are roundoff: the unknowns can compensate all factors.
+#: Singular values below this part of the norm of F are roundoff: the unknowns can compensate these factors.
 _ROUNDOFF = 1e-8
-#: Lower bound for the part of the squared residuals that the factors do not explain. Exact repeats leave only roundoff
-#: there.
+#: Lower bound for the part of the squared residuals that the factors do not explain. If repeated measurements are
+#: identical, this part is only roundoff.
 _SAME = 1e-12
 
 
 class FactorNoise(NamedTuple):
-    """Factors of series."""
+    """Unknown factors of the series, and their effect on the parameters."""
 
-    deviation: float  # most probable standard deviation of a factor [1]; it may be 0; at most `HIDDEN` if not shown
+    deviation: float  # most probable standard deviation of a factor [1], possibly 0; at most `HIDDEN` if not shown
     root: np.ndarray  # (P, n + K) square root of the covariance of the parameters
-    shown: bool  # whether independent noise alone does not explain the residuals
+    shown: bool  # whether the residuals show factors: independent noise alone does not explain them
     hidden: float  # largest standard deviation of factors that the residuals do not exclude [1], at most `HIDDEN`
-    moves: np.ndarray  # (P,) standard deviations of the parameters by such factors
+    moves: np.ndarray  # (P,) standard deviations of the parameters due to factors of this size
 
 
 def factors_of_series(
     counts: list[int], J: np.ndarray, r: np.ndarray, fitted: np.ndarray, slope: np.ndarray
 ) -> FactorNoise | None:
-    """Fit noise with the covariance s^2 (I + q^2 f_k f_k^T) to each series k. None for a single series, or for too few
-    residuals.
+    """Fit noise with the covariance s^2 (I + q^2 f_k f_k^T) to the residuals of each series k. Returns None for a
+    single series or too few residuals.
 
-    There are few factors, so their standard deviation is not known well. If it is shown, it is enlarged by Student's t
-    with K - 1 degrees of freedom. If chance may explain it, it is not enlarged. If the unknowns can compensate most of
-    the factors, the residuals hardly show them. `hidden` and `moves` tell which factors the residuals do not exclude.
+    There are few factors, so their standard deviation is uncertain. If the residuals show factors, their standard
+    deviation is enlarged by Student's t with K - 1 degrees of freedom. If chance may explain the factors, it is not
+    enlarged. If the unknowns can compensate most of the factors, the residuals hardly show them. Then `hidden` and
+    `moves` describe the factors that the residuals do not exclude.
 
     Args:
         counts: number of rows of each of the K series.
-        J: derivatives of the residuals by unknowns u (n, p).
+        J: derivatives (n, p) of the residuals with respect to the unknowns u.
         r: residuals (n,).
-        fitted: the values f (n,) that a factor multiplies, divided by the scales of the residuals.
-        slope: derivatives (P, p) of the P parameters by u.
+        fitted: fitted values f (n,), which a factor multiplies, divided by the scales of the residuals.
+        slope: derivatives (P, p) of the P parameters with respect to u.
     """
     (n, p), K = J.shape, len(counts)
     if K < 2 or n <= p + K or not (p and np.all(np.isfinite(J)) and np.all(np.isfinite(r))):

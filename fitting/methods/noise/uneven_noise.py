@@ -1,24 +1,24 @@
-"""Standard errors of least squares that stay right if the noise differs between points, for example if it grows with
-the stress."""
+"""Standard errors of least squares that remain valid if the noise differs between points, for example if the noise
+grows with the stress."""
 
 import numpy as np
 import scipy.linalg
 import scipy.special
 
-#: For noise in proportion to a size: minimum of smallest noise / largest noise.
+#: For noise proportional to a size: lower bound of the noise, divided by the largest noise.
 _LEAST = 1e-6
 #: Lower bound of 1 - leverage, the part of the noise of a point that stays in its residual.
 _LEFT = 0.05
 
 
 def uneven_root(J: np.ndarray, r: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Square root (P, n) of the covariance of P parameters, if each residual has its own variance (HC3: MacKinnon and
-    White 1985).
+    """Return the square root (P, n) of the covariance of P parameters if each residual has a separate variance (HC3:
+    MacKinnon and White 1985).
 
     Args:
-        J: derivatives of the residuals by unknowns u (n, p), of full rank.
+        J: derivatives (n, p) of the residuals with respect to the unknowns u, of full rank.
         r: residuals of the fit (n,).
-        slope: derivatives (P, p) of the parameters by u.
+        slope: derivatives (P, p) of the parameters with respect to u.
     """
     if not np.all(np.isfinite(J)) or J.size == 0:
         return np.zeros((len(slope), len(r)))
@@ -28,11 +28,11 @@ def uneven_root(J: np.ndarray, r: np.ndarray, slope: np.ndarray) -> np.ndarray:
 
 
 def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Square root (P, n) of the covariance of P parameters for noise in proportion to `size` (n,). It is 0 if equal
-    noise has a higher restricted likelihood.
+    """Return the square root (P, n) of the covariance of P parameters for noise proportional to `size` (n,). It is 0 if
+    equal noise has a higher restricted likelihood.
 
-    This is needed because `uneven_root` cannot use the noise of a point with a leverage near 1: the fit passes through
-    this point.
+    This is needed because `uneven_root` cannot determine the noise of a point with a leverage near 1, since the fit
+    passes through this point.
     """
     (n, p), largest, none = J.shape, np.abs(size).max(initial=0.0), np.zeros((len(slope), len(r)))
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(r)) and p and n > p + 1 and largest > 0):
@@ -43,8 +43,8 @@ def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarr
 
 
 def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tuple[float, float]:
-    """Logarithm of the restricted likelihood of independent noise with standard deviations in proportion to `size`
-    (n,), and the most probable factor."""
+    """Return the logarithm of the restricted likelihood of independent noise with standard deviations proportional to
+    `size` (n,), and the most probable factor of proportionality."""
     beside = scipy.linalg.null_space(J.T)
     try:
         L = np.linalg.cholesky(beside.T @ (size[:, None] ** 2 * beside))
@@ -54,14 +54,14 @@ def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tupl
     return -float(np.sum(np.log(np.diagonal(L)))) - len(L) * np.log(max(level, 1e-300)), level
 
 
-#: Below this probability, two groups of residuals have noise of different size. The test is made only if the smallest
-#: singular value of J, divided by the largest, exceeds _CONDITION.
+#: If equal noise in two groups of residuals is less probable than _CHANCE, their noise has different size. The test is
+#: made only if the smallest singular value of the scaled J, divided by the largest one, is at least _CONDITION.
 _CHANCE, _CONDITION = 1e-3, 1e-8
 
 
 def grouped_root(J: np.ndarray, r: np.ndarray, second: np.ndarray, slope: np.ndarray) -> np.ndarray | None:
-    """Square root (P, n) of the covariance of P parameters with the noise from `grouped_sizes`; None if this noise is
-    None.
+    """Return the square root (P, n) of the covariance of P parameters if two groups of residuals have noise of
+    different size. Returns None if `grouped_sizes` returns None.
 
     Args:
         J, r, slope: see `uneven_root`.
@@ -72,9 +72,9 @@ def grouped_root(J: np.ndarray, r: np.ndarray, second: np.ndarray, slope: np.nda
 
 
 def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarray | None:
-    """Standard deviations (n,) if two groups of residuals (for example G' and G'') have noise of different size. None
-    if the sizes differ no more than by chance, or if some combination of u is hardly determined. Arguments: see
-    `grouped_root`.
+    """Return the standard deviation of each residual (n,) if two groups of residuals (for example of G' and G'') have
+    noise of different size. Returns None if chance may explain the difference, or if the data hardly determine some
+    combination of the unknowns. Arguments: see `grouped_root`.
     """
     scale = np.linalg.norm(J, axis=0)
     if not (np.all(np.isfinite(J)) and np.all(scale > 0)):

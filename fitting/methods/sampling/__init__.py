@@ -1,1 +1,1 @@
-"""Samples of a posterior, and a check whether there are enough of them."""
+"""Sampling of a posterior density, and a check whether there are enough samples."""

@@ -7,8 +7,8 @@ import numpy as np
 
 
 def r_hat(draws: np.ndarray) -> float:
-    """The larger value of bulk R-hat and tail R-hat of one parameter with draws (chains, N). It is near 1 if the chains
-    agree."""
+    """Return the larger value of bulk R-hat and tail R-hat of one parameter with draws (chains, N). It is near 1 if the
+    chains agree."""
     half = draws.shape[1] // 2
     split = np.concatenate([draws[:, :half], draws[:, -half:]])
     folded = np.abs(split - np.median(split))
@@ -17,7 +17,7 @@ def r_hat(draws: np.ndarray) -> float:
 
 def _normal_scores(draws: np.ndarray) -> np.ndarray:
     import scipy.special
-    import scipy.stats  # the import takes half a second, and only fits with samples need it
+    import scipy.stats  # imported here: it takes half a second, and only fits with samples need it
 
     ranks = scipy.stats.rankdata(draws, method="average").reshape(draws.shape)
     return scipy.special.ndtri((ranks - 0.375) / (draws.size + 0.25))

@@ -1,11 +1,12 @@
-"""Samples of a posterior by tempering: particles are drawn from the prior and moved to the posterior in steps.
+"""Sampling of a posterior by tempering: particles (parameter vectors) are drawn from the prior and moved to the
+posterior in steps.
 
-The likelihood is raised to a power that grows from 0 to 1. Each step gives the particles weights, resamples them by
-these weights, and moves them by differential evolution until they are nearly independent of their earlier positions
-(Del Moral, Doucet and Jasra 2006, J. R. Stat. Soc. B 68, 411; ter Braak and Vrugt 2008, Statistics and Computing 18,
-435). Every run begins at the prior. So the runs agree only if each has found the whole posterior, with its tails and
-all its maxima. The method needs only a density that can be computed at many points at once. It needs no derivatives, no
-tuning and no compilation.
+The likelihood is raised to a power that grows from 0 to 1. Each step gives weights to the particles and resamples them
+by these weights. Then differential evolution moves the particles until they are nearly independent of their earlier
+positions (Del Moral, Doucet and Jasra 2006, J. R. Stat. Soc. B 68, 411; ter Braak and Vrugt 2008, Statistics and
+Computing 18, 435). Every run begins at the prior. So the runs agree only if each has found the whole posterior, with
+its tails and all its maxima. The method needs only a density that can be computed at many points at once. It needs no
+derivatives, no tuning and no compilation.
 """
 
 from collections.abc import Callable
@@ -16,17 +17,18 @@ import scipy.special
 
 #: Number of independent runs, and smallest number of particles in each.
 CHAINS, FEWEST = 4, 500
-#: The power rises in each step so far that this part of the particles stays effective.
+#: In each step, the power rises as far as possible while at least this part of the particles stays effective.
 EFFECTIVE = 0.5
-#: The moves of a step end if the correlation with the positions before the step is below FORGOTTEN, or below
-#: FORGOTTEN_LAST in the last step; and maximum number of moves in a step.
+#: The moves of a step end if the correlation with the positions before the step is below FORGOTTEN, or in the last step
+#: below FORGOTTEN_LAST. MOST: maximum number of moves in a step.
 FORGOTTEN, FORGOTTEN_LAST, MOST = 0.6, 0.2, 30
-#: Part of the moves that use the whole difference of two particles. Such moves can lead from one maximum to another.
+#: Fraction of the moves that use the whole difference of two particles. Such moves can lead from one maximum to
+#: another.
 LONG = 0.1
 
 
 class Density(NamedTuple):
-    """A posterior; the functions take u (W, P)."""
+    """A posterior density. Its functions take the parameters u (W, P) of W points."""
 
     log_likelihood: Callable[[np.ndarray], np.ndarray]  # -> (W,), up to a constant
     log_prior: Callable[[np.ndarray], np.ndarray]  # -> (W,), -inf outside of its support
@@ -37,10 +39,10 @@ class Chains(NamedTuple):
     """Draws of independent runs."""
 
     draws: np.ndarray  # (CHAINS, N, P)
-    log_evidence: np.ndarray  # (CHAINS,) log of the mean likelihood over the prior
+    log_evidence: np.ndarray  # (CHAINS,) log of the evidence (the mean likelihood under the prior)
     steps: int  # number of steps of the power, in all runs together
     moves: int  # number of moves of each particle, in all runs together
-    acceptance: float  # accepted part of the last moves
+    acceptance: float  # accepted fraction of the last moves
     remembered: float  # largest correlation of the draws with the positions before the last moves
 
 
@@ -54,7 +56,7 @@ class _Particles(NamedTuple):
 
 
 def run(density: Density, count: int, seed: int = 0) -> Chains:
-    """Make `CHAINS` independent runs with `count` draws each.
+    """Sample the posterior in `CHAINS` independent runs with `count` draws each.
 
     Args:
         density: the posterior.
@@ -93,7 +95,7 @@ def _finite_only(values: np.ndarray) -> np.ndarray:
 
 
 def _rise(likelihood: np.ndarray, left: float) -> float:
-    """Maximum increase of the power, by bisection on the effective number of particles."""
+    """Return the largest allowed increase of the power, by bisection on the effective number of particles."""
 
     def effective(rise: float) -> float:
         w = np.exp(rise * (likelihood - likelihood.max()))
@@ -109,7 +111,7 @@ def _rise(likelihood: np.ndarray, left: float) -> float:
 
 
 def _resampled(log_weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Indices of the particles that are kept (systematic resampling)."""
+    """Return the indices of the particles that are kept (systematic resampling)."""
     w = np.cumsum(np.exp(log_weights - log_weights.max()))
     ticks = (np.arange(len(w)) + rng.random()) / len(w) * w[-1]
     return np.minimum(np.searchsorted(w, ticks), len(w) - 1)
@@ -118,8 +120,8 @@ def _resampled(log_weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _moved(
     density: Density, start: _Particles, power: float, limit: float, rng: np.random.Generator
 ) -> tuple[_Particles, int, float, float]:
-    """The particles after moves that do not change the tempered density; then the number of moves, the acceptance and
-    the correlation."""
+    """Return the particles after moves that do not change the tempered density. Also return the number of moves, the
+    accepted fraction, and the correlation with the positions before."""
     half = len(start.u) // 2
     halves = slice(0, half), slice(half, 2 * half)
     now = _Particles(*(field.copy() for field in start))
@@ -134,8 +136,8 @@ def _moved(
 def _half_moved(
     density: Density, now: _Particles, power: float, halves: tuple[slice, slice], rng: np.random.Generator
 ) -> float:
-    """Move the first half of the particles in place, by differences of particles in the second half. Return the
-    accepted fraction.
+    """Move the first half of the particles in place, using differences between particles of the second half. Return the
+    accepted fraction of the moves.
 
     The differences do not depend on the moved particles, so the moves do not change the density.
     """
@@ -147,7 +149,7 @@ def _half_moved(
     reach = np.where(rng.random(half) < LONG, 1.0, usual)[:, None]
     trial = own + reach * (other[first] - other[second]) + 1e-6 * rng.standard_normal(own.shape)
     prior, likelihood = density.log_prior(trial), _finite_only(density.log_likelihood(trial))
-    with np.errstate(invalid="ignore"):  # a point without likelihood is refused
+    with np.errstate(invalid="ignore"):  # a point with zero likelihood is rejected
         gain = power * (likelihood - now.likelihood[halves[0]]) + prior - now.prior[halves[0]]
     take = np.log(rng.random(half)) < np.where(np.isnan(gain), -np.inf, gain)
     for field, value in zip(now, (trial, likelihood, prior), strict=True):
@@ -156,7 +158,7 @@ def _half_moved(
 
 
 def _correlation(before: np.ndarray, after: np.ndarray) -> float:
-    """Largest correlation between a coordinate and its earlier value."""
+    """Return the largest correlation between a coordinate of the particles and its value before the moves."""
     a, b = before - before.mean(axis=0), after - after.mean(axis=0)
     size = np.sqrt(np.sum(a * a, axis=0) * np.sum(b * b, axis=0))
     return float(np.max(np.sum(a * b, axis=0) / np.maximum(size, 1e-300)))

@@ -1,1 +1,1 @@
-"""Tables in files: lines, headings, cells, and the moduli of a sweep from the columns that a file has."""
+"""Read tables from files: lines, headings and cells, and the moduli of a frequency sweep from its columns."""

@@ -1,4 +1,4 @@
-"""Storage and loss moduli from the columns of a file: storage or loss modulus, |G*|, phase, tan(delta)."""
+"""Compute storage and loss moduli from the columns of a file: storage or loss modulus, |G*|, phase, tan(delta)."""
 
 import numpy as np
 
@@ -13,10 +13,10 @@ NAMES = {"storage": "G'", "loss": "G''", "complex": "|G*|", "phase": "the phase"
 
 
 def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str]) -> np.ndarray:
-    """A column (n,), converted to rad/s, Pa, rad or 1. Moduli of tension are not divided by 3 here.
+    """Return a column (n,), converted to rad/s, Pa, rad or 1. Tensile moduli are not divided by 3 here.
 
     Raises:
-        InputError: the unit is not known, or its meaning is ambiguous.
+        InputError: the unit is unknown or ambiguous.
     """
     quantity, unit = column.quantity.removesuffix("_sd"), column.unit
     if quantity == "tangent":
@@ -38,7 +38,7 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
     if column.quantity == "phase" and unit.startswith(("deg", "°")) and seen.size and seen.max() <= 0.5 * np.pi:
         notes.append(
             f"column {column.name!r} has {seen.min():.3g} to {seen.max():.3g} degrees, less than "
-            "tissues have: if these are radians, name it phase_rad"
+            "in tissues: if these are radians, name it phase_rad"
         )
     if quantity == "frequency":
         return written * _of_frequency(path, column, unit)
@@ -60,8 +60,8 @@ def _of_frequency(path: str, column: Column, unit: str) -> float:
 
 
 def fault_of(column: Column, written: float, value: float, smallest: float, largest: float) -> tuple[str, str] | None:
-    """The fault of a value (in SI) and the remedy; None if the value has no fault. The text quotes the value as the
-    file has it."""
+    """Return the fault of a value (in SI) and the remedy, or None if the value is good. The text quotes the value as
+    written in the file."""
     if not np.isfinite(value):
         if np.isnan(written):
             return f"{column.name} is empty", "fill it in or remove the line"
@@ -78,7 +78,7 @@ def fault_of(column: Column, written: float, value: float, smallest: float, larg
 
 
 def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
-    """Divide moduli of tension or bending by 3, in place. The returned note says so."""
+    """Divide moduli of tension or bending by 3, in place. Return a note on this."""
     moduli = [q for q in columns if q.split("_")[0] in MODULI]
     tensile = [q for q in moduli if is_tensile(columns[q][0])]
     if tensile:  # "tensile_storage_modulus, loss_modulus": both are of tension
@@ -94,12 +94,13 @@ def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
     if not tensile:
         return []
     names = " and ".join(dict.fromkeys(columns[q][0].name for q in tensile))
-    return [f"{names} are of tension or bending: G = E / 3 is taken, as of an incompressible material"]
+    return [f"{names} are of tension or bending: G = E / 3 is used (incompressible material)"]
 
 
 def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
-    """Storage and loss moduli (n,) [Pa] from columns in SI units, and their standard deviations if the file has them.
-    Standard deviations of |G*|, phase or tan(delta) are converted to first order; they are assumed to be independent.
+    """Return storage and loss moduli (n,) [Pa] from columns in SI units, and their standard deviations if given.
+
+    Standard deviations of |G*|, phase or tan(delta) are converted to first order, as independent errors.
     """
     pair = pair_of(values)
     assert pair is not None

@@ -33,7 +33,7 @@ class Column(NamedTuple):
 
 
 def pair_of(quantities: Collection[str]) -> tuple[str, str] | None:
-    """The best pair of quantities that gives both moduli; None if there is none."""
+    """Return the best pair of quantities that determines both moduli, or None if there is no such pair."""
     return next((pair for pair in PAIRS if set(pair) <= set(quantities)), None)
 
 
@@ -42,13 +42,13 @@ MODULI = ("storage", "loss", "complex")
 
 
 def is_complete(columns: list[Column]) -> bool:
-    """Whether the columns are enough for a sweep."""
+    """Return whether the columns are enough for a sweep."""
     quantities = {c.quantity for c in columns}
     return "frequency" in quantities and pair_of(quantities) is not None
 
 
 def first_missing(columns: list[Column]) -> str:
-    """The first quantity of `NEEDED` that is missing."""
+    """Return the first quantity of `NEEDED` that is missing."""
     quantities = {c.quantity for c in columns}
     if "frequency" not in quantities:
         return "frequency"
@@ -56,15 +56,16 @@ def first_missing(columns: list[Column]) -> str:
 
 
 def is_angular(column: Column) -> bool:
-    """Whether the heading names an angular frequency."""
+    """Return whether the heading names an angular frequency."""
     return bool(
         re.match(r"\s*(ang|omega|ω|kreisf|winkelf|circular|radian|pulsa|frecuencia ang|w\b)", column.name.lower())
     )
 
 
 def header_columns(cells: list[str]) -> list[Column]:
-    """The columns of a sweep. Columns with a known unit come before the others, and angular frequencies before
-    frequencies. The first column of a quantity is used; further columns of it are compared with the first. If the
+    """Return the columns of a sweep: first those with a known unit, and angular frequencies before frequencies.
+
+    The first column of a quantity is used. Further columns of the same quantity are compared with the first. If the
     columns are enough for a sweep, columns that it does not need are left out.
     """
     found = [(k, cell, quantity_of(cell)) for k, cell in enumerate(cells)]
@@ -80,8 +81,8 @@ def header_columns(cells: list[str]) -> list[Column]:
 
 
 def columns_beside(cells: list[str], units: list[str], used: list[Column]) -> list[Column]:
-    """Columns of |G*|, phase, tan(delta) and |eta*| that the sweep does not need: for each quantity, the first column
-    with a known unit.
+    """Return columns of |G*|, phase, tan(delta) and |eta*| that the sweep does not need: for each quantity, the first
+    column with a known unit.
 
     Args:
         cells: headings.
@@ -103,14 +104,14 @@ def columns_beside(cells: list[str], units: list[str], used: list[Column]) -> li
 
 
 def is_tensile(column: Column) -> bool:
-    """Whether the heading names a modulus of tension or bending, E."""
+    """Return whether the heading names a modulus of tension or bending, E."""
     name = re.sub('[′’`´″”"]', "'", column.name.lower())
     words = r"\b(tensile|young|flexural|bending|compressive|zug|biege)|(?:^|[\s(\[|_])e('|\*)"
     return bool(re.match(r"\s*e[_ ]|\s*epp?\b|\s*[(|]?e\b", name) or re.search(words, name))
 
 
 def names_shear(column: Column) -> bool:
-    """Whether the heading names a modulus of shear, G."""
+    """Return whether the heading names a modulus of shear, G."""
     return re.search(r"shear|(^|[^a-z])g([^a-z]|$)", column.name.lower()) is not None
 
 
@@ -119,7 +120,7 @@ _TEMPERATURE = {"c": (1.0, 273.15), "k": (1.0, 0.0), "f": (5 / 9, 459.67 * 5 / 9
 
 
 def condition_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float, float]]:
-    """Column index, factor and offset to SI of `temperature` [K] and `shift_factor`, if the headings name them.
+    """Return column index, factor and offset to SI of `temperature` [K] and `shift_factor`, if the headings name them.
 
     Args:
         cells: headings.

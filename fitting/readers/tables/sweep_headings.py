@@ -1,4 +1,4 @@
-"""Meaning of a column heading in a frequency sweep: its quantity and its unit. The words are those of common
+"""Find the quantity and the unit of a column heading in a frequency sweep. The words are those of common
 instruments."""
 
 import re
@@ -62,7 +62,7 @@ UNITS: dict[str, dict[str, float]] = {
 
 
 def known_unit(quantity: str, unit: str | None) -> bool:
-    """Whether the unit can be converted. A column without a unit gets the default unit."""
+    """Return whether the unit can be converted. A column without a unit gets the default unit."""
     if unit is None:
         return True
     if quantity == "frequency":
@@ -71,7 +71,8 @@ def known_unit(quantity: str, unit: str | None) -> bool:
 
 
 def quantity_of(cell: str) -> tuple[str, str | None] | None:
-    """The (quantity, unit) of a header cell, or None. The quantity of a standard deviation ends in "_sd"."""
+    """Return quantity and unit of a heading, or None if it is unknown. Quantities of standard deviations end in
+    "_sd"."""
     name = cell
     for sign, plain in _PLAIN.items():
         name = name.replace(sign, plain)
@@ -97,7 +98,7 @@ def quantity_of(cell: str) -> tuple[str, str | None] | None:
 
 
 def _name_and_unit(name: str) -> tuple[str, str | None]:
-    """Name and unit of "G' [Pa]", "G' in Pa", "G' / Pa" and "G', Pa"."""
+    """Split a heading such as "G' [Pa]", "G' in Pa", "G' / Pa" or "G', Pa" into name and unit."""
     bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
     if bracket and not re.fullmatch(r"[ge]'*\*?|delta|omega|f|w", bracket.group(1), re.IGNORECASE):
         return name[: bracket.start()], bracket.group(1)

@@ -1,4 +1,4 @@
-"""Tables of frequency sweeps in the lines of a file: where each table begins, and its rows of numbers."""
+"""Find the tables of frequency sweeps in the lines of a file: where each table begins, and its rows of numbers."""
 
 import re
 from collections.abc import Callable
@@ -61,8 +61,9 @@ def choose_table(
     what: str = "frequencies",
     size: Callable[[Table], int] = lambda table: table.frequencies,
 ) -> tuple[int, list[str]]:
-    """Index of the table to read, and a note if there are several. Without `wanted`, the table with the largest `size`
-    is read; by default, this is the table with the largest number of frequencies.
+    """Return the index of the table to read, and a note if there are several tables.
+
+    If `wanted` is None, this is the table with the largest `size`; by default, the largest number of frequencies.
     """
     names = [f"{k} {t.name!r}" if t.name else str(k) for k, t in enumerate(tables, 1)]
     if wanted is not None:
@@ -78,7 +79,7 @@ def choose_table(
 
 
 def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int:
-    """Index of the table with the number or name `wanted`, or of the only table whose name contains this text."""
+    """Return the index of the table with the number or name `wanted`, or of the only table whose name contains it."""
     wanted = str(wanted)
     if wanted.isdecimal() and 1 <= int(wanted) <= len(tables):
         return int(wanted) - 1
@@ -93,7 +94,7 @@ def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int
 
 
 def tables_of(path: str, lines: list[str]) -> list[Table]:
-    """Every table that has numbers. If there is none, an `InputError` tells what is missing."""
+    """Return all tables that have numbers. If there is none, raise an `InputError` that names what is missing."""
     for uncomment in (False, True):  # np.savetxt writes its header as a comment
         tables, headers = _search(path, [line.lstrip("#% ") for line in lines] if uncomment else lines)
         if tables:
@@ -115,12 +116,12 @@ def tables_of(path: str, lines: list[str]) -> list[Table]:
         )
     lacks = first_missing(named[best])
     viscous = any(c.quantity == "viscosity" for c in named[best])
-    hint = "; viscosities are not read: |G*| is omega |eta*|, a column complex_modulus_Pa" if viscous else ""
+    hint = "; viscosities are not read: |G*| is omega |eta*|, give it as complex_modulus_Pa" if viscous else ""
     raise InputError(f"{path}: no column for {lacks} in the header {shown!r}; add {NEEDED[lacks]}{hint}")
 
 
 def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
-    """Tables with numbers, and the line numbers of all complete headers."""
+    """Return the tables with numbers, and the line numbers of all complete headers."""
     tables, headers, k, free = [], [], 0, 0  # `free`: first line after the last table
     while k < len(lines):
         line = lines[k]
@@ -159,25 +160,26 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
 
 
 def _nameless_deviations(cells: list[str]) -> list[str]:
-    """A note on headings such as "SD" and "±": they do not tell to which modulus they belong."""
+    """Return a note on headings such as "SD" and "±", which do not show to which modulus they belong."""
     words = [re.sub(r"[^a-z±]", " ", cell.lower()).split() for cell in cells]
     spread = {*DEVIATION_WORDS, "±"}
     found = [c for c, own in zip(cells, words, strict=True) if spread & set(own) and set(own) <= spread | {"pa", "kpa"}]
     if not found:
         return []
     return [
-        f"columns {', '.join(map(repr, found))} are not used: their headings do not tell to which modulus they "
+        f"columns {', '.join(map(repr, found))} are not used: their headings do not show to which modulus they "
         "belong; name them storage_modulus_sd_Pa and loss_modulus_sd_Pa"
     ]
 
 
-#: Words in headings of a DMA, which stretches, compresses or bends its samples. A rheometer does not write them.
+#: Words in headings of a DMA (dynamic mechanical analyser), which stretches, compresses or bends its samples. A
+#: rheometer does not write these words.
 _OF_DMA = re.compile(r"(static|dynamic|dyn\.?) (force|strain|stress|displacement)|^(sample )?length\b|stiffness", re.I)
 
 
 def _perhaps_tensile(cells: list[str], columns: list[Column]) -> list[str]:
-    """A note if the headings of the moduli tell neither shear nor tension, and another heading belongs to tests in
-    tension."""
+    """Return a note if the headings of the moduli name neither shear nor tension, and another heading belongs to
+    tensile tests."""
     moduli = [c for c in columns if c.quantity in MODULI]
     sign = next((c for c in cells if _OF_DMA.search(c.replace("_", " ").strip('" '))), None)
     turned = any(re.search(r"torque|angle|drehmoment|winkel|m/rad", cell.lower()) for cell in cells)
@@ -185,13 +187,13 @@ def _perhaps_tensile(cells: list[str], columns: list[Column]) -> list[str]:
         return []
     names = " and ".join(dict.fromkeys(c.name for c in moduli))
     return [
-        f"{names}: taken as shear, G; the column {sign.strip()!r} is one of tests in tension, compression "
-        "or bending: if these are moduli E, three times as large, name them E' and E''"
+        f"{names}: taken as shear, G, although the column {sign.strip()!r} belongs to tests in tension, compression "
+        "or bending; if these are moduli E, three times as large, name them E' and E''"
     ]
 
 
 def _perhaps_thousands(rows: list[list[str]], columns: list[Column], sign: str | None) -> list[str]:
-    """A note if the commas in numbers may separate thousands, for example "410,382"."""
+    """Return a note if the commas in numbers may separate thousands, for example "410,382"."""
     cells = [row[c.place].strip('" ') for row in rows for c in columns if c.place < len(row)]
     shown = next((cell for cell in cells if re.fullmatch(r"[1-9]\d{0,2},\d{3}", cell)), None)
     if sign is not None or shown is None:
@@ -202,11 +204,9 @@ def _perhaps_thousands(rows: list[list[str]], columns: list[Column], sign: str |
 
 
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
-    """Raw torque, angle, phase, strain and temperature in SI units, for the rows of a table; an empty cell is NaN.
+    """Return raw torque, angle, phase, strain and temperature in SI units, for the rows of a table.
 
-    A temperature column with an empty cell is left out.
-
-    `sign` is the table's decimal sign.
+    An empty cell is NaN. A temperature column with an empty cell is left out. `sign` is the table's decimal sign.
     """
     found, units = {}, unit_rows[-1] if unit_rows else []
     measured = {q: (place, factor, 0.0) for q, (place, factor) in raw_torque.known_columns(cells, units).items()}
@@ -220,14 +220,14 @@ def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
 
 
 def _cells_of(place: int, rows: list[list[str]], delimiter: str, sign: str | None) -> np.ndarray:
-    """Numbers of a column; NaN where a cell has none."""
+    """Return the numbers of a column; NaN where a cell has no number."""
     found = [to_number(row[place], delimiter, sign) if place < len(row) else None for row in rows]
     return np.array([np.nan if value is None else value for value in found])
 
 
 def _title(above: list[str]) -> str:
-    """Name of a table from the lines above its header: the step of TRIOS, the result of RheoCompass, or else the
-    nearest line."""
+    """Return the name of a table from the lines above its header: the name of the step (TRIOS) or of the result
+    (RheoCompass), or else the nearest line."""
     cells = [[c.strip("#\"' ") for c in line.split("\t")] for line in above]
     cells = [[c for c in row if c] for row in cells]
     for row in reversed(cells):
@@ -239,8 +239,8 @@ def _title(above: list[str]) -> str:
 
 
 def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: str) -> tuple[list[Column], int]:
-    """The columns, and the index of the next line to read. If one of the next two lines is a line of units, the columns
-    get these units."""
+    """Return the columns, and the index of the next line to read. If one of the next two lines is a line of units, the
+    columns get these units."""
     for ahead in range(k, min(k + 2, len(lines))):
         cells = split_cells(lines[ahead], delimiter)
         units = {c.place: cells[c.place].strip('"[]() ') for c in columns if c.place < len(cells)}
@@ -255,8 +255,8 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
 
 
 def _rows_below(path, columns, lines, k, delimiter, width):
-    """Rows of numbers below a header, their line numbers, and the index of the line after them. An empty cell is
-    NaN."""
+    """Return the rows of numbers below a header, their line numbers, and the index of the line after them. An empty
+    cell is NaN."""
     needed = [c for c in columns if not c.quantity.endswith("_sd")]
     kept, numbers = [], []
     while k < len(lines):
@@ -287,7 +287,7 @@ def _is_words(cells: list[str], needed: list[Column]) -> bool:
 
 
 def _goes_on(lines: list[str], k: int, delimiter: str, needed: list[Column]) -> bool:
-    """Whether numbers of the same table follow after line k, which has only words."""
+    """Return whether numbers of the same table follow after line k, which has only words."""
     for line in lines[k:]:
         if _complete(line):
             return False
@@ -297,7 +297,7 @@ def _goes_on(lines: list[str], k: int, delimiter: str, needed: list[Column]) -> 
 
 
 def _numbers_of_cells(path, columns, kept, numbers, delimiter):
-    """The cells of all rows as numbers."""
+    """Return the cells of all rows as numbers."""
     sign = decimal_sign(cell for row in kept for cell in row)
     rows = []
     for row, number in zip(kept, numbers, strict=True):

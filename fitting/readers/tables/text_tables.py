@@ -1,4 +1,4 @@
-"""Tables in text files of any encoding: lines, their cells, and the numbers in them."""
+"""Read tables from text files of any encoding: lines, cells, and the numbers in cells."""
 
 import codecs
 import csv
@@ -15,8 +15,12 @@ LONGEST_LINE = 131072
 
 
 def text_of(path: Path, what: str = "a frequency sweep") -> str:
-    """Content of a text file of any encoding, or of a workbook. If the file is neither, an `InputError` says so, with
-    the name `what`."""
+    """Return the content of a text file of any encoding, or of a workbook, as text. `what` names the expected content
+    in messages.
+
+    Raises:
+        InputError: the file does not exist, is empty, or is neither text nor a workbook.
+    """
     try:
         if path.is_dir():
             raise InputError(f"{path} is a folder: give the CSV file of {what}")
@@ -33,7 +37,7 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
     long = next((k for k, line in enumerate(text.splitlines(), 1) if len(line) > LONGEST_LINE), None)
     if long is not None and not text.lstrip().startswith("{"):
         raise InputError(
-            f"{path}: line {long} has more than {LONGEST_LINE} characters: no table has that; export again"
+            f"{path}: line {long} has more than {LONGEST_LINE} characters, which no table has: export it again"
         )
     if text.lstrip().startswith("{"):
         found = trios_json.tables(text)
@@ -76,10 +80,10 @@ def _decoded(path: Path, data: bytes) -> str:
 
 
 def find_delimiter(line: str) -> str:
-    """Delimiter between the cells of a line: the most frequent of tab, semicolon, comma and bar; or else spaces.
+    """Return the delimiter of a line: the most frequent of tab, semicolon, comma and bar; or else spaces.
 
-    In "Frequency, Hz;Modulus, Pa" the commas are within the cells: a comma with a space counts only if there is no tab
-    and no semicolon.
+    In "Frequency, Hz;Modulus, Pa" the commas are within the cells. So a comma with a space counts only if there is no
+    tab and no semicolon.
     """
     plain = re.sub(r"\|\s*\w+\s*\*?\s*\|", "", line) if "*|" in line else line  # the bars of |G*| are not delimiters
     plain = re.sub(r", +", "", plain) if re.search(r"[\t;]", plain) else plain
@@ -88,13 +92,13 @@ def find_delimiter(line: str) -> str:
 
 
 def split_line(line: str, delimiter: str | None = None) -> tuple[str, list[str]]:
-    """The delimiter of a line, and its cells. If no delimiter is given, it is found from the line."""
+    """Return the delimiter and the cells of a line. If no delimiter is given, it is found from the line."""
     delimiter = delimiter or find_delimiter(line)
     return delimiter, split_cells(line, delimiter)
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """The cells of a line."""
+    """Return the cells of a line."""
     if delimiter in (" ", "  "):
         return re.split(r"\s{2,}" if delimiter == "  " else r"\s+", line.strip())
     return [c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
@@ -102,14 +106,14 @@ def split_cells(line: str, delimiter: str) -> list[str]:
 
 #: Texts in cells without a measurement.
 EMPTY = {"", "-", "--", "---", "–", "—", "*", "n/a", "#n/a", "na", "n.a.", "none", "null", "nan", "?"}
-#: Spaces and apostrophes that separate thousands; and, for comma and point as separator of thousands, the pattern of
-#: such numbers.
+#: _GROUPED: spaces and apostrophes that separate thousands. _THOUSANDS: patterns of numbers in which commas or points
+#: separate thousands.
 _GROUPED = re.compile(r"(?<=\d)['’ \u00a0\u2009\u202f](?=\d{3}(\D|$))")
 _THOUSANDS = {sign: re.compile(rf"[-+]?[1-9]\d{{0,2}}(\{sign}\d{{3}})+(\{other}\d*)?") for sign, other in (",.", ".,")}
 
 
 def decimal_sign(cells: Iterable[str]) -> str | None:
-    """The decimal sign of a table: "." or ",", or None if the cells do not show it. The other sign separates
+    """Return the decimal sign of a table, "." or ",", or None if the cells do not show it. The other sign separates
     thousands."""
     found = set()
     for cell in cells:
@@ -124,8 +128,8 @@ def decimal_sign(cells: Iterable[str]) -> str | None:
 
 
 def to_number(text: str, delimiter: str, sign: str | None = None) -> float | None:
-    """The number in a cell; a decimal comma and separated thousands are allowed. NaN for an empty cell, None for any
-    other text.
+    """Return the number in a cell: NaN for an empty cell, None for any other text. A decimal comma and separated
+    thousands are allowed.
 
     Args:
         text: a cell.
@@ -149,7 +153,7 @@ def to_number(text: str, delimiter: str, sign: str | None = None) -> float | Non
 
 
 def means_nothing(cells: Iterable[str]) -> bool:
-    """Whether no cell begins like a number. Then the line has only words."""
+    """Return whether no cell begins like a number. The line then has only words."""
     return not any(re.match(r"[-+]?[.,]?\d|nan|[-+]?inf", cell.strip('" ').lower()) for cell in cells)
 
 

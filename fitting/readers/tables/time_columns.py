@@ -1,7 +1,7 @@
-"""Columns of tests in time, in SI units: the time, and a modulus, a compliance, or two measured quantities.
+"""Read the columns of relaxation and creep tests: the time, and a modulus, a compliance, or two measured quantities.
 
 The files have the same formats as for sweeps: plain CSV, TRIOS and RheoCompass text, with units in the header or below
-it.
+it. The results are in SI units.
 """
 
 import os
@@ -22,8 +22,8 @@ from fitting.readers.tables.text_tables import (
 from fitting.readers.units import TIME_TEST_UNITS
 from liverjax.core.errors import InputError
 
-#: Words with which a heading begins, and its quantity. If one entry begins with the words of another, the longer entry
-#: comes first.
+#: First words of a heading, and the quantity that they mean. If one entry begins with the words of another, the longer
+#: entry comes first.
 WORDS = (
     ("relaxation modulus e(t)", "tensile modulus"),
     ("young's modulus e(t)", "tensile modulus"),
@@ -111,7 +111,7 @@ FORMS = (
     ("tensile modulus",),
     ("tensile compliance",),
 )
-#: For each quantity of tension: the quantity of shear and the factor to it, for a sample that keeps its volume.
+#: For each tensile quantity: the quantity of shear and the conversion factor, for an incompressible sample.
 TENSILE = {
     "tensile modulus": ("modulus", 1 / 3),
     "tensile compliance": ("compliance", 3.0),
@@ -120,40 +120,38 @@ TENSILE = {
 }
 
 
-#: In tests of viscoelasticity, soft tissue is not strained beyond this [1].
+#: In viscoelastic tests, soft tissue is not strained more than this [1]. A larger value may be in percent.
 LARGE = 1.0
-#: TRIOS writes two times: one counts from the begin of the test, one from the begin of the experiment. The time of the
-#: test is used.
+#: TRIOS writes two times: one from the start of the test step, one from the start of the experiment. The time of the
+#: step is used.
 OWN_TIME = "step time"
 
 
 def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns of a test by quantity, in SI units, and notes. The times rise and begin at 0 s or later.
+    """Return the columns of a test by quantity, in SI units, and notes. The times rise and begin at 0 s or later.
 
     Raises:
-        InputError: one sentence with the file, the column or line, the value and the remedy.
+        InputError: the file cannot be used; the message names the column or line, the value and the remedy.
     """
     columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
     time = columns["time"]
     if not len(time):
         raise InputError(f"{path}: every row has an empty cell or one that is not finite; give numbers")
     if len(time) > 2 and np.all(np.diff(time) < 0):
-        raise InputError(
-            f"{path}: the rows run backwards, from {time[0]:g} s to {time[-1]:g} s; turn their order round"
-        )
+        raise InputError(f"{path}: the rows run backwards, from {time[0]:g} s to {time[-1]:g} s: reverse their order")
     if np.any(np.diff(time) <= 0) or time[0] < 0:
         k = int(np.argmax(np.diff(time) <= 0)) + 1
         order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"
         if time[0] >= 0 and time[k] == time[k - 1]:
             raise InputError(
-                f"{path}: two rows have the time {time[k]:g} s: write times with more digits, or one row of their mean"
+                f"{path}: two rows have the time {time[k]:g} s: write times with more digits, or replace both by a mean"
             )
-        raise InputError(f"{path}: {order}; let the rows begin at 0 s or later and rise in time")
+        raise InputError(f"{path}: {order}; the times must begin at 0 s or later, and increase")
     return columns, notes
 
 
 def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns, in SI units, of the first table that has the time and one of `FORMS`; and notes."""
+    """Return the columns, in SI units, of the first table that has the time and one of `FORMS`; and notes."""
     for k, line in enumerate(lines):
         delimiter, cells = split_line(line.lstrip("# "))
         found = _heading(cells)
@@ -174,43 +172,43 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
 
 
 def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns with quantities of tension converted to shear, and a note on this."""
+    """Return the columns with tensile quantities converted to shear, and a note on this."""
     tensile = [name for name in TENSILE if name in columns]
     for name in tensile:
         shear, factor = TENSILE[name]
         columns[shear] = factor * columns.pop(name)
     if tensile:
         verb = "is taken as that" if len(tensile) == 1 else "are taken as those"
-        notes = [*notes, f"{' and '.join(tensile)} {verb} of a sample that keeps its volume: G = E / 3"]
+        notes = [*notes, f"{' and '.join(tensile)} {verb} of an incompressible sample: G = E / 3"]
     if "tensile stress" in tensile:
         notes += beyond_small(float(np.nanmax(np.abs(columns["strain"]))))
     return columns, notes
 
 
-#: A note is given if the force deviates from a straight line by more than this [1].
+#: A note is given if the relative deviation of the force from linear elasticity exceeds this [1].
 BENT = 0.02
 
 
 def beyond_small(strain: float) -> list[str]:
-    """A note if the force of a neo-Hookean sample at this strain is no longer in proportion to the strain."""
+    """Return a note if the force of a neo-Hookean sample at this strain is no longer proportional to the strain."""
 
     def off(stretch: float) -> float:
-        """The force divided by the force of the straight line, minus 1."""
+        """Return the force, divided by the linear force, minus 1."""
         return (stretch - stretch**-2) / (3 * (stretch - 1)) - 1
 
     if not strain > 0 or -off(1 + strain) < BENT:
         return []
     shorter = f"{100 * off(1 - strain):.2g} % too large in compression, " if strain < 1 else ""
     return [
-        f"the sample is strained by {100 * strain:.2g} %, where the force of neo-Hookean tissue is not in proportion "
-        f"to the strain: moduli come out {shorter}{-100 * off(1 + strain):.2g} % too small in tension. To have this "
-        "computed, describe the test in a TOML file"
+        f"the sample is strained by {100 * strain:.2g} %, where the force of neo-Hookean tissue is not proportional to "
+        f"the strain: the moduli are {shorter}{-100 * off(1 + strain):.2g} % too small in tension. To include this "
+        "effect in the fit, describe the test in a TOML file"
     ]
 
 
 def _unknown_unit(line: str) -> tuple[str, str] | None:
-    """Quantity and unit of a heading whose unit is not known. The line must be a header: it names the time, and with
-    this quantity one of `FORMS`."""
+    """Return quantity and unit of a heading with an unknown unit. Returns None if the line is no header of a test (the
+    time and one of `FORMS`), or if all units are known."""
     cells = split_line(line.lstrip("# "))[1]
     found = _heading(cells)
     for cell in cells if "time" in found else []:
@@ -228,7 +226,7 @@ def _known_units(quantity: str) -> str:
 
 
 def _told_of_tables(below: list[str]) -> list[str]:
-    """A note if further tables of tests follow below the first table."""
+    """Return a note if further tables of tests follow below the first table."""
     more = sum(map(_begins_a_table, below))
     if not more:
         return []
@@ -241,8 +239,8 @@ def _begins_a_table(line: str) -> bool:
 
 
 def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """For each quantity: column index and unit of the first cell that names it. A step time comes before other
-    times."""
+    """Return for each quantity the column index and unit of the first cell that names the quantity. A step time comes
+    before other times."""
     found: dict[str, tuple[int, str | None]] = {}
     for k, cell in sorted(enumerate(cells), key=lambda each: not _is_own_time(each[1])):
         text = cell.strip().strip('"')
@@ -263,12 +261,12 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
     return _all_tensile(found, cells)
 
 
-#: Words of a heading that means shear even in a table of tension.
+#: Words of headings that mean shear even in a table of a tensile test.
 _SHEAR = re.compile(r"shear|g\(t\)|j\(t\)|schub|scher|cisail", re.IGNORECASE)
 
 
 def _all_tensile(found: dict[str, tuple[int, str | None]], cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """If one column is of tension, the other quantities are of tension too, unless their headings name shear."""
+    """Make all quantities tensile if one is tensile, except those whose headings name shear. Return the columns."""
     if not TENSILE.keys() & found.keys():
         return found
     return {
@@ -282,10 +280,10 @@ def _is_own_time(cell: str) -> bool:
 
 
 def _told_of_times(cells: list[str]) -> list[str]:
-    """A note if the header has two time columns."""
+    """Return a note if the header has two time columns."""
     if not any(map(_is_own_time, cells)) or not any("time" in _heading([c]) and not _is_own_time(c) for c in cells):
         return []
-    return ["the times are those of the column Step time; the column Time counts from another beginning"]
+    return ["the times are those of the column Step time; the column Time has another zero point"]
 
 
 def _plain_heading(unit: str) -> str:
@@ -297,7 +295,7 @@ def _known_column(quantity: str, unit: str) -> bool:
 
 
 def _rows_in_time(path, lines, k, delimiter, found):
-    """Numbers below the header, the units from a line of units, and notes. An empty cell is NaN."""
+    """Return the numbers below the header, the units from a line of units, and notes. An empty cell is NaN."""
     kept, numbers, every, units, notes = [], [], [], {}, []
     needed = {q: place for q, (place, _) in found.items()}
     while k < len(lines):
@@ -311,7 +309,7 @@ def _rows_in_time(path, lines, k, delimiter, found):
             numbers.append(k)
             continue
         named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known_column(q, cells[p])}
-        if not kept and named:  # unknown units are kept here and refused later
+        if not kept and named:  # unknown units are kept here; `_in_si` raises the error
             units = {q: cells[p].strip('[]() "') for q, p in needed.items() if p < len(cells) and cells[p].strip()}
         elif kept and _begins_a_table(line):
             break
@@ -334,7 +332,7 @@ def _rows_in_time(path, lines, k, delimiter, found):
 
 
 def _rows_follow(below: list[str], delimiter: str, places: list[int]) -> bool:
-    """Whether numbers of the same table follow below."""
+    """Return whether numbers of the same table follow below."""
     for line in below:
         if _begins_a_table(line):
             return False

@@ -1,4 +1,4 @@
-"""Warnings about a fit to waves. They are printed, and they are `warnings` in waves.json."""
+"""Warnings about a fit to waves. They are printed, and written as `warnings` into waves.json."""
 
 import itertools
 
@@ -12,22 +12,24 @@ from fitting.waves.shear_waves import velocity_and_attenuation
 from fitting.waves.stiffness_map import FAR, WaveMap
 from fitting.waves.wave_field import WaveField
 
-#: Below this radius [voxels], the modulus of a region is only a guess. In tests, the moduli of cylinders of this radius
+#: Below this radius [voxels], the modulus of a region is unreliable. In tests, the moduli of cylinders of this radius
 #: were right within 8 %.
 LEAST_RADIUS = 2.5
-#: Above this chi^2 per equation, a warning says that the model misses something.
+#: Above this chi^2 per equation, a warning says that the model does not explain the data.
 TOO_FAR = 1.5
 #: Below this chi^2 per equation, the stated noise is too large, if there are FEW equations or more.
 TOO_NEAR, FEW = 0.4, 50
 #: The chi^2 of a map is reported if it exceeds 1 per equation by more than ROUGH plus BY_CHANCE standard deviations.
 #: ROUGH is for the error of the estimated noise.
 BY_CHANCE, ROUGH = 5.0, 0.03
+#: The correlation of a map's residuals is reported if it enlarges the deviations this much more than chi^2 does.
+CORRELATED = 1.1
 #: Above this chi^2 per equation, the moduli may be wrong by more than their errors.
 WRONG = 10.0
 
 
 def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
-    """All warnings, one sentence each. The arguments are the same as for `fitting.reports.waves.report.write`."""
+    """Return all warnings. The arguments are the same as for `fitting.reports.waves.report.write`."""
     told, each = _sign(organ, found), found.whole if found.parts is None else found.parts
     told += _of_scales(organ, found)
     any_coarse = False
@@ -48,35 +50,40 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
     if found.parts is not None and found.labels is not None:
         few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus)).all(axis=0)
         for label in found.labels[few]:
-            told.append(f"region {label}: its standard error is larger than its modulus: it has too few voxels")
+            told.append(f"region {label}: its standard error exceeds its modulus, because it has too few voxels")
         told += _of_small_regions(organ.field, found.labels[~few])
         far = np.abs(found.parts.farther).max(axis=0) > 1
         if far.any():
             names = ", ".join(str(label) for label, beyond in zip(found.labels, far, strict=True) if beyond)
             told.append(
-                f"regions {names}: the waves place their edges more than a voxel away from the edges of the labels "
-                "(edges_farther_out_voxels): look at the labels"
+                f"regions {names}: according to the waves, their edges are more than a voxel away from the edges of "
+                "the labels (edges_farther_out_voxels): check the labels"
             )
     if drawn is not None and not drawn.distance <= FAR:
         told.append(
             f"the map stopped {drawn.distance:.2g} standard deviations away from its minimum: compare it with regions"
         )
+    if drawn is not None and drawn.noise_factor.max() > CORRELATED * np.sqrt(max(1.0, drawn.chi2 / drawn.components)):
+        told.append(
+            "map: its residuals at neighbouring voxels are correlated, so the standard deviations of the map are "
+            f"enlarged {drawn.noise_factor.max():.3g} times"
+        )
     # The mean of n squares has the standard deviation sqrt(2/n). The noise that divides the residuals is only an
     # estimate.
     if drawn is not None and drawn.chi2 / drawn.components > 1 + ROUGH + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(
-            f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: "
-            f"{'coarse voxels (mesh_bias), ' if any_coarse else ''}edges sharper than the map, "
+            f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation, so its standard deviations are too "
+            f"small. Possible causes: {'coarse voxels (mesh_bias), ' if any_coarse else ''}edges sharper than the map, "
             "noise that is larger in a part of the organ, a ratio of the moduli at several frequencies that is not the "
-            "same everywhere, or a body that does not move like a "
-            "viscous solid; its deviations are too small then, so compare it with regions and with one frequency alone"
+            "same everywhere, or a body that does not move like a viscous solid. Compare the map with regions and with "
+            "one frequency alone"
         )
     return told
 
 
 def _of_small_regions(field: WaveField, labels: np.ndarray) -> list[str]:
-    """A sentence on regions in which no voxel is `LEAST_RADIUS` or more away from other regions. The surface of the
-    organ does not count as another region."""
+    """Return a warning about regions in which no voxel is `LEAST_RADIUS` or more away from other regions. The surface
+    of the organ does not count as another region."""
     assert field.labels is not None
     small = []
     for label in labels:
@@ -87,8 +94,8 @@ def _of_small_regions(field: WaveField, labels: np.ndarray) -> list[str]:
     if not small:
         return []
     return [
-        f"regions {', '.join(small)}: below {LEAST_RADIUS:g} voxels of radius a modulus is a guess, and its error does "
-        "not contain this: measure with smaller voxels, or give the region the label of its surroundings"
+        f"regions {', '.join(small)}: below a radius of {LEAST_RADIUS:g} voxels, a modulus is a guess, and its error "
+        "does not show this. Measure with smaller voxels, or give the region the label of its surroundings"
     ]
 
 
@@ -98,14 +105,14 @@ NO_MOTION = 1.2
 
 
 def _of_no_motion(field: WaveField, f: int) -> list[str]:
-    """A sentence if the displacements at this frequency are hardly larger than their noise."""
+    """Return a warning if the displacements at this frequency are hardly larger than their noise."""
     u = field.displacement[f][field.mask]
     size = float(np.sqrt(np.nanmean(np.abs(u) ** 2) / 2))
     if not size < NO_MOTION * field.noise[f]:
         return []
     return [
         f"{field.frequencies[f]:g} Hz: the displacements ({size:.2g} m) are hardly larger than their noise "
-        f"({field.noise[f]:.2g} m): nothing is known of the waves there; leave this frequency out"
+        f"({field.noise[f]:.2g} m), so the waves are unknown: leave this frequency out"
     ]
 
 
@@ -114,27 +121,27 @@ SKEW = 0.15
 
 
 def _of_long_waves(hertz: float, found: Found, f: int) -> list[str]:
-    """The interval of each modulus whose error is so large that it is not the same on both sides.
+    """Return the interval of each modulus whose error is so large that the interval is not symmetric.
 
-    Waves much longer than the organ determine the compliance 1/G. The error of 1/G is symmetric.
+    Waves much longer than the organ determine the compliance 1/G, and the error of 1/G is symmetric.
     """
     each, told = found.whole if found.parts is None else found.parts, []
     for r, (G, e) in enumerate(zip(np.abs(each.modulus[f]), each.standard_errors[f].real, strict=True)):
-        told_already = found.parts is not None and e >= G  # another sentence reports this region
+        told_already = found.parts is not None and e >= G  # another warning reports this region
         if told_already or not (np.isfinite(e) and e > SKEW * G):
             continue
         half = 2 * e / G**2
         top = f"{1 / (1 / G - half):.3g} Pa" if half < 1 / G else "any value above"
         told.append(
-            f"{hertz:g} Hz: {_modulus_named(found, r)} has an error of {100 * e / G:.2g} %. Waves that are long beside "
-            "the organ determine 1/G rather than G. By the error of 1/G, the size of G is "
+            f"{hertz:g} Hz: {_modulus_named(found, r)} has an error of {100 * e / G:.2g} %. Waves much longer than "
+            "the organ determine 1/G rather than G. From the error of 1/G, the size of G is "
             f"{1 / (1 / G + half):.3g} Pa to {top} (95 %): measure at a higher frequency"
         )
     return told
 
 
 def _of_voxel_size(hertz: float, found: Found, f: int) -> list[str]:
-    """A sentence if the size of the voxels changes a modulus by more than the standard error of this modulus."""
+    """Return a warning if the size of the voxels changes a modulus by more than the standard error of this modulus."""
     each, biases = found.whole, found.mesh_bias[:, None]
     if found.parts is not None and found.parts_bias is not None:
         each, biases = found.parts, found.parts_bias
@@ -155,36 +162,35 @@ def _modulus_named(found: Found, r: int) -> str:
 
 
 def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: bool) -> list[str]:
-    """Sentences on residuals that are too large, or that neighbouring voxels share.
+    """Return warnings about residuals that are too large, or that are correlated between neighbouring voxels.
 
-    `coarse`: the size of the voxels changes a modulus by more than its error. Then the size of the voxels is named
+    `coarse`: the size of the voxels changes a modulus by more than its error. The size of the voxels is then named
     first among the causes.
     """
     told, ratio = [], each.chi2[f] / each.components
     alike = f < len(each.correlations) and each.correlations[f].seen
     if alike:
         told.append(
-            f"{hertz:g} Hz: neighbouring voxels share their residuals (correlation {each.correlations[f].beyond:.2g} "
-            f"above that of independent noise): {'the voxels are coarse (mesh_bias), ' if coarse else ''}the data are "
+            f"{hertz:g} Hz: the residuals of neighbouring voxels are correlated ({each.correlations[f].beyond:.2g} "
+            f"above independent noise): {'the voxels are coarse (mesh_bias), ' if coarse else ''}the data are "
             "smoothed, or the organ is less uniform than its "
             f"{uniform}; {_enlarged(each.noise_factor[f].max())}"
         )
     if ratio < TOO_NEAR and each.components >= FEW:
         told.append(
-            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation: the motion scatters {np.sqrt(ratio):.2g} times as much as "
-            "the stated noise, and the standard errors are too large by this factor: give a smaller --noise, or none"
+            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation. The motion scatters {np.sqrt(ratio):.2g} times as much as "
+            "the stated noise, and the standard errors are too large: give a smaller --noise, or none"
         )
     if ratio > WRONG:
         told.append(
-            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {uniform}: unless the data are smoothed"
-            f"{' or the voxels coarse' if coarse else ''}, the "
-            "moduli may be wrong by more than their errors; look for voxels that were not measured or are noisier, and "
-            "at the labels"
+            f"{hertz:g} Hz: the fit with uniform {uniform} is poor (chi2 = {ratio:.3g} per equation). Unless the data "
+            f"are smoothed{' or the voxels coarse' if coarse else ''}, the moduli may be wrong by more than their "
+            "errors. Check the labels, and exclude voxels that were not measured or are very noisy"
         )
     elif ratio > TOO_FAR and not alike:
         told.append(
-            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {uniform}: the organ is less uniform, or the "
-            "noise larger; the standard errors are enlarged by its root"
+            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {uniform}. The organ is less uniform, or the "
+            "noise is larger; the standard errors are multiplied by the square root of this chi2"
         )
     return told
 
@@ -192,16 +198,15 @@ def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: boo
 def _enlarged(factor: float) -> str:
     if factor < 1.005:
         return "standard errors do not contain this"
-    return f"standard errors are enlarged {factor:.3g} times, those of a map are not"
+    return f"standard errors are enlarged {factor:.3g} times"
 
 
-#: Speeds [m/s] of shear waves in soft tissue.
+#: Range of the speeds [m/s] of shear waves in soft tissue.
 SLOW, FAST = 0.4, 15.0
 
 
 def _in_radians(hertz: np.ndarray) -> bool:
-    """Whether all frequencies are whole numbers times 2 pi, and none is a whole number, within the digits of a
-    table."""
+    """Return whether all frequencies are whole numbers times 2 pi, and none is a whole number, within rounding."""
 
     def whole(x: np.ndarray) -> np.ndarray:
         return np.abs(x - np.round(x)) < 5e-4
@@ -210,7 +215,8 @@ def _in_radians(hertz: np.ndarray) -> bool:
 
 
 def _of_scales(organ: Organ, found: Found) -> list[str]:
-    """Sentences on wave speeds that no soft tissue has, and on moduli whose change with frequency no material has.
+    """Return warnings about wave speeds outside the range of soft tissue, and about moduli that change with frequency
+    as in no material.
 
     The balance of forces does not depend on the units, so chi^2 does not show a wrong unit.
     """
@@ -220,13 +226,13 @@ def _of_scales(organ: Organ, found: Found) -> list[str]:
     odd = np.flatnonzero(~((speeds > SLOW) & (speeds < FAST)))
     if odd.size:
         told.append(
-            f"waves of {omega[odd[0]] / (2 * np.pi):g} Hz run at {speeds[odd[0]]:.2g} m/s, and in soft tissue at "
+            f"waves of {omega[odd[0]] / (2 * np.pi):g} Hz run at {speeds[odd[0]]:.2g} m/s, but in soft tissue at "
             f"{SLOW:g} to {FAST:g} m/s: check the spacing (metres) and the frequencies (Hz, not rad/s)"
         )
     elif _in_radians(omega / (2 * np.pi)):
         told.append(
             f"the frequencies {', '.join(f'{f:.6g}' for f in omega / (2 * np.pi))} are whole numbers times 2 pi: if "
-            "they are in rad/s, moduli are 39 times too large; give them in Hz"
+            "they are in rad/s, the moduli are 39 times too large; give frequencies in Hz"
         )
     for a, b in itertools.pairwise(range(len(omega))):
         span = np.log(omega[b] / omega[a])
@@ -235,15 +241,15 @@ def _of_scales(organ: Organ, found: Found) -> list[str]:
         if slope + error < -0.1 or slope - error > 1.1:
             told.append(
                 f"from {omega[a] / (2 * np.pi):g} to {omega[b] / (2 * np.pi):g} Hz |G*| changes as the frequency to "
-                f"the power of {slope:.2g}, which is 0 to 1 in all materials: check that the frequencies are in the "
-                "order of the fields"
+                f"the power of {slope:.2g}, but this power is 0 to 1 in all materials: check that the frequencies are "
+                "in the order of the fields"
             )
     return told
 
 
 def _sign(organ: Organ, found: Found) -> list[str]:
-    """A sentence if every loss modulus that the data determine is negative. No passive material has a negative loss
-    modulus.
+    """Return a warning if every loss modulus that the data determine is negative. No passive material has a negative
+    loss modulus.
 
     If regions are given, the moduli of the regions are checked: one modulus for several materials may have any loss.
     """
@@ -257,11 +263,11 @@ def _sign(organ: Organ, found: Found) -> list[str]:
     if not wrong:
         return []
     return [
-        f"the loss modulus is negative at {', '.join(wrong)}, which no tissue has: here the motion is the real part of "
-        "U exp(+i omega t), so take the complex conjugate of waves of the other sign"
+        f"the loss modulus is negative at {', '.join(wrong)}, which no tissue has. Here the motion is the real part of "
+        "U exp(+i omega t): if your waves have the other sign, take their complex conjugate"
     ]
 
 
 def chi2_text(chi2: float) -> str:
-    """chi^2 as text with two decimals; from 1e4 on in scientific notation."""
+    """Return chi^2 as text with two decimals; from 1e4 on in scientific notation."""
     return f"{chi2:.2f}" if chi2 < 1e4 else f"{chi2:.1e}"

@@ -1,4 +1,4 @@
-"""The map of a fit to waves: waves.h5 at the voxels, waves.vtu for ParaView, and the picture waves.png."""
+"""Write the map of a fit to waves: waves.h5 at the voxels, waves.vtu for ParaView, and the picture waves.png."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
-    """Values at the voxels (nx, ny, nz), NaN outside, from values at the corners (P,)."""
+    """Interpolate values at the corners (P,) to the voxels (nx, ny, nz). Voxels outside of the organ are NaN."""
     nothing = complex(np.nan, np.nan) if np.iscomplexobj(corners) else np.nan
     out = np.full(organ.field.mask.shape, nothing, corners.dtype)
     out[tuple(organ.body.voxel.T)] = voxels.on_all_nodes(organ.body, corners)
@@ -53,8 +53,8 @@ def write_for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
 
 
 def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
-    """The middle slice, normal to the shortest side, at the highest frequency: the map, its standard deviation and the
-    direct inversion."""
+    """Plot the middle slice, normal to the shortest side, at the highest frequency: the map, its standard deviation and
+    the direct inversion."""
     f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
     k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))
     G, sd = at_voxels(organ, drawn.modulus[f]), at_voxels(organ, drawn.sd[f].real)

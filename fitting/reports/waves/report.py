@@ -1,4 +1,4 @@
-"""Results of a fit to waves: waves.json, the sweeps of the regions, and the printed table."""
+"""Write the results of a fit to waves: waves.json, the sweeps of the regions, and the printed table."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ from liverjax.core.plotting import save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 
-#: Minimum number of frequencies of a sweep.
+#: Minimum number of frequencies for which sweeps are written.
 FEWEST = 3
 #: A node of the map counts as different from the mean of the organ if it differs by more than this many standard
 #: deviations.
@@ -63,9 +63,11 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
 
 
 def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) -> list[Content]:
-    """One dictionary per region, with lists over the frequencies. The errors contain the noise, the uncertain position
-    of the edges, and the error of the elements. This error has two parts (relative): its mean `bias` (F, R) over the
-    directions of waves, and the rest `left` (F, R, D) for each direction.
+    """Return one dictionary per region, with lists over the frequencies.
+
+    The errors contain the noise, the uncertain position of the edges, and the discretisation error of the elements. The
+    relative discretisation error has two parts: its mean `bias` (F, R) over the directions of the waves, and the rest
+    `left` (F, R, D) for each direction.
     """
     omega, rows = organ.waves.omega, []
     for r in range(own.modulus.shape[1]):
@@ -96,8 +98,8 @@ def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) 
 
 
 def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
-    """For each sweep: the springpot model that `models.best_of_models` chooses, with its parameters (None if there are
-    no sweeps); and warnings.
+    """Fit each sweep with the springpot model that `models.best_of_models` chooses. Return the results (None if there
+    are no sweeps) and warnings.
     """
     if not sweeps:
         return None, []
@@ -131,7 +133,7 @@ def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
 
 
 def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
-    """Write a frequency sweep of the whole and of every region, for ``python -m fitting``, if there are enough
+    """Write a frequency sweep of the whole organ and of every region, for ``python -m fitting``, if there are enough
     frequencies. Return the files."""
     if len(organ.field.frequencies) < FEWEST:
         return {}
@@ -161,7 +163,7 @@ def _by_label(organ: Organ, found: Found) -> Content | None:
 
 
 def _direct(organ: Organ, found: Found, usual: np.ndarray) -> Content:
-    """Medians of the direct inversion over the whole organ and over each region; None if no voxel has a value."""
+    """Return medians of the direct inversion over the whole organ and each region; None where no voxel has a value."""
     labels = organ.field.labels
     places = {"whole": organ.field.mask}
     if found.labels is not None and labels is not None:
@@ -181,6 +183,7 @@ def _of_map(drawn: WaveMap) -> Content:
         "prior_deviation": drawn.deviation,
         "correlation_length_m": drawn.length,
         "chi2_per_component": drawn.chi2 / drawn.components,
+        "noise_factor": drawn.noise_factor.tolist(),
         "discrepancy_reached": drawn.reached,
         "distance_to_minimum_in_standard_deviations": drawn.distance,
         "part_of_variance_left": float(np.mean((drawn.posterior_sd / drawn.prior_sd) ** 2)),
@@ -195,7 +198,7 @@ def _error_cell(x: float | None) -> str:
 
 
 def table(content: Content) -> str:
-    """Moduli of the whole organ and of the regions at every frequency, and the direct inversion for comparison."""
+    """Return a table of the moduli of the whole organ and the regions at every frequency, with the direct inversion."""
     rows = [f"{'':12s}{'Hz':>8s}{'G_storage [Pa]':>22s}{'G_loss [Pa]':>22s}{'c [m/s]':>9s}{'chi2':>9s}   direct [Pa]"]
     for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
         direct = content["direct_inversion"][name]
@@ -212,8 +215,8 @@ def table(content: Content) -> str:
             )
     if any(row.endswith("   none") for row in rows):
         rows.append(
-            "direct: none where every voxel is near an edge or a hole of the data, or a component is not measured: its "
-            "derivatives and its smoothing reach 5 voxels"
+            "direct: none where every voxel is near an edge or a hole of the data, or where a component is not "
+            "measured. The derivatives and the smoothing of the direct inversion reach 5 voxels"
         )
     for name, own in (content["springpots"] or {}).items():
         said = ", ".join(

@@ -1,8 +1,8 @@
-"""Check, from the data alone, whether the components of the displacement follow the axes of the voxels.
+"""Check from the data alone whether the components of the displacement are in the directions of the voxel axes.
 
-Shear waves keep the volume, so the divergence of the displacement is small. The divergence is large if two components
-are exchanged, or if one has the wrong sign. This happens between programs that count rows first and programs that count
-columns first.
+Shear waves do not change the volume, so the divergence of the displacement is small. The divergence is large if two
+components are exchanged, or if one has the wrong sign. Such errors occur when data move between a program that stores
+arrays by rows and a program that stores arrays by columns.
 """
 
 import itertools
@@ -13,16 +13,17 @@ from fitting.waves.wave_field import WaveField
 
 #: Minimum number of voxels with all six neighbours.
 FEWEST = 100
-#: Another order or sign of the components is better if its mean square divergence is below this part of the given one.
+#: Another order or sign of the components is better if it reduces the mean square divergence below this fraction.
 SMALLER = 0.8
 
 
 def other_order(field: WaveField) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-    """Component and sign for each axis that give much less divergence than the given ones; None if there are none."""
+    """Return the component and the sign for each axis that give the smallest divergence. Return None if the given order
+    is nearly as good."""
     slopes = _central_differences(field)
     if slopes.shape[2] < FEWEST:
         return None
-    # The products of all slopes d_a u_c give the mean square divergence for every order and sign.
+    # The products of all derivatives d_a u_c give the mean square divergence for every order and sign.
     flat = slopes.reshape(9, -1)
     products = (flat @ flat.conj().T).real.reshape(3, 3, 3, 3)
     best: tuple[tuple[int, ...], tuple[int, ...]] = ((0, 1, 2), (1, 1, 1))
@@ -37,7 +38,7 @@ def other_order(field: WaveField) -> tuple[tuple[int, ...], tuple[int, ...]] | N
 
 
 def order_sentence(field: WaveField) -> str | None:
-    """A warning if the components are in another order or have other signs than the axes; else None."""
+    """Return a warning if another order or sign of the components would fit the axes much better; otherwise None."""
     found = other_order(field)
     if found is None:
         return None
@@ -46,13 +47,13 @@ def order_sentence(field: WaveField) -> str | None:
     names = ", ".join(("-" if whole * s < 0 else "") + "xyz"[c] for c, s in zip(order, signs, strict=True))
     return (
         f"the components of the displacement do not follow the axes of the voxels: as ({names}) they change the volume "
-        "much less, as shear waves do; give them in the order and with the signs of the axes"
+        "much less, which is expected of shear waves. Give them in the order and with the signs of the axes"
     )
 
 
 def _central_differences(field: WaveField) -> np.ndarray:
-    """Central differences d_a u_c (3, 3, n) at voxels with six measured neighbours, scaled to a root mean square of 1
-    at each frequency."""
+    """Return central differences d_a u_c (3, 3, n) at voxels with six measured neighbours. They are scaled to a root
+    mean square of 1 at each frequency."""
     U, rows = field.displacement, []
     middle = tuple(slice(1, -1) for _ in range(3))
     for u in U:

@@ -1,28 +1,28 @@
-"""Phases that a scanner has wrapped into (-pi, pi] are made continuous in space and in time."""
+"""Unwrap phases that a scanner has wrapped into (-pi, pi], so that they are continuous in space and in time."""
 
 import numpy as np
 
 from liverjax.core.errors import InputError
 
-#: Neighbours whose wrapped phases differ by more than the part _STEEP of pi are nearly ambiguous. A note is given if
-#: this holds for more than the part _MANY of them.
+#: If the wrapped phases of two neighbours differ by more than _STEEP times pi, their difference is nearly ambiguous. A
+#: note is given if this holds for more than the fraction _MANY of the neighbours.
 _STEEP, _MANY = 0.8, 0.01
 
 
 def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Phases without jumps (NaN where they are not measured), and notes. A note is given if jumps are left, or if
-    phases change so fast from voxel to voxel that jumps cannot be distinguished from waves.
+    """Return phases without jumps (NaN where they are not measured), and notes. A note is given if jumps are left, or
+    if phases change so fast from voxel to voxel that jumps cannot be distinguished from waves.
 
-    In space, edges between voxels are unwrapped in the order of their reliability (Herraez et al. 2002, Appl. Opt. 41,
-    7437). The level of each volume is then known up to multiples of 2 pi. It is assumed that the level changes by less
-    than pi from one instant of the period to the next.
+    In space, pairs of neighbouring voxels are unwrapped in the order of their reliability (Herraez et al. 2002, Appl.
+    Opt. 41, 7437). Then the mean phase of each volume is known except for multiples of 2 pi. These multiples are chosen
+    under the assumption that the median phase changes by less than pi from one instant of the period to the next.
 
     Args:
         name: name of the file, for the messages.
         phases: (F, T, nx, ny, nz, 3) [rad], T instants of a period.
 
     Raises:
-        InputError: phases lie outside of [-pi, pi], or scikit-image is missing.
+        InputError: phases are outside of [-pi, pi], or scikit-image is not installed.
     """
     measured = phases[np.isfinite(phases)]
     if not measured.size or np.abs(measured).max() > np.pi * (1 + 1e-3):
@@ -32,23 +32,26 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
         from skimage.restoration import unwrap_phase
     except ImportError:
         raise InputError(
-            f"{name}: wrapped phases need scikit-image: pip install '.[unwrap]', or unwrap them first"
+            f"{name}: wrapped phases need scikit-image: pip install '.[unwrap]', or unwrap the phases first"
         ) from None
     out = np.full(phases.shape, np.nan)
     for f, t, c in np.ndindex(phases.shape[0], phases.shape[1], phases.shape[-1]):
         one = phases[f, t, ..., c]
-        volume = np.ma.masked_array(np.nan_to_num(one), np.isnan(one))  # with NaN, the sorting would not end
+        volume = np.ma.masked_array(np.nan_to_num(one), np.isnan(one))  # with NaN, `unwrap_phase` would not end
         out[f, t, ..., c] = np.ma.filled(unwrap_phase(volume, rng=0), np.nan)
     levels = np.nanmedian(out, axis=(2, 3, 4))  # (F, T, 3)
     left = sum(int(np.sum(np.abs(np.diff(out, axis=a)) > np.pi)) for a in (2, 3, 4))
     notes = _of_steep_phases(phases)
-    note = f"{left} neighbouring voxels still differ by more than pi after unwrapping: their waves are wrong; mask them"
+    note = (
+        f"{left} pairs of neighbouring voxels still differ by more than pi after unwrapping, so the waves are wrong "
+        "there. Remove these voxels from the mask"
+    )
     return out + (np.unwrap(levels, axis=1) - levels)[:, :, None, None, None], notes + ([note] if left else [])
 
 
 def _of_steep_phases(phases: np.ndarray) -> list[str]:
-    """A note for each frequency at which many neighbouring voxels differ by nearly pi, the maximum that wrapped phases
-    can show."""
+    """Return a note for each frequency with many neighbouring voxels that differ by nearly pi. This is the largest
+    difference that wrapped phases can show."""
     notes = []
     for f, one in enumerate(phases):
         steps = [np.diff(one, axis=a) for a in (1, 2, 3)]
@@ -57,7 +60,7 @@ def _of_steep_phases(phases: np.ndarray) -> list[str]:
         if steep > _MANY:
             notes.append(
                 f"frequency {f + 1} of {len(phases)}: {100 * steep:.2g} % of neighbouring voxels differ by nearly pi "
-                "in phase: there jumps cannot be distinguished from waves, and the motion may be wrong; use a "
+                "in phase. There, jumps cannot be distinguished from waves, so the motion may be wrong. Use a "
                 "weaker motion encoding (fewer radians per micrometre), or smaller voxels"
             )
     return notes

@@ -5,7 +5,7 @@ from typing import ClassVar
 from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
-#: Series coefficients of the inverse Langevin function; the printed chapter lacks the numerators (11, 19, 519).
+#: Series coefficients from the inverse Langevin function. The printed chapter lacks the numerators (11, 19, 519).
 COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 
 
@@ -13,7 +13,7 @@ COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 class ArrudaBoyce(Law):
     """W = mu sum_k c_k / N^(k-1) (Ibar1^k - 3^k) + U(J), k = 1 … 5.
 
-    Chapter, Table 1 with corrected numerators; Arruda and Boyce 1993. mu = n k_B Theta, N = `chain_length`.
+    Book chapter, Table 1 with corrected numerators; Arruda and Boyce 1993. mu = n k_B Theta, N = `chain_length`.
     """
 
     mu: Number = param("Pa", "n k_B Theta", above=0.0, typical=730.0)
@@ -23,7 +23,7 @@ class ArrudaBoyce(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """The series with the factor (Ibar1 - 3) taken out, so that there is no cancellation at rest."""
+        """Energy of the series. The factor (Ibar1 - 3) is taken out, so that there is no cancellation at rest."""
         total = 0.0
         for k, c in enumerate(COEFFICIENTS, start=1):
             # (I^k - 3^k) = (I - 3) sum_m I^m 3^(k-1-m), by Horner's rule.
@@ -34,7 +34,7 @@ class ArrudaBoyce(Law):
         return self.mu * (I1 - 3) * total
 
     def isochoric_derivatives(self, I1, I2):
-        """Both derivatives by Horner's rule."""
+        """First and second derivative with respect to Ibar1, by Horner's rule."""
         t = I1 / self.chain_length
         slope, curvature = 0.0, 0.0
         for k, c in reversed(list(enumerate(COEFFICIENTS, start=1))):
@@ -44,5 +44,5 @@ class ArrudaBoyce(Law):
         return {"I1": self.mu * slope}, {("I1", "I1"): self.mu / self.chain_length * curvature}
 
     def shear_modulus(self):
-        """mu (1 + 3/(5 N) + 99/(175 N^2) + …) [Pa]: twice the slope at rest."""
+        """Shear modulus mu (1 + 3/(5 N) + 99/(175 N^2) + …) [Pa]: twice dW/dIbar1 at rest."""
         return 2 * self.isochoric_derivatives(3.0, None)[0]["I1"]

@@ -1,6 +1,6 @@
 """Bogen: one power of the principal stretches.
 
-The chapter's Table 1 prints "- 1" instead of "- 3". With "- 1" the energy at rest would not be 0.
+Table 1 of the book chapter prints "- 1" instead of "- 3". With "- 1" the energy at rest would not be 0.
 """
 
 from typing import ClassVar
@@ -13,10 +13,11 @@ from liverjax.laws.base import Law
 class Bogen(Law):
     """W = mu/alpha (Xi(alpha) - 3) + U(J).
 
-    Chapter, Table 1 (with - 3 instead of - 1); Bogen 1987. It is one term of Ogden's law.
+    Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. Book chapter, Table 1 (with - 3 instead of - 1); Bogen 1987. This law
+    is one term of Ogden's law.
     """
 
-    mu: Number = param("Pa", "mu; it must have alpha's sign for a stable law", typical=400.0)
+    mu: Number = param("Pa", "mu; a stable law needs mu and alpha with the same sign", typical=400.0)
     alpha: Number = param("1", "exponent", nonzero=True, typical=4.0)
     bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
@@ -27,13 +28,13 @@ class Bogen(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """mu/alpha X."""
+        """Energy mu/alpha X with X = Xi(alpha) - 3."""
         return self.mu / self.alpha * X
 
     def stretch_derivatives(self, X):
-        """First derivative mu/alpha; the second is 0."""
+        """First derivative mu/alpha. The second derivative is 0."""
         return (self.mu / self.alpha,), {}
 
     def shear_modulus(self):
-        """mu alpha / 2 [Pa]."""
+        """Ground-state shear modulus mu alpha / 2 [Pa]."""
         return self.mu * self.alpha / 2

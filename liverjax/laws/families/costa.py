@@ -18,9 +18,9 @@ class Costa(Law):
     """W = c/2 (exp Q - 1) + U(J), Q = sum b_AB E_AB^2 over fibre, sheet, normal, shear pairs counted twice.
 
     Q = b_ff E_ff^2 + b_ss E_ss^2 + b_nn E_nn^2 + 2 (b_fs E_fs^2 + b_fn E_fn^2 + b_sn E_sn^2). Costa, Holmes and
-    McCulloch 2001. The chapter names the law (section 4.1.2 i, for heart muscle) but prints no formula: it is not in
-    Table 1. E is Green's strain in the axes fibre, sheet (made orthogonal to the fibre) and normal. This energy is not
-    isochoric: it adds to the bulk modulus.
+    McCulloch 2001. The book chapter names this law (section 4.1.2 i, for heart muscle) but prints no formula for it. E
+    is Green's strain in the axes fibre, sheet (made orthogonal to the fibre) and normal. The energy is not isochoric,
+    so it adds to the bulk modulus.
     """
 
     c: Number = param("Pa", "scale", above=0.0, typical=200.0)
@@ -44,11 +44,11 @@ class Costa(Law):
         return sum(terms[:3]) + 2 * sum(terms[3:])
 
     def green_energy(self, E):
-        """The energy with expm1, so that there is no cancellation at rest."""
+        """Energy, computed with expm1 so that there is no cancellation at rest."""
         return 0.5 * self.c * jnp.expm1(self._exponent(E))
 
     def green_derivatives(self, E):
-        """S_AB = s b_AB E_AB with s = c exp Q, and moduli s b_AB (half for shears) + 2/s S (x) S."""
+        """Stress S_AB = s b_AB E_AB with s = c exp Q, and moduli s b_AB (half for shears) + (2/s) S (x) S."""
         s = self.c * jnp.exp(self._exponent(E))
         b = self._weights()
         S = symmetric(tuple(s * w * E[i][j] for w, (i, j) in zip(b, SIX, strict=True)))
@@ -56,18 +56,18 @@ class Costa(Law):
         return S, GreenModuli(normal, tuple(0.5 * s * w for w in b[3:]), 2 / s)
 
     def shear_modulus(self):
-        """Voigt mean over all shears, c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""
+        """Voigt mean of the shear modulus, c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""
         b = self._weights()
         return self.c * (sum(b[:3]) / 15 + sum(b[3:]) / 10)
 
     def bulk_modulus(self):
-        """Voigt mean: bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
+        """Voigt mean of the bulk modulus, bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
         return (0.0 if self.bulk is None else self.bulk) + self.c * sum(self._weights()[:3]) / 9
 
     def check_directions(self):
         """Raise `InputError` if a direction has length 0, or the sheet is parallel to the fibre.
 
-        Traced directions pass.
+        Traced directions are not checked.
         """
         if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves((self.fibre, self.sheet))):
             return
@@ -79,10 +79,10 @@ class Costa(Law):
         size = np.linalg.norm(f, axis=-1) * np.linalg.norm(s, axis=-1)
         if np.any(np.linalg.norm(np.cross(f, s), axis=-1) <= 1e-9 * size):
             raise InputError(
-                "law costa: sheet lies along fibre, or one of them is zero: give two directions that differ"
+                "law costa: sheet is parallel to fibre, or one of them is zero; give two different directions"
             )
 
     @classmethod
     def guccione(cls, *, c: Number, b_f: Number, b_t: Number, b_fs: Number, bulk: Number, **directions: Any) -> "Costa":
-        """Guccione, McCulloch and Waldman 1991: b_ff = b_f, b_ss = b_nn = b_sn = b_t, b_fs = b_fn = b_fs."""
+        """Make the law of Guccione et al. 1991: b_ff = b_f, b_ss = b_nn = b_sn = b_t, b_fs = b_fn = b_fs."""
         return cls(c=c, b_ff=b_f, b_ss=b_t, b_nn=b_t, b_sn=b_t, b_fs=b_fs, b_fn=b_fs, bulk=bulk, **directions)

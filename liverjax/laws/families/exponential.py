@@ -1,6 +1,6 @@
 """Exponential of a power of the principal stretches.
 
-The chapter's Table 1 prints "- 1" instead of "- 3". With "- 1" the energy at rest would not be 0.
+Table 1 of the book chapter prints "- 1" instead of "- 3". With "- 1" the energy at rest would not be 0.
 """
 
 from typing import ClassVar
@@ -15,7 +15,7 @@ from liverjax.laws.base import Law
 class Exponential(Law):
     """W = c1 (exp(c2 (Xi(alpha) - 3)) - 1) + U(J).
 
-    Chapter, Table 1 (with - 3 instead of - 1).
+    Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. Book chapter, Table 1 (with - 3 instead of - 1).
     """
 
     c1: Number = param("Pa", "scale", above=0.0, typical=385.0)
@@ -30,14 +30,14 @@ class Exponential(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """The energy with expm1, so that there is no cancellation at rest."""
+        """Energy, computed with expm1 so that there is no cancellation at rest. X = Xi(alpha) - 3."""
         return self.c1 * jnp.expm1(self.c2 * X)
 
     def stretch_derivatives(self, X):
-        """c1 c2 e and c1 c2^2 e, e = exp(c2 X)."""
+        """First and second derivative with respect to X: c1 c2 e and c1 c2^2 e, with e = exp(c2 X)."""
         slope = self.c1 * self.c2 * jnp.exp(self.c2 * X)
         return (slope,), {(0, 0): self.c2 * slope}
 
     def shear_modulus(self):
-        """c1 c2 alpha^2 / 2 [Pa]."""
+        """Ground-state shear modulus c1 c2 alpha^2 / 2 [Pa]."""
         return self.c1 * self.c2 * self.alpha**2 / 2

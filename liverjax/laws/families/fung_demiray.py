@@ -12,7 +12,7 @@ from liverjax.laws.base import Law
 class FungDemiray(Law):
     """W = c1/(2 c2) (exp(c2 (Ibar1 - 3)) - 1) + U(J).
 
-    Chapter, Table 1; Demiray 1972.
+    Book chapter, Table 1; Demiray 1972.
     """
 
     c1: Number = param("Pa", "ground-state shear modulus", above=0.0, typical=770.0)
@@ -22,14 +22,14 @@ class FungDemiray(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """The energy with expm1, so that there is no cancellation at rest."""
+        """Energy, computed with expm1 so that there is no cancellation at rest."""
         return 0.5 * self.c1 / self.c2 * jnp.expm1(self.c2 * (I1 - 3))
 
     def isochoric_derivatives(self, I1, I2):
-        """c1/2 e and c1 c2/2 e, e = exp(c2 (Ibar1 - 3))."""
+        """First and second derivative with respect to Ibar1: (c1/2) e and (c1 c2/2) e, e = exp(c2 (Ibar1 - 3))."""
         slope = 0.5 * self.c1 * jnp.exp(self.c2 * (I1 - 3))
         return {"I1": slope}, {("I1", "I1"): self.c2 * slope}
 
     def shear_modulus(self):
-        """c1 [Pa]."""
+        """Ground-state shear modulus c1 [Pa]."""
         return self.c1

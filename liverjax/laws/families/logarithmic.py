@@ -1,4 +1,4 @@
-"""Logarithm of a power of the principal stretches. It is infinite at a finite stretch."""
+"""Logarithm of a power of the principal stretches. The energy is infinite at a finite stretch."""
 
 from typing import ClassVar
 
@@ -12,7 +12,8 @@ from liverjax.laws.base import Law
 class Logarithmic(Law):
     """W = -c1 ln(1 - c2 (Xi(alpha) - 3)) + U(J).
 
-    Chapter, Table 1. W is infinite at Xi(alpha) = 3 + 1/c2, and NaN above.
+    Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. Book chapter, Table 1. W is infinite at Xi(alpha) = 3 + 1/c2. W is NaN
+    for larger Xi.
     """
 
     c1: Number = param("Pa", "scale", above=0.0, typical=1925.0)
@@ -27,18 +28,18 @@ class Logarithmic(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """The energy with log1p, so that there is no cancellation at rest."""
+        """Energy, computed with log1p so that there is no cancellation at rest. X = Xi(alpha) - 3."""
         return -self.c1 * jnp.log1p(-self._filled(X))
 
     def _filled(self, X):
-        """c2 X; NaN at the pole c2 X = 1 and above."""
+        """Return c2 X, and NaN at the pole c2 X = 1 and above."""
         return jnp.where(self.c2 * X < 1, self.c2 * X, jnp.nan)
 
     def stretch_derivatives(self, X):
-        """c1 c2/(1 - c2 X) and c1 c2^2/(1 - c2 X)^2."""
+        """First and second derivative with respect to X: c1 c2/(1 - c2 X) and c1 c2^2/(1 - c2 X)^2."""
         pole = self.c2 / (1 - self._filled(X))
         return (self.c1 * pole,), {(0, 0): self.c1 * pole * pole}
 
     def shear_modulus(self):
-        """c1 c2 alpha^2 / 2 [Pa]."""
+        """Ground-state shear modulus c1 c2 alpha^2 / 2 [Pa]."""
         return self.c1 * self.c2 * self.alpha**2 / 2

@@ -1,4 +1,4 @@
-"""Generalised Mooney-Rivlin up to third order."""
+"""Generalised Mooney-Rivlin law up to third order."""
 
 from typing import Any, ClassVar
 
@@ -15,7 +15,7 @@ _POWERS = {"c10": (1, 0), "c01": (0, 1), "c20": (2, 0), "c11": (1, 1), "c02": (0
 
 
 def _monomial(coefficient: float, *factors: tuple[Any, int]) -> Number:
-    """coefficient * prod x^n by multiplication, since JAX's derivative of x**0 is NaN at x = 0."""
+    """Compute coefficient * prod x^n by multiplication, since JAX's derivative of x**0 is NaN at x = 0."""
     value = coefficient
     for x, n in factors:
         for _ in range(n):
@@ -27,7 +27,7 @@ def _monomial(coefficient: float, *factors: tuple[Any, int]) -> Number:
 class MooneyRivlin(Law):
     """W = sum c_ij (Ibar1 - 3)^i (Ibar2 - 3)^j + U(J), i + j <= 3.
 
-    Chapter, Table 1. A coefficient that is not given does not exist: it needs no computation and cannot be fitted.
+    Book chapter, Table 1. A coefficient that is not given is left out: it needs no computation and cannot be fitted.
     """
 
     c10: Number = param("Pa", "coefficient of (Ibar1 - 3)", typical=300.0)
@@ -44,16 +44,16 @@ class MooneyRivlin(Law):
     invariants: ClassVar = ("I1", "I2", "J")
 
     def terms(self):
-        """Coefficient and powers of every monomial with a given coefficient."""
+        """Return coefficient and powers of every monomial with a given coefficient."""
         return [(getattr(self, name), i, j) for name, (i, j) in _POWERS.items() if getattr(self, name) is not None]
 
     def isochoric_energy(self, I1, I2):
-        """Polynomial in the deviations from rest."""
+        """Energy: a polynomial in Ibar1 - 3 and Ibar2 - 3."""
         a, b = I1 - 3, I2 - 3
         return sum(c * _monomial(1.0, (a, i), (b, j)) for c, i, j in self.terms())
 
     def isochoric_derivatives(self, I1, I2):
-        """Derivatives of the monomials. Terms that are always 0 are left out."""
+        """First and second derivatives of the polynomial. Terms that are always 0 are left out."""
         a, b = I1 - 3, I2 - 3
         first, second = {}, {}
         for c, i, j in self.terms():
@@ -70,5 +70,5 @@ class MooneyRivlin(Law):
         return first, second
 
     def shear_modulus(self):
-        """2 (c10 + c01) [Pa]."""
+        """Ground-state shear modulus 2 (c10 + c01) [Pa]."""
         return 2 * (self.c10 + self.c01)

@@ -1,4 +1,4 @@
-"""Neo-Hookean laws: the form of the chapter's Table 1 (with C1 = mu/2), and the compressible form of the literature."""
+"""Neo-Hookean laws: the form in Table 1 of the book chapter (C1 = mu/2), and a compressible form of the literature."""
 
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from liverjax.laws.base import Law
 class NeoHookean(Law):
     """W = mu/2 (Ibar1 - 3) + U(J).
 
-    Chapter, Table 1 (C1 = mu/2), with isochoric invariants because tetrahedra are compressible.
+    Book chapter, Table 1 (C1 = mu/2), with isochoric invariants because tetrahedra are compressible.
     """
 
     mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)
@@ -21,15 +21,15 @@ class NeoHookean(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """mu/2 (Ibar1 - 3)."""
+        """Energy mu/2 (Ibar1 - 3)."""
         return 0.5 * self.mu * (I1 - 3)
 
     def isochoric_derivatives(self, I1, I2):
-        """The first derivative is constant, and the second is 0."""
+        """First derivative mu/2. The second derivative is 0."""
         return {"I1": 0.5 * self.mu}, {}
 
     def shear_modulus(self):
-        """mu [Pa]."""
+        """Ground-state shear modulus mu [Pa]."""
         return self.mu
 
 
@@ -37,7 +37,7 @@ class NeoHookean(Law):
 class NeoHookeanCompressible(Law):
     """W = mu/2 (I1 - 3) - mu ln J + lambda/2 ln^2 J.
 
-    The compressible form of the literature (Bonet and Wood 2008, eq. 6.27). It is infinite at J = 0.
+    This is the compressible form of the literature (Bonet and Wood 2008, eq. 6.27). W is infinite at J = 0.
     """
 
     mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)
@@ -45,12 +45,12 @@ class NeoHookeanCompressible(Law):
     invariants: ClassVar = ("I1", "J")
 
     def strain_energy(self, I):
-        """The complete energy."""
+        """Complete strain energy density [Pa]."""
         ln = jnp.log(I.J)
         return 0.5 * self.mu * (I.I1 - 3) - self.mu * ln + 0.5 * self.lame_lambda * ln**2
 
     def energy_derivatives(self, I):
-        """W_1 = mu/2, W_J = (lambda ln J - mu)/J, W_JJ = (lambda (1 - ln J) + mu)/J^2."""
+        """Derivatives W_1 = mu/2, W_J = (lambda ln J - mu)/J and W_JJ = (lambda (1 - ln J) + mu)/J^2."""
         ln = jnp.log(I.J)
         inverse_J = 1 / I.J
         slope = (self.lame_lambda * ln - self.mu) * inverse_J
@@ -58,9 +58,9 @@ class NeoHookeanCompressible(Law):
         return {"I1": 0.5 * self.mu, "J": slope}, {("J", "J"): curvature}
 
     def shear_modulus(self):
-        """mu [Pa]."""
+        """Ground-state shear modulus mu [Pa]."""
         return self.mu
 
     def bulk_modulus(self):
-        """lambda + 2/3 mu [Pa]."""
+        """Ground-state bulk modulus lambda + 2/3 mu [Pa]."""
         return self.lame_lambda + 2 / 3 * self.mu

@@ -1,6 +1,6 @@
 """Ogden: powers of the principal stretches.
 
-Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. A law of stretches gets X = Xi - 3, which is exact at rest.
+Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. The methods get X = Xi - 3, computed without cancellation at rest.
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from liverjax.laws.base import Law
 class Ogden(Law):
     """W = sum_k mu_k/alpha_k (Xi(alpha_k) - 3) + U(J).
 
-    Chapter, Table 1; Ogden 1972. Some authors write mu_k/alpha_k^2: their mu_k is alpha_k times the mu_k here. The law
-    is stable for every stretch if each mu_k alpha_k > 0.
+    Book chapter, Table 1; Ogden 1972. Some authors write mu_k/alpha_k^2; their mu_k is alpha_k times the mu_k here. The
+    law is stable for every stretch if each mu_k alpha_k > 0.
     """
 
     mu: Sequence[float] | Array = param("Pa", "mu_k, one per term", each=True, typical=(700.0, -40.0))
@@ -30,15 +30,15 @@ class Ogden(Law):
         return tuple(self.alpha)
 
     def stretch_energy(self, *X):
-        """Sum of the terms."""
+        """Energy: the sum of mu_k/alpha_k X_k."""
         return sum(m / a * x for m, a, x in zip(self.mu, self.alpha, X, strict=True))
 
     def stretch_derivatives(self, *X):
-        """mu_k/alpha_k; all second derivatives are zero."""
+        """First derivatives mu_k/alpha_k. All second derivatives are zero."""
         return tuple(m / a for m, a in zip(self.mu, self.alpha, strict=True)), {}
 
     def shear_modulus(self):
-        """sum mu_k alpha_k / 2 [Pa]."""
+        """Ground-state shear modulus: sum of mu_k alpha_k / 2 [Pa]."""
         return sum(m * a for m, a in zip(self.mu, self.alpha, strict=True)) / 2
 
     def check(self):

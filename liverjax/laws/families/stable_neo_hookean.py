@@ -1,4 +1,4 @@
-"""Stable neo-Hookean: its energy is finite for every deformation gradient, even if it is inverted."""
+"""Stable neo-Hookean law. The energy is finite for every deformation gradient, even for inverted elements."""
 
 import math
 from typing import ClassVar
@@ -15,7 +15,7 @@ class StableNeoHookean(Law):
     m = 4/3 mu, l = lame_lambda + 5/6 mu.
 
     Smith, De Goes, Kim 2018 (eq. 14, shifted to 0 at rest). With these m and l, mu and lame_lambda are the Lame
-    coefficients of the ground state (their section 3.4).
+    coefficients of the ground state (section 3.4 of the paper).
     """
 
     mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)
@@ -26,22 +26,22 @@ class StableNeoHookean(Law):
         return 4 / 3 * self.mu, self.lame_lambda + 5 / 6 * self.mu
 
     def strain_energy(self, I):
-        """The complete energy: l/2 [(J - a)^2 - (1 - a)^2] = l/2 (J - 1)^2 - 3 m/4 (J - 1)."""
+        """Complete energy, computed with l/2 [(J - a)^2 - (1 - a)^2] = l/2 (J - 1)^2 - 3 m/4 (J - 1)."""
         m, l = self._constants()
         shift = I.J - 1
         return 0.5 * m * (I.I1 - 3 - jnp.log(I.I1 + 1) + math.log(4)) + shift * (0.5 * l * shift - 0.75 * m)
 
     def energy_derivatives(self, I):
-        """W_1 = m/2 I1/(I1 + 1), W_J = l (J - 1) - 3 m/4, W_11 = m/2/(I1 + 1)^2, W_JJ = l."""
+        """Derivatives W_1 = m/2 I1/(I1 + 1), W_J = l (J - 1) - 3 m/4, W_11 = m/2/(I1 + 1)^2 and W_JJ = l."""
         m, l = self._constants()
         inverse = 1 / (I.I1 + 1)
         first = {"I1": 0.5 * m * I.I1 * inverse, "J": l * (I.J - 1) - 0.75 * m}
         return first, {("I1", "I1"): 0.5 * m * inverse * inverse, ("J", "J"): l}
 
     def shear_modulus(self):
-        """mu [Pa]."""
+        """Ground-state shear modulus mu [Pa]."""
         return self.mu
 
     def bulk_modulus(self):
-        """lambda + 2/3 mu [Pa]."""
+        """Ground-state bulk modulus lambda + 2/3 mu [Pa]."""
         return self.lame_lambda + 2 / 3 * self.mu

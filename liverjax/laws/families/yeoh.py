@@ -10,7 +10,7 @@ from liverjax.laws.base import Law
 class Yeoh(Law):
     """W = sum_k c_k (Ibar1 - 3)^k + U(J), k = 1 … 3.
 
-    Chapter, Table 1 (reduced polynomial model).
+    Book chapter, Table 1 (reduced polynomial model).
     """
 
     c1: Number = param("Pa", "coefficient of (Ibar1 - 3)", above=0.0, typical=385.0)
@@ -21,15 +21,15 @@ class Yeoh(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """Cubic in Ibar1 - 3, by Horner's rule."""
+        """Energy: a cubic polynomial in Ibar1 - 3, by Horner's rule."""
         a = I1 - 3
         return a * (self.c1 + a * (self.c2 + a * self.c3))
 
     def isochoric_derivatives(self, I1, I2):
-        """c1 + 2 c2 a + 3 c3 a^2 and 2 c2 + 6 c3 a, a = Ibar1 - 3."""
+        """First and second derivative: c1 + 2 c2 a + 3 c3 a^2 and 2 c2 + 6 c3 a, with a = Ibar1 - 3."""
         a = I1 - 3
         return {"I1": self.c1 + a * (2 * self.c2 + 3 * self.c3 * a)}, {("I1", "I1"): 2 * self.c2 + 6 * self.c3 * a}
 
     def shear_modulus(self):
-        """2 c1 [Pa]."""
+        """Ground-state shear modulus 2 c1 [Pa]."""
         return 2 * self.c1

@@ -1,8 +1,8 @@
-"""Stress and stiffness in the form of the chapter (section 4.1.2): six terms for every product g^k(I1, I2) h^k(J).
+"""Stress and stiffness as in the book chapter (section 4.1.2): six terms for every product g^k(I1, I2) h^k(J).
 
-This is a documented variant. `liverjax.laws.terms.invariant_terms` first sums the scalars over k. It gives the same
-values up to roundoff, and its cost does not grow with the number of products. `liverjax.laws.products` writes the laws
-as such products.
+This is a variant for comparison. The default, `liverjax.laws.terms.invariant_terms`, first sums the scalars over k. The
+default gives the same values up to roundoff, and its cost does not grow with the number of products.
+`liverjax.laws.products` writes the laws as such products.
 """
 
 from typing import NamedTuple
@@ -88,12 +88,12 @@ def _state_at(law: Energies, F: Matrix) -> _At:
 
 
 def _stress_of_product(t: _Term, s: _At) -> Matrix:
-    """S^k = 2 dg/dC; it needs no inverse."""
+    """Return S^k = 2 dg/dC. No matrix is inverted."""
     return add_matrices(scale_matrix(2 * t.g1, IDENTITY), scale_matrix(2 * t.g2, s.B))
 
 
 def first_piola(law: Energies, F: Matrix) -> Matrix:
-    """sum_k phi' (h' g cof F + h F S^k) [Pa]."""
+    """First Piola-Kirchhoff stress sum_k phi' (h' g cof F + h F S^k) [Pa]."""
     s = _state_at(law, F)
     total = scale_matrix(0.0, F)
     for terms, phi1, _ in s.groups:
@@ -104,16 +104,16 @@ def first_piola(law: Energies, F: Matrix) -> Matrix:
 
 
 def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, jax.Array]]:
-    """D_i (x) D_j and D_i . D_j of every pair: the constant parts of L and U."""
+    """Return D_i (x) D_j and D_i . D_j of every pair, which are the constant parts of the matrices L and U."""
     return [(outer(D[i], D[j]), dot(D[i], D[j])) for i, j in pairs]
 
 
 class Layout(NamedTuple):
-    """Which parts are stored in memory; the default is the fastest (experiments/chapter)."""
+    """Parts that are stored in memory. The default is the fastest choice (experiments/chapter)."""
 
-    #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes; None: computed where they are used.
+    #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes. None: they are computed when used.
     constant: list | None = None
-    #: Whether values that blocks share are written to memory, as in `invariant_terms`; here this is slower.
+    #: Whether values that blocks share are written to memory, as in `invariant_terms`. Here this is slower.
     write: bool = False
 
 
@@ -125,9 +125,10 @@ def blocks(
     regularised: bool = False,
     layout: Layout = Layout(),
 ) -> list[Matrix]:
-    """d2W/dx_i dx_j per reference volume: the sum of G + H + I + Lambda + M + R over k, and the term with phi''.
+    """Return stiffness blocks d2W/dx_i dx_j per reference volume.
 
-    `regularised` changes the G of every product, but not the term with phi''.
+    A block is the sum over k of the chapter's terms G + H + I + Lambda + M + R, plus the term with phi''. `regularised`
+    changes the term G of every product, but not the term with phi''.
     """
     keep = _written if layout.write else lambda values: values
     s = keep(_state_at(law, F))
@@ -137,12 +138,12 @@ def blocks(
 
 
 class _Node(NamedTuple):
-    """Input of the six terms at a node."""
+    """Values at one node that the six terms need."""
 
     D: Vector
     cof: Vector  # cof F D
     B: Vector  # B D
-    S: list[list[Vector]]  # S^k D, by group and term
+    S: list[list[Vector]]  # S^k D, for each group and term
     FS: list[list[Vector]]  # F S^k D
 
 
@@ -152,7 +153,7 @@ def _node(s: _At, D: Vector) -> _Node:
 
 
 def _written(values: T) -> T:
-    """The pytree with its arrays written to memory (`stored`). Plain numbers are not changed."""
+    """Return the pytree with its arrays written to memory (`stored`). Plain numbers are not changed."""
     leaves, tree = jax.tree.flatten(values)
     arrays = iter(stored([v for v in leaves if jnp.ndim(v)]))
     return jax.tree.unflatten(tree, [next(arrays) if jnp.ndim(v) else v for v in leaves])
@@ -163,7 +164,7 @@ def _six_terms(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Number], regu
     for n, (terms, phi1, phi2) in enumerate(s.groups):
         for t, FSDi, FSDj, SDj in zip(terms, i.FS[n], j.FS[n], j.S[n], strict=True):
             G = scale_matrix(t.h2 * t.g, outer(i.cof, j.cof))
-            if regularised:  # eps/3, where the chapter prints eps: so the trace does not change
+            if regularised:  # eps/3 keeps the trace unchanged (the chapter prints eps)
                 eps = jnp.clip(1 - s.J, 0, 1)
                 trace = scale_matrix(t.h2 * t.g * eps / 3 * dot(i.cof, j.cof), IDENTITY)
                 G = add_matrices(scale_matrix(1 - eps, G), trace)
@@ -180,13 +181,16 @@ def _six_terms(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Number], regu
 
 
 def _second_derivative_of_J(F: Matrix, Di: Vector, Dj: Vector) -> Matrix:
-    """-[F (D_i x D_j)]_x."""
+    """Return d2J/dx_i dx_j = -[F (D_i x D_j)]_x, where [v]_x is the matrix of the cross product with v."""
     n0, n1, n2 = matvec(F, cross(Di, Dj))
     return ((0.0, n2, -n1), (-n2, 0.0, n0), (n1, -n0, 0.0))
 
 
 def _linear_matrices(t: _Term, i: _Node, j: _Node, constant: tuple[Matrix, Number]) -> Matrix:
-    """L + U of dS/dC : H = beta H + sum delta_ab (B_b : H) B_a, with B_1 = Id and B_2 = I1 Id - C."""
+    """Return the matrices L + U.
+
+    They follow from dS/dC : H = beta H + sum delta_ab (B_b : H) B_a, with B_1 = Id and B_2 = I1 Id - C.
+    """
     DiDj, product = constant
     beta = -2 * t.g2
     L = add_matrices(scale_matrix(beta, transpose(DiDj)), scale_matrix(beta * product, IDENTITY))
@@ -197,7 +201,7 @@ def _linear_matrices(t: _Term, i: _Node, j: _Node, constant: tuple[Matrix, Numbe
 
 
 def _slope(terms: list[_Term], node: _Node, n: int) -> Vector:
-    """d(sum_k g h)/dx at a node, for the terms of group n."""
+    """Return the derivative d(sum_k g h)/dx at a node, for the terms of group n."""
     v = scale(sum(t.h1 * t.g for t in terms), node.cof)
     for t, FS in zip(terms, node.FS[n], strict=True):
         v = tuple(a + t.h * b for a, b in zip(v, FS, strict=True))

@@ -1,4 +1,4 @@
-"""Hand-derived stress and stiffness of laws w(E) of Green's strain in the axes of the material."""
+"""Hand-derived stress and stiffness of energies w(E) of Green's strain in the axes of the material."""
 
 from typing import Any, NamedTuple
 
@@ -31,7 +31,7 @@ from liverjax.tensors.matrices import (
 
 
 class GreenModuli(NamedTuple):
-    """dS/dE = orthotropic moduli + `curvature` S (x) S, in the axes of the material."""
+    """Moduli dS/dE in the axes of the material: orthotropic moduli plus `curvature` times S (x) S."""
 
     normal: Matrix  # C_mmnn
     shear: Vector  # C_mnmn of the pairs 12, 13, 23
@@ -39,13 +39,13 @@ class GreenModuli(NamedTuple):
 
 
 def stress(law: Energies, F: Matrix) -> Matrix:
-    """Second Piola-Kirchhoff stress [Pa] of w only."""
+    """Second Piola-Kirchhoff stress [Pa] of the energy w(E) only."""
     A = law.material_axes(F[0][0])
     return rotated(_stress_of_strain(law, green_strain(matmul(F, A))), A)
 
 
 def blocks(law: Energies, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """Material part of d2w/dx_i dx_j for pairs of indices into the shape vectors D."""
+    """Material part of the stiffness d2w/dx_i dx_j, for pairs of indices (i, j) into the shape vectors D."""
     A = law.material_axes(F[0][0])
     FA = matmul(F, A)
     E, turned = green_strain(FA), [matvec(transpose(A), d) for d in D]
@@ -70,7 +70,7 @@ def _stress_of_strain(law: Energies, E: Matrix) -> Matrix:
 
 
 def _slopes(function: Any, six: tuple) -> list:
-    """Derivative with respect to each entry E_ij of a symmetric E. A shear changes two entries, each by one half."""
+    """Differentiate with respect to the six entries of a symmetric E. E_ij and E_ji each get half of a shear change."""
     result = []
     for k, (i, j) in enumerate(SIX):
         weight = 1.0 if i == j else 0.5

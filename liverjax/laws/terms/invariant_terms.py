@@ -1,6 +1,7 @@
 """Hand-derived terms at one deformation gradient: stress, tangent and the blocks of the stiffness.
 
-They are the terms of the chapter's section 4.1.2, contracted. With J as an additional invariant and v_a,i = dI_a/dx_i,
+They are the terms of section 4.1.2 of the book chapter, summed over the products g^k h^k. J is an additional invariant.
+With W_a = dW/dI_a, W_ab = d2W/dI_a dI_b and v_a,i = dI_a/dx_i,
 
     d2W/dx_i dx_j = sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j
 
@@ -37,7 +38,7 @@ from liverjax.tensors.subsets import Subsets, in_subset, put_together
 
 
 class Stress(NamedTuple):
-    """P = F S + p cof F with arrays (E,). `S` is a symmetric matrix, or one array if it is spherical; p = W_J."""
+    """Stress P = F S + p cof F, with p = dW/dJ. `S` is a symmetric matrix, or one array if it is spherical."""
 
     S: Matrix | Any
     p: jax.Array
@@ -66,7 +67,7 @@ class State(NamedTuple):
 
 
 class Pieces(NamedTuple):
-    """The states of laws of several kinds, each in the elements of its region."""
+    """The states of several laws, each in the elements of its region."""
 
     subsets: Subsets
     states: tuple[State, ...]
@@ -75,7 +76,7 @@ class Pieces(NamedTuple):
 
 
 def state(law: Energies, F: Matrix) -> State | Pieces:
-    """The invariants and derivatives of the law (`liverjax.laws.base.Law`) at F."""
+    """Return the invariants and derivatives of the law (`liverjax.laws.base.Law`) at F."""
     if law.subsets is not None:
         own = (_state_of_law(law.piece(k), in_subset(law.subsets, k, F)) for k in range(len(law.pieces())))
         return Pieces(law.subsets, tuple(own), F, cofactor(F))
@@ -87,12 +88,12 @@ def _state_of_law(law: Energies, F: Matrix) -> State:
 
 
 def state_of(scalars: Scalars, F: Matrix) -> State:
-    """The state of an energy of I1, I2 and J at F with known derivatives."""
+    """Return the state at F of an energy of I1, I2 and J with known derivatives."""
     return _state(scalars, F, ())
 
 
 def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
-    """The state: C is computed only if I2 needs it, principal stretches only if a law needs them."""
+    """Return the state. C is computed only if I2 needs it, and principal stretches only if a law needs them."""
     first, second = scalars
     cof = cofactor(F)
     C = right_cauchy_green(F) if "I2" in first else None
@@ -103,7 +104,7 @@ def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
 
 
 def stress(s: State | Pieces) -> Stress:
-    """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J. A missing derivative adds no term."""
+    """Return S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J. A missing derivative adds no term."""
     if isinstance(s, Pieces):
         return _put_together(s.subsets, [stress(own) for own in s.states])
     W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
@@ -126,7 +127,7 @@ def stress(s: State | Pieces) -> Stress:
 
 
 def _put_together(subsets: Subsets, found: list[Stress]) -> Stress:
-    """Stresses of all elements. If one of them is a matrix, spherical stresses are written as matrices, too."""
+    """Join the stresses of all elements. If one stress is a matrix, spherical stresses are also written as matrices."""
     if any(isinstance(S, tuple) for S, _ in found):
         found = [Stress(S if isinstance(S, tuple) else _spherical(S), p) for S, p in found]
     return put_together(subsets, found)
@@ -138,7 +139,7 @@ def _spherical(S: Any) -> Matrix:
 
 
 def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
-    """P = F S + p cof F."""
+    """First Piola-Kirchhoff stress P = F S + p cof F [Pa]."""
     S, p = resultant
     FS = matmul(F, S) if isinstance(S, tuple) else scale_matrix(S, F)
     return tuple(tuple(FS[i][j] + p * cof[i][j] for j in range(3)) for i in range(3))
@@ -149,10 +150,9 @@ _FLAT = 1e-3
 
 
 def second_piola(F: Matrix, resultant: Stress) -> Matrix:
-    """S + p J C^-1 [Pa] of P = F S + p cof F, with J C^-1 = cof(F)^T cof(F) / J.
+    """Second Piola-Kirchhoff stress S + p J C^-1 [Pa] of P = F S + p cof F, with J C^-1 = cof(F)^T cof(F) / J.
 
-    Section 4.2 of the chapter needs F^-1 here, which does not exist at J = 0. So a smaller |J| is replaced by 1e-3 in
-    the division by J.
+    Section 4.2 of the book chapter uses F^-1, which does not exist at J = 0. Here |J| in the division is at least 1e-3.
     """
     S, p = resultant
     cof = cofactor(F)
@@ -168,13 +168,16 @@ def second_piola(F: Matrix, resultant: Stress) -> Matrix:
 
 
 def first_piola(law: Energies, F: Matrix) -> Matrix:
-    """First Piola-Kirchhoff stress [Pa] of a tuple matrix F."""
+    """First Piola-Kirchhoff stress [Pa] at a deformation gradient F, a matrix of nested tuples."""
     s = state(law, F)
     return piola(F, s.cof, stress(s))
 
 
 def slopes(s: State, D: Vector) -> dict[str, Vector]:
-    """For a node with shape vector D: dJ/dx, and half of dI/dx for I1, I2, I4: F D, F (I1 Id - C) D, (a.D) F a."""
+    """Return derivatives at a node with shape vector D: dJ/dx = cof F D, and half of dI/dx for I1, I2 and I4.
+
+    Half of dI/dx is F D for I1, F (I1 Id - C) D for I2, and (a.D) F a for I4.
+    """
     FD = matvec(s.F, D)
     v = {"I1": FD, **{key: scale(dot(a, D), matvec(s.F, a)) for key, a in s.fibres.items()}}
     if "J" in s.first:
@@ -189,7 +192,7 @@ def _weight(invariant: str) -> float:
 
 
 class _Parts(NamedTuple):
-    """Values that are needed to compute the blocks."""
+    """Values that the blocks of all node pairs need."""
 
     J: jax.Array
     first: dict
@@ -202,9 +205,9 @@ class _Parts(NamedTuple):
 
 
 def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Parts:
-    """The result is written to memory.
+    """Compute the values for the blocks and write them to memory.
 
-    Otherwise XLA:CPU would compute it again for each entry, which is a fifth slower.
+    Otherwise XLA on CPUs would compute them again for each entry, which is 20 % slower.
     """
     S, p = stress(s)
     metric = {(i, j): dot(D[i], D[j]) for i, j in pairs}
@@ -217,7 +220,7 @@ def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Pa
 
 
 def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
-    """The block of two nodes, without energies of stretches and of Green's strain."""
+    """Return the block of two nodes, without energies of stretches and of Green's strain."""
     vi, vj = s.slopes[pair[0]], s.slopes[pair[1]]
     second = dict(s.second)
     W_JJ = second.pop(("J", "J"), None) if regularised else None
@@ -257,14 +260,14 @@ def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
 def blocks(
     s: State | Pieces, D: list[Vector], pairs: tuple[tuple[int, int], ...], regularised: bool = False
 ) -> list[Matrix]:
-    """d2W/dx_i dx_j per reference volume: the chapter's G, H, I, Lambda, M and R of all terms at once.
+    """Return stiffness blocks d2W/dx_i dx_j per reference volume: the sum of the chapter's G, H, I, Lambda, M and R.
 
     Args:
         s: `state` of the element.
         D: shape vectors of its nodes [1/m].
         pairs: which blocks, as indices (i, j) into D.
-        regularised: replace G as in section 4.1.2 iii, but with eps/3 where the chapter prints eps, so that the trace
-            does not change.
+        regularised: whether to replace G as in section 4.1.2 iii of the book chapter. Here eps/3 is used where the
+            chapter prints eps, so that the trace does not change.
     """
     if isinstance(s, Pieces):
         own = [blocks(each, in_subset(s.subsets, k, D), pairs, regularised) for k, each in enumerate(s.states)]
@@ -287,7 +290,7 @@ _UNIT_VECTORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def tangent(s: State | Pieces) -> list[list[Matrix]]:
-    """d2W/dF dF [Pa] as nested lists [J][L] of matrices (i, k): the blocks for shape vectors e_J and e_L."""
+    """Return d2W/dF dF [Pa] as nested lists [J][L] of matrices (i, k): the blocks for shape vectors e_J and e_L."""
     pairs = tuple((J, L) for J in range(3) for L in range(3))
     A = blocks(s, list(_UNIT_VECTORS), pairs)
     return [A[3 * J : 3 * J + 3] for J in range(3)]

@@ -1,12 +1,13 @@
-"""Hand-derived stress and stiffness of laws w(Xi(alpha_1), …), Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha.
+"""Hand-derived stress and stiffness of energies w(Xi(alpha_1), …), with Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha.
 
-In the principal axes S is diagonal, S_m = tau_m / lambda_m^2 with tau_m = dw/d ln lambda_m, and
+In the principal axes, the second Piola-Kirchhoff stress S is diagonal: S_m = tau_m / lambda_m^2 with
+tau_m = dw/d ln lambda_m. The moduli are
 
     C_mmnn = (d2w/d ln lambda_m d ln lambda_n - 2 delta_mn tau_m) / (lambda_m lambda_n)^2
     C_mnmn = (S_m - S_n) / (lambda_m^2 - lambda_n^2).
 
-C_mnmn is computed as a divided difference that is exact if stretches are equal. The chapter's A H A form (section
-4.1.2) has a geometric mean there, which is wrong except for alpha = 2 and 4.
+C_mnmn is computed as a divided difference that is exact if stretches are equal. The A H A form of the book chapter
+(section 4.1.2) has a geometric mean instead, which is wrong except for alpha = 2 and 4.
 
 Values are computed with these formulas. Their derivatives are computed from the energy, expanded in frozen principal
 axes (`liverjax.tensors.principal`). If stretches are equal, this expansion is smooth, but the axes are not.
@@ -34,7 +35,8 @@ from liverjax.tensors.material_axes import (
 from liverjax.tensors.matrices import Matrix, Vector, add, determinant, dot, matmul, stored, transpose
 from liverjax.tensors.principal import change, expanded_power_sum, principal, sinh_ratio
 
-#: Logarithms of the principal stretches, and their axes (`liverjax.tensors.principal`): constants in derivatives.
+#: Logarithms of the principal stretches, and principal axes (`liverjax.tensors.principal`). Derivatives treat both as
+#: constants.
 Frame = tuple[Vector, Matrix]
 
 
@@ -53,7 +55,7 @@ class Principal(NamedTuple):
 
 
 def stretch_slopes(law: Energies, X: tuple) -> tuple[tuple, dict]:
-    """dw/dX_k and {(k, l): d2w/dX_k dX_l}: hand-derived if the law has them, else by automatic differentiation."""
+    """Return dw/dX_k and {(k, l): d2w/dX_k dX_l}, hand-derived if the law defines them, otherwise by autodiff."""
     if law.stretch_derivatives is not None:
         return law.stretch_derivatives(*X)
     n = len(X)
@@ -79,7 +81,7 @@ def _at_stretches(law: Energies, F: Matrix, frame: Frame) -> Principal:
 
 
 def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
-    """C_mmnn as a matrix, and C_mnmn of the three pairs."""
+    """Return the moduli C_mmnn as a matrix, and C_mnmn of the three pairs of axes."""
 
     def normal(m: int, n: int) -> jax.Array:
         h = -2 * s.tau[m] if m == n else 0.0
@@ -104,24 +106,24 @@ def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
 
 
 def stress(law: Energies, F: Matrix, frame: Frame) -> Matrix:
-    """Second Piola-Kirchhoff stress [Pa] of w only (no volumetric part), with `frame` = `principal(F)`."""
+    """Second Piola-Kirchhoff stress [Pa] of w only, without the volumetric part; `frame` is `principal(F)`."""
     return symmetric(_stress(_arrays(law, F), F, frame))
 
 
 def moduli(law: Energies, F: Matrix, frame: Frame) -> list[list]:
-    """dS/dE [Pa] of w only: 6 x 6 components in the coordinate axes, with `frame` = `principal(F)`."""
+    """Moduli dS/dE [Pa] of w only: 6 x 6 components in the coordinate axes; `frame` is `principal(F)`."""
     return _square(_moduli_of_axes(_arrays(law, F), F, frame))
 
 
 def blocks(law: Energies, F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """Material part of d2w/dx_i dx_j for pairs of indices into the shape vectors D."""
+    """Material part of the stiffness d2w/dx_i dx_j, for pairs of indices (i, j) into the shape vectors D."""
     C = stored(moduli(law, F, frame))
     half = stored([half_contracted(C, d) for d in D])
     return [pushed(F, anisotropic(half[j], D[i])) for i, j in pairs]
 
 
 def _arrays(law: Energies, F: Matrix) -> jax.Array:
-    """The law with its parameters as arrays in the precision of F, since whole numbers have no derivative."""
+    """Return the law with its parameters as arrays in the precision of F, since whole numbers have no derivative."""
     return jax.tree.map(lambda v: jnp.asarray(v, jnp.result_type(F[0][0])), law)
 
 
@@ -133,12 +135,12 @@ def _square(upper: tuple) -> list[list]:
     return [[entries[min(a, b), max(a, b)] for b in range(6)] for a in range(6)]
 
 
-# Functions with a custom derivative rule must not be linear in an argument: if only a linear argument is unknown
-# (forward over reverse mode), JAX does not use the rule.
+# Functions with a custom derivative rule must not be linear in an argument. Otherwise JAX ignores the rule if only this
+# argument is unknown (forward over reverse mode).
 
 
 def stress_at_constant(law: Energies, F: Matrix) -> Matrix:
-    """`stress` for a constant F. The axes do not change, so JAX can differentiate with respect to the parameters."""
+    """Return `stress` for constant F. The axes are constant, so JAX can differentiate with respect to parameters."""
     return symmetric(_stress.fun(_arrays(law, F), F, principal(F)))
 
 
@@ -203,11 +205,11 @@ def _vanishes(t: Number) -> bool:
     return isinstance(t, SymbolicZero)
 
 
-# -- the same from the expanded energy: slower, used for derivatives --------------------------------------------------
+# -- stress and moduli from the expanded energy: slower, used for derivatives -----------------------------------------
 
 
 def _expanded_energy(law: Energies, logs: Vector, axes: Matrix, log_J0: Number, Y: tuple) -> jax.Array:
-    """w of C = diag(lambda^2) + N^T Y N in frozen principal axes N."""
+    """Return w at C = diag(lambda^2) + N^T Y N, in the frozen principal axes N."""
     X = six_of(rotated(symmetric(Y), transpose(axes)))
     relative = [x * jnp.exp(-logs[i] - logs[j]) for x, (i, j) in zip(X, SIX, strict=True)]
     one_plus = symmetric(tuple(r + (1.0 if i == j else 0.0) for r, (i, j) in zip(relative, SIX, strict=True)))
@@ -216,7 +218,10 @@ def _expanded_energy(law: Energies, logs: Vector, axes: Matrix, log_J0: Number, 
 
 
 def _energy_of_change(law: Energies, F: Matrix, frame: Frame, orders: int) -> tuple[Any, tuple]:
-    """The energy as a function of a change Y of C, and Y: it is 0, but can be differentiated `orders` times in F."""
+    """Return the energy as a function of a change Y of C, and Y itself.
+
+    Y is 0, but can be differentiated `orders` times with respect to F.
+    """
     logs, axes = frame
     log_J0 = jax.lax.stop_gradient(jnp.log(determinant(F)))
     return partial(_expanded_energy, law, logs, axes, log_J0), change(F, orders)
@@ -225,7 +230,8 @@ def _energy_of_change(law: Energies, F: Matrix, frame: Frame, orders: int) -> tu
 def _strain_derivatives(function: Any, Y: tuple) -> jax.Array:
     """Derivatives of `function` with respect to the six entries of E (first axis).
 
-    dY = 2 dE, and a shear changes two entries.
+    Y is the change of C, so dY = 2 dE. A shear component of E stands at two positions of the tensor, so its factor is
+    1, not 2.
     """
 
     def along(direction):

@@ -1,9 +1,9 @@
 """Centre lines and radii of one tube or a tree of tubes, from their surface, for example from a segmentation.
 
 The distance from one end is measured along the surface. Lines of equal distance are rings around the tubes, one ring
-for each branch. The band between two levels contains the surface between two rings. The centres of the two rings of a
-band are joined by a piece of a centre line. The radius of a piece is the mean distance between the piece
-and the points of its rings. The centre lines begin and end at the ends of the surface.
+for each branch. The part of the surface between two rings is called a band. The centres of the two rings of a band are
+joined by a piece of a centre line. The radius of a piece is the mean distance between the piece and the points of its
+rings. The centre lines begin and end at the ends of the surface.
 
 Source: level sets of geodesic distance (Verroust and Lazarus 2000, Extracting skeletal curves from 3D scattered data).
 """
@@ -18,14 +18,14 @@ from liverjax.core.errors import InputError
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Distance between rings, divided by the mean radius of the tubes.
+#: Distance between rings along the surface, divided by the mean radius of the tubes.
 _BAND = 2.0
 #: Minimum number of points of a ring: a ring with fewer points does not go around a tube.
 _LEAST = 5
 
 
 class CentreLines(NamedTuple):
-    """Pieces of centre lines."""
+    """Begin, end and radius of m straight pieces of centre lines."""
 
     begin: np.ndarray  # (m, 3) [m]
     end: np.ndarray  # (m, 3) [m]
@@ -33,10 +33,10 @@ class CentreLines(NamedTuple):
 
 
 def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (n, 3) [m] and triangles (t, 3) of a surface file. Corners at the same place are merged.
+    """Read corners (n, 3) [m] and triangles (t, 3) from a surface file. Corners with equal coordinates are merged.
 
     Args:
-        path: any format of meshio with triangles (STL, PLY, OBJ, VTK, …).
+        path: file with triangles, in any format that meshio reads (STL, PLY, OBJ, VTK, …).
         scale: unit of the file [m].
         name: name of the vessel, for messages.
 
@@ -51,7 +51,7 @@ def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.nd
         raise InputError(f"{name} surface {path} cannot be read ({error or 'unknown format'}): give an STL") from None
     triangles = [block.data for block in found.cells if block.type == "triangle"]
     if not triangles:
-        raise InputError(f"{name} surface {path} holds no triangles: export the surface of the tube")
+        raise InputError(f"{name} surface {path} contains no triangles: export the surface of the tube")
     points = scale * np.asarray(found.points, float)[:, :3]
     size = float(np.ptp(points, axis=0).max())
     _, first, place = np.unique(np.round(points / (1e-7 * size)), axis=0, return_index=True, return_inverse=True)
@@ -63,7 +63,7 @@ def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.nd
 class _Rings(NamedTuple):
     """Rings of one surface, and the bands between them."""
 
-    points: np.ndarray  # (p, 3) where the edges cross levels
+    points: np.ndarray  # (p, 3) points where edges cross a level of the distance
     ring: np.ndarray  # (p,) ring of each point
     below: np.ndarray  # (r,) band below each ring
     above: np.ndarray  # (r,) band above each ring
@@ -71,11 +71,11 @@ class _Rings(NamedTuple):
 
 
 def centre_lines(points: np.ndarray, triangles: np.ndarray, name: str = "vessel") -> CentreLines:
-    """Centre lines of the tubes with this surface.
+    """Compute the centre lines of the tubes with this surface.
 
     Args:
         points: corners (n, 3) [m].
-        triangles: corner numbers (t, 3); tubes may be open or closed at their ends.
+        triangles: corner numbers (t, 3). The ends of the tubes may be open or closed.
         name: name of the vessel, for messages.
 
     Raises:
@@ -118,7 +118,7 @@ def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarra
 
 
 def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> float:
-    """Distance between rings: from the mean radius (area over length), but so large that no edge crosses two rings."""
+    """Distance between rings from the mean radius (area over length), large enough that no edge crosses two rings."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     longest = max(np.ptp(away[triangles], axis=1).max(), 1e-300)
@@ -126,7 +126,7 @@ def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> flo
 
 
 def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _Rings:
-    """Rings of the points where edges cross levels of the distance. The levels are at (k + 1/2) times the spacing."""
+    """Find the rings of points where edges cross a level of the distance. Levels are (k + 1/2) times the spacing."""
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components
 
@@ -157,7 +157,7 @@ def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _R
 
 
 def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
-    """Lines that join the centres of the rings of a band, and lines from the last ring of a branch to its end."""
+    """Join the two ring centres of every band by a line, and the last ring of every branch with the branch's end."""
     count = np.bincount(r.ring)
     centre = np.stack([np.bincount(r.ring, r.points[:, k]) for k in range(3)], axis=1) / count[:, None]
     r, real = _without_tips(r, np.flatnonzero(count >= _LEAST))
@@ -169,8 +169,7 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
             if own in others:
                 continue
             beside = real[side[real] == own]
-            # Branches that meet in this band, or begin in it, are joined. If there is no other branch, this branch
-            # ends.
+            # Branches that meet or begin in this band are joined. If there is no other branch, this branch ends here.
             lines += [(centre[a], centre[b], np.isin(r.ring, (a, b))) for b in beside[beside > a]]
             if len(beside) > 1:
                 continue
@@ -185,7 +184,7 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
 
 
 def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
-    """Remove the last ring of each branch and merge its two bands: the ring may go around a corner of the end."""
+    """Remove the last ring of each branch, since it may go around a corner of the end. Its two bands are merged."""
     keep, band, below, above = set(real.tolist()), r.band.copy(), r.below.copy(), r.above.copy()
     sides = np.concatenate([below[real], above[real]])
     for a in real:
@@ -197,7 +196,7 @@ def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
 
 
 def _outwards(centre: np.ndarray, r: _Rings, real: np.ndarray, a: int, own: int) -> np.ndarray:
-    """Direction (3,) of the line at its last ring a: away from the previous ring, or normal to a if there is none."""
+    """Direction (3,) of the line at the last ring a: away from the previous ring, or normal to a if a is alone."""
     inner = r.below[a] if own == r.above[a] else r.above[a]
     before = [b for b in real if b != a and inner in (r.below[b], r.above[b])]
     if before:

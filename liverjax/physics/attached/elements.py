@@ -1,8 +1,8 @@
-"""Elements between nodes of the body whose energy depends on their lengths and angles: membranes, springs, bars.
+"""Elements between nodes of the body: membranes, springs, bars. Their energy depends on their lengths and angles.
 
-At every integration point an element has d tangent vectors f_k = sum_a p_ka y_a, with the positions y_a of its nodes.
-Its energy is a function W of the metric C_kl = f_k . f_l. With T_kl = dW/dC_kl + dW/dC_lk, the forces and the stiffness
-are
+At every integration point an element has d tangent vectors f_k = sum_a p_ka y_a, with the positions y_a of its nodes
+and constant factors p_ka. The energy of the element is a function W of the metric C_kl = f_k . f_l. With T_kl =
+dW/dC_kl + dW/dC_lk, the forces g_a and the stiffness blocks K_ab of nodes a and b are
 
     g_a = sum p_ka T_kl f_l,    K_ab = sum p_ka p_lb (T_kl I + d2W/dC_v dC_w (dC_v/df_k) (dC_w/df_l)).
 """
@@ -17,26 +17,26 @@ from liverjax.solvers.attached import Attached
 
 
 class Elements(NodalForce):
-    """Forces between nodes, computed element by element."""
+    """Force term of elements between nodes, for one step."""
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
         """Node numbers (n, m) of m elements with n nodes each."""
         raise TypeError(f"{type(self).__name__} lacks nodes(mesh)")
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Factors p (d, n, Q, m) [1/m] of the nodes' positions in the tangent vectors."""
+        """Factors p (d, n, Q, m) [1/m] of the nodal positions in the tangent vectors, at Q points of m elements."""
         raise TypeError(f"{type(self).__name__} lacks tangents(mesh)")
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Energy (Q, m) [J] at every point as a function of C_11 (Q, m), or of C_11, C_12 and C_22."""
+        """Energy (Q, m) [J] at every point as a function of the metric: C_11 (Q, m), or C_11, C_12 and C_22."""
         raise TypeError(f"{type(self).__name__} lacks energies(mesh, C)")
 
     def away(self) -> jax.Array | None:
-        """Vectors (d, 3, Q, m) to subtract from the tangent vectors, for ends that are not nodes; None: nothing."""
+        """Vectors (d, 3, Q, m) that are subtracted from the tangent vectors, for ends that are not nodes, or None."""
         return None
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Gradient of the energy."""
+        """Forces (V, 3) [N]: the gradient of the energy."""
         p, nodes = self.tangents(mesh), self.nodes(mesh)
         f = self._vectors(p, x[nodes])
         T = _tension(jax.grad(lambda C: jnp.sum(self.energies(mesh, C)))(_metric(f)))
@@ -50,7 +50,7 @@ class Elements(NodalForce):
         return jnp.sum(self.energies(mesh, _metric(f)))
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivatives of the energy."""
+        """Stiffness: second derivatives of the energy."""
         p, nodes = self.tangents(mesh), self.nodes(mesh)
         f = self._vectors(p, x[nodes])
         C = _metric(f)
@@ -77,7 +77,7 @@ class Elements(NodalForce):
 
 
 def _metric(f: jax.Array) -> tuple[jax.Array, ...]:
-    """C_kl (Q, m), k <= l."""
+    """Components C_kl (Q, m) of the metric, for k <= l."""
     return tuple(jnp.sum(f[k] * f[l], axis=0) for k in range(len(f)) for l in range(k, len(f)))
 
 
@@ -89,7 +89,7 @@ def _tension(slopes: tuple[jax.Array, ...]) -> list[list[jax.Array]]:
 
 
 def _changes(f: jax.Array) -> list[list[jax.Array]]:
-    """dC_v/df_k (3, Q, m)."""
+    """Derivatives dC_v/df_k (3, Q, m) of the components C_v of the metric with respect to the tangent vectors."""
     if len(f) == 1:
         return [[2 * f[0]]]
     zero = jnp.zeros_like(f[0])

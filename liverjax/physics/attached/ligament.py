@@ -1,8 +1,9 @@
-"""A ligament: a cable between two points of the body, or from a place of the body to a point outside.
+"""A ligament: a cable between two points of the body, or from a set of nodes to a point outside the body.
 
-Its tension at length l is k (l - l0), and 0 if it is slack: a ligament pulls and does not push. The user gives the rest
-length l0, or the tension T0 in the reference shape. There the length is L, so l0 = L - T0/k. A ligament from a place of
-n nodes to a point outside has n fibres, which share stiffness and tension equally.
+The tension at length l is k (l - l0), with the stiffness k and the rest length l0. It is 0 if the ligament is slack, so
+a ligament pulls and does not push. The user gives l0, or the tension T0 in the reference shape. In the reference shape
+the length is L, so l0 = L - T0/k. A ligament from n nodes to a point outside has n fibres, which share stiffness and
+tension equally.
 """
 
 from typing import Any, ClassVar
@@ -19,19 +20,23 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
 
-#: A fibre may be shorter than its rest length by this fraction and is still not slack: the difference is roundoff.
+#: A fibre that is shorter than its rest length by this fraction or less is not slack: the difference is roundoff.
 _ROUNDED = 1e-9
 
 
 @struct
 class Ligament(Physics):
-    """Fibres (m): each of them pulls at nodes of the body and may end outside the body."""
+    """m fibres. Each fibre pulls at n nodes of the body, and may end at a point outside the body."""
 
     nodes: Indices = param("1", "node numbers (n, m)", lower=0)
-    weights: Array = param("1", "weights of these nodes in the fibre's vector (n, m): the sum is 0, or 1 with a wall")
-    to: Numbers | None = param("m", "where fibres end outside the body (3,); None: both ends are in it", default=None)
-    stiffness: Number = param("N/m", "of all fibres together", above=0.0)
-    pre_tension: Number | None = param("N", "of all fibres together, in the reference shape", lower=0.0, default=None)
+    weights: Array = param(
+        "1", "weights of these nodes in the fibre's vector (n, m): sum 0, or sum 1 if it ends outside"
+    )
+    to: Numbers | None = param("m", "end of the fibres outside the body (3,); None: both ends are in it", default=None)
+    stiffness: Number = param("N/m", "total stiffness of all fibres", above=0.0)
+    pre_tension: Number | None = param(
+        "N", "total tension of all fibres in the reference shape", lower=0.0, default=None
+    )
     rest_length: Any = param("m", "of each fibre", above=0.0, default=None)
 
     section: ClassVar[str] = "ligament"
@@ -39,9 +44,11 @@ class Ligament(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "Ligament":
-        """Read [[ligament]]: a place and a point outside the body, or two points of the body."""
+        """Read [[ligament]]: a set of nodes and a point outside the body, or two points of the body."""
         if ("points" in table) == ("to" in table):
-            raise InputError(f"{name} needs either to = [x, y, z], with a place, or points = [[x, y, z], [x, y, z]]")
+            raise InputError(
+                f"{name} needs either to = [x, y, z] with where or set, or points = [[x, y, z], [x, y, z]]"
+            )
         if "stiffness" not in table:
             raise InputError(f"{name} needs stiffness in N/m: give a number")
         given = {key: table[key] for key in ("stiffness", "pre_tension", "rest_length") if key in table}
@@ -52,14 +59,14 @@ class Ligament(Physics):
             nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
             return cls(nodes=jnp.asarray(nodes[None], jnp.int32), weights=jnp.ones((1, len(nodes))), to=to, **given)
         if "where" in table or "set" in table:
-            raise InputError(f"{name} has points and a place: leave one of them out")
+            raise InputError(f"{name} has points, and also where or set: remove one of them")
         ends = table["points"]
         if not isinstance(ends, list) or len(ends) != 2:
             raise InputError(f"{name} points = {ends!r} must be two points of the body: write [[x, y, z], [x, y, z]]")
         return between(mesh, np.array([_vector(end, f"{name} points") for end in ends]), name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse wrong node numbers, a wrong rest length or tension, and fibres of length 0."""
+        """Raise InputError for wrong node numbers, a wrong rest length or tension, or fibres of length 0."""
         numbers = np.asarray(self.nodes)
         if numbers.ndim != 2:
             raise InputError(f"{name}.nodes has shape {numbers.shape}: give the nodes of each fibre in a column (n, m)")
@@ -90,12 +97,12 @@ class Ligament(Physics):
         return jnp.full_like(L, self.rest_length) if self.pre_tension is None else L - self.pre_tension / self.stiffness
 
     def freeze(self, memory: None, step: Step) -> "Fibres":
-        """Rest lengths, and the stiffness of one fibre."""
+        """Force term of the fibres, for one step."""
         rest = self._rest(step.mesh)
         return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held along fibres that end outside the body and are not slack at the beginning."""
+        """Return nodes and fibre directions, for fibres that end outside the body and are taut at the beginning."""
         if self.to is None:
             return np.zeros(0, int), np.zeros((0, 3))
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
@@ -103,26 +110,30 @@ class Ligament(Physics):
         f = np.asarray(self._vectors(mesh.points))[taut]
         return np.asarray(self.nodes)[0, taut], f / lengths[taut, None]
 
+    def pulls_single_nodes(self) -> bool:
+        """True: each fibre pulls at a node, or at the nodes of one element."""
+        return True
+
     def is_straight_without_tension(self, mesh: TetMesh, x: jax.Array) -> bool:
         """Whether a fibre has exactly its rest length at positions x (V, 3).
 
-        A small vibration about x would make it slack half of the time.
+        In a small vibration about x such a fibre would be slack half of the time.
         """
         lengths, rest = np.asarray(self._lengths(x)), np.asarray(self._rest(mesh))
         return bool(np.any(np.abs(lengths - rest) <= _ROUNDED * rest))
 
 
-@jax.jit  # compiled, since the checks of a sweep call it for each row
+@jax.jit  # compiled, since the checks of a sweep call it for each run
 def _lengths_and_rest(ligament: Ligament, mesh: TetMesh) -> tuple[jax.Array, jax.Array]:
-    """Lengths (m,) of the fibres in the reference shape, and at rest [m]."""
+    """Lengths (m,) [m] of the fibres in the reference shape, and their rest lengths (m,) [m]."""
     return ligament._lengths(mesh.points), ligament._rest(mesh)
 
 
 def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: Any) -> Ligament:
-    """A ligament between two points (2, 3) [m] of the body.
+    """Create a ligament between two points (2, 3) [m] of the body.
 
     Raises:
-        InputError: a point outside the body.
+        InputError: a point lies outside the body.
     """
     nodes, values = locate.weights(mesh, *locate.elements_at(mesh, points, f"{name} points"))
     signed = values * np.array([[-1.0, 1.0]])
@@ -142,7 +153,7 @@ def _vector(value: object, name: str) -> np.ndarray:
 
 @struct
 class Fibres(Elements):
-    """A ligament during a step."""
+    """Force term of a ligament, for one step."""
 
     at: Any = param("1", "node numbers (n, m)")
     weights: Array = param("1", "weights of the nodes in the fibre's vector (n, m)")
@@ -155,17 +166,17 @@ class Fibres(Elements):
         return self.at
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """The tangent vector is the whole fibre."""
+        """Factors p (1, n, 1, m): the tangent vector is the vector of the whole fibre."""
         return jnp.asarray(self.weights)[None, :, None, :]
 
     def away(self) -> jax.Array | None:
-        """The end outside the body."""
+        """Position of the end outside the body, or None if both ends are in the body."""
         if self.to is None:
             return None
         return jnp.broadcast_to(jnp.asarray(self.to)[None, :, None, None], (1, 3, 1, len(self.rest)))
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Half the stiffness times the square of the elongation; 0 if the fibre is slack."""
+        """Energy [J]: half the stiffness times the square of the elongation; 0 if the fibre is slack."""
         length, rest = jnp.sqrt(C[0]), self.rest[None]
         # A fibre at its rest length is taut. `maximum` would have half the derivative there.
         longer = jnp.where(length >= (1 - _ROUNDED) * rest, length - rest, 0.0)

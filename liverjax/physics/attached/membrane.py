@@ -1,8 +1,8 @@
 """A membrane on a part of the surface, for example the capsule: it stretches with the surface and bends without force.
 
-Its law acts in the plane of the membrane. The stress across the thickness is 0 (plane stress). A law with an isochoric
-part is treated as incompressible: the stretch of the thickness is 1 over the area ratio. For another law the stretch of
-the thickness is an unknown at every point.
+The law of the membrane acts in its plane. The stress through the thickness is 0 (plane stress). A law with an isochoric
+part is treated as incompressible: the stretch of the thickness is 1 divided by the area ratio. For another law the
+stretch of the thickness is an unknown at every integration point.
 
 Source: Holzapfel, Eberlein, Wriggers and Weizsaecker 1996, "A new axisymmetrical membrane element for anisotropic,
 finite strain analysis of arteries", and Bonet and Wood 2008, section 6.6 (plane stress).
@@ -27,10 +27,10 @@ from liverjax.physics.base import Physics, Step
 
 @struct
 class Membrane(Physics):
-    """A thin layer on triangles of the surface. It has no tension in the reference shape."""
+    """A thin layer on triangles of the surface, without tension in the reference shape."""
 
     triangles: Indices = param("1", "node numbers (m, 3)", lower=0)
-    thickness: Number = param("m", "of the layer: one number, or one per triangle (m,)", above=0.0)
+    thickness: Number = param("m", "thickness of the layer: one number, or one per triangle (m,)", above=0.0)
     law: Law = param("1", "law of the layer; parameters may have one value per triangle (m,)")
 
     section: ClassVar[str] = "membrane"
@@ -38,7 +38,7 @@ class Membrane(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "Membrane":
-        """Read [[membrane]]: a place (by default the whole surface), a thickness and a law."""
+        """Read [[membrane]]: a part of the surface (by default all of it), a thickness and a law."""
         for key, example in (
             ("thickness", "thickness = 5e-5, in m"),
             ("law", "[membrane.law] with name and parameters"),
@@ -50,12 +50,12 @@ class Membrane(Physics):
         nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), place)
         triangles = selection.surface_of(mesh, nodes, table.get("set"))
         if not len(triangles):
-            raise InputError(f"{place} meets nodes but no boundary triangle: widen it to a whole face")
+            raise InputError(f"{place} selects nodes but no boundary triangle: enlarge the region to a whole face")
         law = layers.read_layer(table["law"], name)
         return cls(triangles=jnp.asarray(triangles, jnp.int32), thickness=table["thickness"], law=law)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse triangles that are not in the mesh, a wrong number of thicknesses, and laws with fibre directions."""
+        """Raise InputError for unknown triangles, a wrong number of thicknesses, or a law with fibre directions."""
         selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
         if np.shape(self.thickness) not in ((), (len(self.triangles),)):
             shape, count = np.shape(self.thickness), len(self.triangles)
@@ -63,11 +63,11 @@ class Membrane(Physics):
         layers.check(self.law, name)
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Membrane":
-        """The membrane on the same triangles of the richer mesh."""
+        """The membrane on the same triangles of the mesh of higher order."""
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def freeze(self, memory: None, step: Step) -> "Stretched":
-        """The membrane with the isochoric part of its law if there is one, else with the whole law."""
+        """Force term with the isochoric part of the law. If the law has no such part, the whole law is used."""
         isochoric = self.law.isochoric_part()
         law, solved = (self.law, jnp.ones(0)) if isochoric is None else (isochoric, None)
         return Stretched(triangles=self.triangles, thickness=self.thickness, law=law, solved=solved)
@@ -75,26 +75,26 @@ class Membrane(Physics):
 
 @struct
 class Stretched(Elements):
-    """The membrane during a step."""
+    """Force term of a membrane, for one step."""
 
     triangles: Indices = param("1", "node numbers (m, 3)")
     thickness: Any = param("m", "of the layer")
     law: Law = param("1", "isochoric part, or the whole law if the stretch of the thickness is unknown")
-    solved: object = param("1", "not None: the stretch of the thickness is an unknown", default=None)
+    solved: object = param("1", "not None if the stretch of the thickness is an unknown", default=None)
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Nodes of the triangles: 3 or more for each."""
+        """Nodes of the triangles: three or more per triangle."""
         return jnp.stack(surface.triangle_nodes(mesh, self.triangles))
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Factors for two unit vectors in the plane of the reference triangle."""
+        """Factors p of the tangent vectors, for two orthogonal unit vectors in the plane of the reference triangle."""
         _, along = surface.triangle_slopes(mesh)
         r11, r12, r22 = (r[None, None] for r in self._edges(mesh))
         first, second = (jnp.asarray(a.T, r11.dtype)[:, :, None] for a in along)
         return jnp.stack([first / r11, (second - r12 / r11 * first) / r22])
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Thickness times area times energy density."""
+        """Energy [J] at every point: thickness times area times energy density."""
         weights, _ = surface.triangle_slopes(mesh)
         r11, _, r22 = self._edges(mesh)
         law = jax.tree.map(lambda v: v if jnp.ndim(v) == 0 else v[None], self.law)

@@ -1,8 +1,8 @@
-"""A vessel: bars along a centre line. They stiffen the tetrahedra through which they pass, and they bend without force.
+"""A vessel: bars along a centre line. The bars stiffen the tetrahedra that they cross. They have no bending stiffness.
 
-The line is cut at the faces of the tetrahedra. A piece has no additional unknowns: its points move with the shape
-functions of its element. Its cross-section is a ring, or a disc if `wall` is None. Its law acts in uniaxial tension
-along the piece, at constant volume. The tissue at the place of the wall is not removed.
+The line is cut into pieces at the faces of the tetrahedra. A piece has no additional unknowns: its points move with the
+shape functions of its element. The cross-section is a ring, or a disc if `wall` is None. The law acts in uniaxial
+tension along the piece, at constant volume. The tissue in the volume of the wall is not removed.
 """
 
 from collections.abc import Mapping
@@ -26,19 +26,21 @@ from liverjax.physics.attached.centre_lines import CentreLines, centre_lines, re
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
 
-#: Two Gauss points on a piece: they integrate the squared slopes of quadratic elements exactly.
+#: Two Gauss points on a piece integrate the squared derivatives of quadratic shape functions exactly.
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3)
 
 
 @struct
 class Vessel(Physics):
-    """Pieces (m) of a centre line, each in one element."""
+    """m pieces of a centre line, each in one element."""
 
     element: Indices = param("1", "element numbers (m,)", lower=0)
     enters: jax.Array = param("1", "barycentric coordinates where a piece begins (4, m)")
     leaves: jax.Array = param("1", "barycentric coordinates where a piece ends (4, m)")
     radius: Number = param("m", "outer radius, one number or one per piece (m,)", above=0.0)
-    wall: Number | None = param("m", "thickness of the wall; None: the section is a disc", above=0.0, default=None)
+    wall: Number | None = param(
+        "m", "thickness of the wall; None: the cross-section is a disc", above=0.0, default=None
+    )
     law: Law = param("1", "law of the wall")
 
     section: ClassVar[str] = "vessel"
@@ -52,31 +54,31 @@ class Vessel(Physics):
                 f"{name} needs line = [[x, y, z], …] with radius in m, or surface = 'tube.stl', and [vessel.law]"
             )
         if "where" in table or "set" in table:
-            raise InputError(f"{name} has a place, but its line already gives the place: leave where and set out")
+            raise InputError(f"{name} has where or set, but its line already gives the position: remove where and set")
         given = {"wall": table["wall"]} if "wall" in table else {}
         law = layers.read_layer(table["law"], name)
         if "surface" in table:
             lines = _lines_of_surface(table, name)
             return crossing(mesh, lines, law, name=name, **given)
         if "radius" not in table or "unit" in table:
-            raise InputError(f"{name} line needs radius, both in m: give radius, and leave unit out")
+            raise InputError(f"{name} line needs radius, and both are in m: give radius, and remove unit")
         line, radius = (bounds.array_of(table[key]) for key in ("line", "radius"))
         line, radius = (np.empty(0) if v is None else v for v in (line, radius))
         if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2 or radius.shape not in ((), (len(line),)):
             raise InputError(
-                f"{name} needs line = [[x, y, z], …] of two points or more, radius one number or one each, all of them "
-                "finite"
+                f"{name} needs line = [[x, y, z], …] with two points or more, and radius one number or one per point: "
+                "give finite numbers"
             )
         if not np.all(np.any(np.diff(line, axis=0) != 0, axis=1)):
-            raise InputError(f"{name} line has a point twice in a row: mend the line")
+            raise InputError(f"{name} line has the same point twice in succession: correct the line")
         return along(mesh, line, radius, law, name=name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse elements that are not in the mesh, a wall thicker than the radius, and laws with fibre directions."""
+        """Raise InputError for unknown elements, a wall thicker than the radius, or a law with fibre directions."""
         numbers = np.asarray(self.element)
         if numbers.ndim != 1 or not numbers.size or numbers.max() >= mesh.number_of_elements:
             raise InputError(
-                f"{name} crosses no element, or names one beyond {mesh.number_of_elements - 1}: mend its line"
+                f"{name} crosses no element, or one above number {mesh.number_of_elements - 1}: correct its line"
             )
         for key in ("enters", "leaves"):
             bounds.check_shape(f"{name}.{key}", getattr(self, key), (4, len(numbers)))
@@ -84,12 +86,12 @@ class Vessel(Physics):
             bounds.check_shape(f"{name}.{key}", getattr(self, key), (), (len(numbers),))
         if self.wall is not None and np.any(np.asarray(self.wall) > np.asarray(self.radius)):
             raise InputError(
-                f"{name}.wall = {self.wall} m is thicker than the radius: leave wall out for a full section"
+                f"{name}.wall = {self.wall} m is thicker than the radius: remove wall to get a solid cross-section"
             )
         layers.check(self.law, name)
 
     def freeze(self, memory: None, step: Step) -> "Bars":
-        """The bars of the vessel, with the isochoric part of the law if it has one."""
+        """Force term with the isochoric part of the law. If the law has no such part, the whole law is used."""
         law = self.law.isochoric_part() or self.law
         return Bars(element=self.element, enters=self.enters, leaves=self.leaves, section_area=self.area(), law=law)
 
@@ -110,12 +112,12 @@ def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
     if radius is None:
         return lines
     if isinstance(radius, bool) or not isinstance(radius, (int, float)):
-        raise InputError(f"{name} radius = {radius!r} of a surface must be one number in m: give it, or leave it out")
+        raise InputError(f"{name} radius = {radius!r} of a surface must be one number in m: correct it, or remove it")
     return lines._replace(radius=np.full(len(lines.radius), float(radius)))
 
 
 def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "vessel", **given: object) -> Vessel:
-    """A vessel along a line (n, 3) [m], with one radius or one per point (n,) [m]. Parts outside the body are left out.
+    """Create a vessel along a line (n, 3) [m], with one radius [m] or one per point (n,). Parts outside are left out.
 
     Raises:
         InputError: the whole line is outside the body.
@@ -130,7 +132,7 @@ def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "v
 
 
 def crossing(mesh: TetMesh, lines: CentreLines, law: Law, name: str = "vessel", **given: object) -> Vessel:
-    """Vessels along centre lines, for example of a tree. Parts outside the body are left out.
+    """Create a vessel along several centre lines, for example of a tree. Parts outside the body are left out.
 
     Raises:
         InputError: all lines are outside the body.
@@ -160,7 +162,7 @@ def _of_pieces(
 
 @struct
 class Bars(Elements):
-    """A vessel during a step."""
+    """Force term of a vessel, for one step."""
 
     element: Indices = param("1", "element numbers (m,)")
     enters: jax.Array = param("1", "barycentric (4, m)")
@@ -179,7 +181,7 @@ class Bars(Elements):
         return jnp.sqrt(jnp.sum(f * f, axis=1))
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Derivatives of the shape functions along the piece, at its integration points."""
+        """Factors p: derivatives of the shape functions along the piece, at the integration points of the piece."""
         along = (self.leaves - self.enters) / self._lengths(mesh)[None]
         if mesh.order == 1:
             return along[None, :, None, :]
@@ -190,16 +192,16 @@ class Bars(Elements):
         return jnp.stack(rows, axis=1)[None]
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Volume of the wall times the energy density of an incompressible sample in tension."""
+        """Energy [J]: volume of the wall times the energy density of an incompressible sample in tension."""
         law = jax.tree.map(lambda v: v if jnp.ndim(v) == 0 else v[None], self.law)
         volume = self.section_area * self._lengths(mesh) / len(C[0])
         return volume[None] * layers.axial_energy(law, jnp.sqrt(C[0]))
 
 
 def _slopes_along(L: jax.Array, along: jax.Array) -> jax.Array:
-    """Derivatives (10, m) of the quadratic functions at L (4, m) in the direction `along` (4, m).
+    """Derivatives (10, m) of the quadratic shape functions in the direction `along` (4, m), at the point L (4, m).
 
-    They are linear in L.
+    L are barycentric coordinates. The derivatives are linear in L.
     """
     corners = np.eye(4)
     table = functions(2, corners)[1]  # (10, 4, 4): derivatives with respect to L_k, at every corner

@@ -1,9 +1,10 @@
 """A rigid obstacle with Coulomb friction: the surface sticks to it until the shear reaches mu times the pressure.
 
-Every contact point has an elastic slip e along the obstacle's surface [m], a memory from step to step. Within a step,
-the slip grows with the motion of the point relative to the obstacle. Its maximum is mu times the depth of the point; at
-this maximum the point slides. The shear stress is `stiffness` times e, and the pressure is `stiffness` times the depth.
-So a sticking point slips by at most mu times its depth, and it does not creep. When a contact opens, its slip is lost.
+Every contact point has an elastic slip e [m] along the obstacle's surface, which is stored from step to step. Within a
+step, the slip grows with the motion of the point relative to the obstacle. The maximum slip is mu times the depth of
+the point in the obstacle. At the maximum slip the point slides. The shear stress is `stiffness` times e, and the
+pressure is `stiffness` times the depth. So a sticking point moves by at most mu times its depth, and it does not creep.
+When a contact opens, its slip is set to 0.
 
 The force has no energy, since sliding dissipates energy. The tangent is exact. It is not symmetric if points slide.
 
@@ -45,26 +46,29 @@ class RoughObstacle(Obstacle):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
-        """Read [[obstacle]] with a friction."""
+        """Read [[obstacle]] with a friction coefficient."""
         plain = super().read(mesh, table, name)
         return replace(plain, friction=table["friction"])
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held in all directions if their part of the surface touches the obstacle at the beginning."""
+        """Return the nodes of triangles that touch the obstacle at the beginning, constrained in all directions.
+
+        If mu is 0, the nodes are constrained along the normal only.
+        """
         nodes, normals = super().holds(mesh)
         if not np.all(np.asarray(self.friction) > 0):
             return nodes, normals
         return np.tile(nodes, 3), np.repeat(np.eye(3), len(nodes), axis=0)
 
     def begin(self, start: Start) -> jax.Array:
-        """Begin without slip: zeros (3, Q, m)."""
+        """Elastic slip at the beginning of a run: zeros (3, Q, m)."""
         return jnp.zeros_like(contact_points(self, start.mesh, start.x))
 
     def freeze(self, memory: Any, step: Step) -> "Rubbing":
-        """Store the slip at the step's beginning, and the positions of the contact points relative to the obstacle."""
+        """Force term with the slip, and with the contact points relative to the obstacle, at the step's beginning."""
         plain = super().freeze(memory, step)
         moved = plain.moved
-        # In a static run the first positions are only a guess: the surface starts from the reference shape.
+        # In a static run the first positions are only a guess, so slip is measured from the reference shape.
         x = step.x if step.inertia else jnp.where(step.k == 1, step.mesh.points, step.x)
         past = contact_points(self, step.mesh, x) - moved[0][:, None, None]
         slip = jnp.zeros_like(past) if memory is None else memory
@@ -80,28 +84,32 @@ class RoughObstacle(Obstacle):
         )
 
     def advance(self, memory: jax.Array, acting: "Rubbing", end: End) -> jax.Array:
-        """The slip (3, Q, m) [m] at the end of the step."""
+        """Elastic slip (3, Q, m) [m] at the end of the step."""
         return acting.slip_at(acting.points(end.x), 1.0)
 
 
 @struct
 class Rubbing(Touching):
-    """The obstacle during a step."""
+    """Force term of an obstacle with friction, for one step."""
 
     friction: Number = param("1", "mu", default=0.0)
     slip: Any = param("m", "elastic slip at the beginning (3, Q, m)", default=None)
-    past: jax.Array | None = param("m", "contact points then, relative to the obstacle (3, Q, m)", default=None)
+    past: jax.Array | None = param(
+        "m", "contact points at the beginning, relative to the obstacle (3, Q, m)", default=None
+    )
     nodes: Array | None = param("1", "nodes of the triangles (n, m)", default=None)
-    functions: Array | None = param("1", "functions of a triangle's nodes at its points (n, Q)", default=None)
+    functions: Array | None = param(
+        "1", "shape functions of a triangle's nodes at its contact points (n, Q)", default=None
+    )
 
     conservative: ClassVar[bool] = False  # type: ignore[misc]
 
     def points(self, x: jax.Array) -> jax.Array:
-        """Points of contact (3, Q, m) at positions x (V, 3)."""
+        """Contact points (3, Q, m) [m] at nodal positions x (V, 3)."""
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
 
     def slip_at(self, at: jax.Array, s: Number) -> jax.Array:
-        """Elastic slip (3, Q, m) [m] of points (3, Q, m) at fraction s of the step."""
+        """Elastic slip (3, Q, m) [m] of contact points `at` (3, Q, m), at fraction s of the step."""
         n, most = self._law(at, s)
         trial = self._trial(at, s, n)
         size = _of_slip(trial)
@@ -113,32 +121,32 @@ class Rubbing(Touching):
         return jnp.stack(d.normal), jnp.multiply(self.friction, jnp.maximum(-d.value, 0.0))
 
     def _trial(self, at: jax.Array, s: Number, n: jax.Array) -> jax.Array:
-        """Slip (3, Q, m) [m] if all points stick, along planes with normals n (3, Q, m)."""
+        """Slip (3, Q, m) [m] if all points stick, projected onto planes with normals n (3, Q, m)."""
         trial = self.slip + at - self.now(s)[:, None, None] - self.past
         return trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
 
     def _guessed(self, mesh: TetMesh, at: jax.Array, s: Number) -> jax.Array:
-        """Points (1, 1, Q, m) where the surface just touches. The tangent treats them as pressed and sticking."""
+        """Whether points (1, 1, Q, m) just touch the obstacle. The tangent treats them as pressed and sticking."""
         d = distances(self.obstacle, at, self.now(s))
         return (just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0))[None, None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Forces from the contact pressures and from the frictional shear."""
+        """Nodal forces (V, 3) [N] from the contact pressures and from the frictional shear."""
         shear = weighted_stiffness(self.obstacle, mesh)[None] * self.slip_at(self.points(x), s)
         return super().force(mesh, x, s) + shared_out(self.obstacle, mesh, x, shear)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """The complete derivative of the force."""
+        """Stiffness: the complete derivative of the force."""
         at, plain = self.points(x), super().attached(mesh, x, s)
         units = [jnp.zeros_like(at).at[j].set(1.0) for j in range(3)]
         H = jnp.stack([jax.jvp(lambda at: self.slip_at(at, s), (at,), (unit,))[1] for unit in units], axis=1)
         return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(self._law(at, s)[0]), H))
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """The energy of the contact plus an energy of the slip.
+        """Energy [J] of the contact plus an energy of the slip.
 
-        The second energy is half of stiffness times slip squared. Above the maximum slip that the pressure at `start`
-        allows, it grows linearly.
+        The energy of the slip is half of stiffness times slip squared. It grows linearly above the maximum slip that
+        the pressure at `start` allows.
         """
         one = jnp.ones((), x.dtype)
         n, most = self._law(self.points(start), one)
@@ -158,20 +166,20 @@ class Rubbing(Touching):
         return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(n), H))
 
     def _with_shear(self, mesh: TetMesh, plain: Attached, H: jax.Array) -> Attached:
-        """The stiffness of the pressures, `plain`, plus that of the shear: H (3, 3, Q, m) times `stiffness`."""
+        """Add the stiffness of the shear, H (3, 3, Q, m) times `stiffness`, to that of the pressures, `plain`."""
         shear = weighted_stiffness(self.obstacle, mesh)[None, None] * H
         return Attached(plain.nodes, plain.blocks + between_nodes(mesh, shear))
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
-        """Zero, since `attached` has the whole derivative."""
+        """Return zeros, since `attached` contains the whole derivative."""
         return jnp.zeros_like(dx)
 
 
 def _of_slip(trial: jax.Array) -> jax.Array:
-    """Length (Q, m) of slips (3, Q, m), never 0."""
+    """Length (Q, m) of slips (3, Q, m), limited from below to avoid division by 0."""
     return jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
 
 
 def _planes(n: jax.Array) -> jax.Array:
-    """Projections (3, 3, Q, m) onto planes with normals n (3, Q, m)."""
+    """Projection tensors (3, 3, Q, m) onto planes with normals n (3, Q, m)."""
     return jnp.eye(3, dtype=n.dtype)[:, :, None, None] - n[:, None] * n[None]

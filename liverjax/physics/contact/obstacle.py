@@ -1,14 +1,14 @@
 """A rigid obstacle that the surface of the body cannot enter: a plane, a sphere, a cylinder or a cone.
 
-Contact is tested at some points of every triangle (three in linear and quadratic meshes). At a point inside the
-obstacle a pressure acts along the obstacle's normal, per reference area. It is `stiffness` times the depth of the
-point. At points outside nothing acts, so the surface does not stick to the obstacle. There is no friction (see
-`liverjax.physics.contact.friction`). The energy per area is half of pressure times depth. Its gradient and second
-derivative are exact.
+Contact is tested at some points of every surface triangle (three points in linear and quadratic meshes). At a point
+inside the obstacle a pressure per reference area acts along the obstacle's normal. The pressure is `stiffness` times
+the depth of the point. Nothing acts at points outside, so the surface does not stick to the obstacle. There is no
+friction (see `liverjax.physics.contact.friction`). The energy per area is half of pressure times depth. The gradient
+and the second derivative of the energy are exact.
 
-With this penalty the surface enters the obstacle by a depth of pressure over stiffness. By default the stiffness is
-`HARDNESS` times the modulus of the body over the size of a triangle. At a pressure as large as this modulus, the depth
-is then a hundredth of the triangle's size. `lj.obstacle_forces` returns the force and the maximum depth.
+With this penalty method the surface enters the obstacle by the depth pressure / stiffness. By default the stiffness is
+`HARDNESS` times the modulus of the body, divided by the size of a triangle. If the pressure is as large as this
+modulus, the depth is a hundredth of the triangle's size. `lj.obstacle_forces` returns the force and the maximum depth.
 
 Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalty, exact tangent).
 """
@@ -35,9 +35,9 @@ from liverjax.physics.contact.passage import in_body
 from liverjax.physics.contact.shapes import SHAPES, Distance, distance
 from liverjax.solvers.attached import Attached
 
-#: Stiffness of the contact, over the stiffness of a layer of the body's material as thick as a triangle is wide.
+#: Stiffness of the contact, divided by the stiffness of a layer of the body's material as thick as a triangle is wide.
 HARDNESS = 100.0
-#: A smaller distance, over the size of a triangle, counts as touching.
+#: A point counts as touching if its distance, divided by the size of a triangle, is below this.
 _TOUCHING = 1e-9
 #: Contact points of a triangle: weights and barycentric coordinates (3, Q) of a rule of degree 2.
 _POINTS = np.full(3, 1 / 3), np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
@@ -45,23 +45,23 @@ _POINTS = np.full(3, 1 / 3), np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 
 @struct
 class Obstacle(Physics):
-    """One rigid shape that does not move, moves by the vector `by` during the run, or follows a history."""
+    """A rigid obstacle that is at rest, moves by the vector `by` during the run, or follows a history."""
 
-    triangles: Indices = param("1", "node numbers (m, 3) of the surface that may touch it", lower=0)
+    triangles: Indices = param("1", "surface triangles that may touch it: node numbers (m, 3)", lower=0)
     shape: str = static(default="plane", about="plane, sphere, cylinder or cone", words=tuple(SHAPES))
     position: Numbers = param(
-        "m", "point of the plane or of the cylinder's axis, sphere's centre, cone's tip (3,)", default=(0.0, 0.0, 0.0)
+        "m", "point of plane or cylinder axis, centre of sphere, tip of cone (3,)", default=(0.0, 0.0, 0.0)
     )
     axis: Numbers = param(
-        "1", "plane's normal to the free side; cylinder's axis; cone's, inwards (3,)", default=(0.0, 0.0, 1.0)
+        "1", "outward normal of a plane; axis of a cylinder; axis of a cone, inwards (3,)", default=(0.0, 0.0, 1.0)
     )
-    radius: Number = param("m", "of sphere and cylinder; of a cone's rounded tip", lower=0.0, default=0.0)
-    half_angle: Number = param("deg", "of the cone, between axis and side", above=0.0, default=45.0)
+    radius: Number = param("m", "radius of sphere, cylinder or the rounded tip of a cone", lower=0.0, default=0.0)
+    half_angle: Number = param("deg", "angle between axis and side of a cone", above=0.0, default=45.0)
     by: Numbers | None = param("m", "displacement (3,), reached at the last step", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param("m", "displacements at these times (T, 3), or factors of by (T,)", default=None)
     stiffness: Any = param(
-        "Pa/m", "pressure over depth, one number or one per triangle (m,); None: from the law", above=0.0, default=None
+        "Pa/m", "pressure per depth, one number or one per triangle (m,); None: from the law", above=0.0, default=None
     )
 
     section: ClassVar[str] = "obstacle"
@@ -73,7 +73,7 @@ class Obstacle(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
-        """Read [[obstacle]]: a shape, its position and its numbers. By default the whole surface may touch it."""
+        """Read [[obstacle]]: shape, position and dimensions. By default the whole surface may touch the obstacle."""
         if "shape" not in table:
             raise InputError(f"{name} is without shape: give {', '.join(SHAPES)}")
         shape = as_word(table["shape"], f"{name} shape")
@@ -85,7 +85,7 @@ class Obstacle(Physics):
         own = _numbers_of_shape(shape)
         for key in ("axis", "radius", "half_angle"):
             if key in table and key not in own:
-                raise InputError(f"{name} is a {shape}, which has no {key}: leave it out")
+                raise InputError(f"{name} is a {shape}, which has no {key}: remove it")
         whole = "where" not in table and "set" not in table
         nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
         triangles = selection.surface_of(mesh, nodes, table.get("set"))
@@ -98,7 +98,7 @@ class Obstacle(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), shape=shape, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse numbers that do not define the shape, and triangles that are not in the mesh."""
+        """Raise InputError for numbers that do not define the shape, or for triangles that are not in the mesh."""
         selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
         for key in ("radius", "half_angle", "friction"):
             if np.ndim(getattr(self, key, 0.0)):
@@ -112,17 +112,19 @@ class Obstacle(Physics):
         if "radius" in SHAPES[self.shape] and not np.all(np.asarray(self.radius) > 0):
             raise InputError(f"{name} radius = {self.radius} of a {self.shape} must be above 0: give it in m")
         if self.shape == "cone" and not np.all(np.asarray(self.half_angle) < 90):
-            raise InputError(f"{name} half_angle = {self.half_angle} must be below 90 degrees: a plane has 90")
+            raise InputError(
+                f"{name} half_angle = {self.half_angle} must be below 90 degrees: use shape = 'plane' for 90"
+            )
         if abs(np.linalg.norm(np.asarray(self.axis, float)) - 1) > 1e-6:
             raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
         history.check_times(self.times, self.history, name)
         if self.history is not None and np.ndim(self.history) == 2 and self.by is not None:
-            raise InputError(f"{name} has by and a history of displacements: leave one of them out")
+            raise InputError(f"{name} has by and a history of displacements: remove one of them")
         if self.history is not None and np.ndim(self.history) == 1 and getattr(self, self.driven) is None:
-            raise InputError(f"{name} history has factors, but there is no by to multiply with them: give by")
+            raise InputError(f"{name} history has factors of by, but there is no by: give by")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Refuse an obstacle that begins inside the body."""
+        """Raise InputError if the obstacle is inside the body at the beginning."""
         size, deepest = float(np.ptp(np.asarray(mesh.points), axis=0).max()), float(_depth_at_beginning(self, mesh))
         if deepest > 1e-9 * size:
             raise InputError(
@@ -135,7 +137,7 @@ class Obstacle(Physics):
             raise InputError(f"{name} position = {np.asarray(self.position).tolist()} is inside the body: move it out")
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held along the normal if their part of the surface touches the obstacle at the beginning."""
+        """Return the nodes of triangles that touch the obstacle at the beginning, and the normals there."""
         d = _distances(self, mesh, mesh.points, self.displacement(0, 1, 0.0))
         near = np.asarray(d.value <= 1e3 * _TOUCHING * jnp.sqrt(_triangle_areas(self, mesh))[None])
         _, touching = np.nonzero(near)
@@ -144,24 +146,24 @@ class Obstacle(Physics):
         return nodes.ravel(), np.repeat(normals, nodes.shape[1], axis=0)
 
     def in_body(self, mesh: TetMesh, law: Law) -> "Obstacle":
-        """Take the default stiffness from the law.
+        """Compute the default stiffness from the law.
 
-        It is `HARDNESS` times the stiffness of a layer with the modulus K + 4/3 mu, with K limited to 3 mu.
+        It is `HARDNESS` times the stiffness of a layer with the modulus K + 4/3 mu. The bulk modulus K is limited to 3
+        mu, with the shear modulus mu.
         """
         if self.stiffness is not None:
             return self
-        # Material under a contact can move sideways. With a large bulk modulus the contact would be stiffer than
-        # needed.
+        # Material under a contact can move sideways, so a large bulk modulus would make the contact too stiff.
         shear = law.shear_modulus()
         modulus = jnp.max(jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear))
         return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
 
     def at_beginning(self) -> "Obstacle":
-        """The obstacle at time 0 of its history. Without a history it has not moved yet."""
+        """The obstacle at time 0 of its history. Without a history it is at its initial position."""
         return replace(self, by=None) if self.history is None else self
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Obstacle":
-        """The obstacle for the same triangles of the richer mesh."""
+        """The obstacle for the same triangles of the mesh of higher order."""
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
@@ -172,51 +174,51 @@ class Obstacle(Physics):
         return zero if self.by is None else jnp.asarray(self.by) * (k / steps)
 
     def freeze(self, memory: None, step: Step) -> "Touching":
-        """The obstacle, with its displacements at the beginning and at the end of the step."""
+        """Force term of the obstacle, with its displacements at the beginning and at the end of the step."""
         dt = 0.0 if step.dt is None else step.dt
         moved = jnp.stack([self.displacement(n, step.steps, dt) for n in (step.k - 1, step.k)])
-        # Newmark's method takes the force at the end only, doubled (`liverjax.physics.inertia`).
+        # Newmark's method uses only the force at the end of the step, doubled (`liverjax.physics.inertia`).
         own = replace(self, stiffness=2 * jnp.asarray(self.stiffness)) if step.averaged else self
         return Touching(obstacle=own, moved=moved.astype(step.x.dtype), at_end=step.averaged)
 
 
 @struct
 class Touching(NodalForce):
-    """The obstacle during a step."""
+    """Force term of a rigid obstacle, for one step."""
 
     obstacle: Obstacle = param("1", "shape and stiffness")
-    moved: jax.Array = param("m", "its displacement at the beginning and at the end (2, 3)")
+    moved: jax.Array = param("m", "displacement at the beginning and at the end of the step (2, 3)")
 
     at_end: bool = static(default=False)  # type: ignore[misc]
 
     kinked: ClassVar[bool] = True
 
     def now(self, s: Number) -> jax.Array:
-        """Its displacement (3,) [m] at fraction s of the step, if it does not depend on the body."""
+        """Displacement (3,) [m] of the obstacle at fraction s of the step, if it does not depend on the body."""
         return self.moved[0] + s * (self.moved[1] - self.moved[0])
 
     def place(self, x: jax.Array, s: Number) -> jax.Array:
-        """Its displacement (3,) [m] at positions x (V, 3) of the body and fraction s of the step."""
+        """Displacement (3,) [m] of the obstacle for positions x (V, 3) of the body, at fraction s of the step."""
         return self.now(s)
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Minus the forces of the pressures, distributed to the nodes of their triangles."""
+        """Minus the forces (V, 3) [N] of the contact pressures, distributed to the nodes of the triangles."""
         return self.force_at(mesh, x, self.place(x, s))
 
     def force_at(self, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-        """`force` with the obstacle displaced by `moved` (3,)."""
+        """Forces (V, 3) [N] as in `force`, with the obstacle displaced by `moved` (3,) [m]."""
         return contact_force(self.obstacle, mesh, x, moved)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Half of stiffness times depth squared."""
+        """Energy [J] of the contact: half of stiffness times depth squared."""
         depth = jnp.minimum(_distances(self.obstacle, mesh, x, self.now(1.0)).value, 0.0)
         return 0.5 * jnp.sum(weighted_stiffness(self.obstacle, mesh) * depth**2)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of the energy: a part along the normal, and a part from the change of the normal."""
+        """Second derivative of the energy: a part along the normal plus a part from the change of the normal."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
-        # A surface that just touches counts as pressed: otherwise a body on a plane would have no support at first.
+        # A surface that just touches counts as pressed. Otherwise a body on a plane would have no support at first.
         inside = just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack(
             [
@@ -227,7 +229,7 @@ class Touching(NodalForce):
         return Attached(touching_nodes(self.obstacle, mesh), between_nodes(mesh, H))
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """The stiffness along the normal only: the part from the change of the normal is never positive."""
+        """Stiffness along the normal. The part from the change of the normal is never positive and is left out."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         k = k * just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack([jnp.stack([k * a * b for b in d.normal]) for a in d.normal])
@@ -235,9 +237,9 @@ class Touching(NodalForce):
 
 
 def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-    """Gradient of the energy (V, 3) [N] at positions x (V, 3), with the obstacle displaced by `moved` (3,).
+    """Force (V, 3) [N] of each node on the obstacle at positions x (V, 3), with the obstacle displaced by `moved` (3,).
 
-    It is the force of the nodes on the obstacle.
+    It is the gradient of the energy.
     """
     d = _distances(obstacle, mesh, x, moved)
     depth = depths(d, touching_distance(obstacle, mesh))
@@ -246,65 +248,65 @@ def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
 
 
 def depths(d: Distance, near: jax.Array) -> jax.Array:
-    """Distances (Q, m) [m] of points inside, 0 for other points.
+    """Negative distances (Q, m) [m] of the points inside the obstacle, 0 for other points.
 
-    Points nearer than `near` (m,) count as pressed, as in the stiffness: `minimum` would have half the derivative at a
-    point that just touches.
+    Points nearer than `near` (m,) count as pressed, as in the stiffness. At a point that just touches, `minimum` would
+    give half the derivative.
     """
     pressed = d.value - jax.lax.stop_gradient(jnp.maximum(d.value, 0.0))
     return jnp.where(d.value <= near[None], pressed, 0.0)
 
 
 def shared_out(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, pushes: jax.Array) -> jax.Array:
-    """Distribute forces at points (3, Q, m) [N] to the nodes (V, 3)."""
+    """Distribute forces (3, Q, m) [N] at contact points to the nodes. Return nodal forces (V, 3) [N]."""
     own = jnp.einsum("aq,iqm->ami", point_functions(mesh, x.dtype), pushes)
     return jnp.zeros_like(x).at[touching_nodes(obstacle, mesh)].add(own)
 
 
 def between_nodes(mesh: TetMesh, H: jax.Array) -> jax.Array:
-    """Stiffness (n, 3, n, 3, m) between nodes of triangles, from the stiffness H (3, 3, Q, m) [N/m] at their points."""
+    """Stiffness (n, 3, n, 3, m) [N/m] between the nodes of triangles, from the stiffness H (3, 3, Q, m) at points."""
     N = point_functions(mesh, H.dtype)
     both = jnp.einsum("aq,bq->abq", N, N)
     return jnp.einsum("abq,ijqm->aibjm", both, H)
 
 
 def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-    """Maximum depth () [m] of the surface in the obstacle, at positions x (V, 3); 0 if all points are outside."""
+    """Maximum depth () [m] of the surface in the obstacle at positions x (V, 3); 0 if all points are outside."""
     deepest = -jnp.min(_distances(obstacle, mesh, x, moved).value)
     return jnp.where(deepest >= 0, deepest, 0.0)  # `maximum` would have half the derivative at a point that touches
 
 
-@jax.jit  # compiled, since the checks of a sweep call it for each row
+@jax.jit  # compiled, since the checks of a sweep call it for each run
 def _depth_at_beginning(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Depth () [m] of the obstacle in the body at the beginning of a run. A negative value is minus their distance."""
+    """Depth () [m] of the surface in the obstacle at the beginning of a run; minus the distance if they are apart."""
     return -jnp.min(_distances(obstacle, mesh, mesh.points, obstacle.displacement(0, 1, 0.0)).value)
 
 
 def touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Nodes (n, m) of the triangles: n = 3 or more for each."""
+    """Node numbers (n, m) of the m triangles, with n = 3 or more nodes per triangle."""
     return jnp.stack(surface.triangle_nodes(mesh, obstacle.triangles))
 
 
 def point_functions(mesh: TetMesh, dtype: DTypeLike) -> jax.Array:
-    """Shape functions of a triangle's nodes at its contact points (n, Q)."""
+    """Shape functions (n, Q) of the n nodes of a triangle at its Q contact points."""
     return jnp.asarray(surface.triangle_functions(mesh, _rule(mesh)[1]), dtype)
 
 
 def _rule(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     """Weights and contact points of a triangle.
 
-    A surface of order 3 has more than three: it could enter between three.
+    A triangle of order 3 has more than three points, since its surface could enter an obstacle between three points.
     """
     return triangle_rule() if mesh.order == 3 else _POINTS
 
 
 def contact_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Contact points of the triangles (3, Q, m) [m] at positions x (V, 3)."""
+    """Coordinates (3, Q, m) [m] of the contact points on the triangles, for node positions x (V, 3)."""
     return jnp.einsum("aq,ami->iqm", point_functions(mesh, x.dtype), x[touching_nodes(obstacle, mesh)])
 
 
 def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
-    """Distances of points (3, Q, m) [m] from the obstacle, which is displaced by `moved` (3,)."""
+    """Signed distances of points (3, Q, m) [m] from the obstacle, which is displaced by `moved` (3,) [m]."""
     place = jnp.asarray(obstacle.position, at.dtype) + moved
     axis, angle = jnp.asarray(obstacle.axis, at.dtype), jnp.deg2rad(jnp.asarray(obstacle.half_angle, at.dtype))
     y = [at[i] - place[i] for i in range(3)]
@@ -313,29 +315,30 @@ def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
 
 @partial(jax.jit, inline=True)
 def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> Distance:
-    """Distances of the contact points of the triangles (Q, m)."""
+    """Signed distances (Q, m) [m] of the contact points from the obstacle, which is displaced by `moved` (3,) [m]."""
     return distances(obstacle, contact_points(obstacle, mesh, x), moved)
 
 
 def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
-    """Whether points (Q, m) are inside, or near enough to count as touching."""
+    """Whether points (Q, m) are inside the obstacle, or near enough to count as touching."""
     return d.value <= touching_distance(obstacle, mesh)[None]
 
 
 def touching_distance(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Maximum distance (m,) [m] that counts as touching."""
+    """Maximum distance (m,) [m] that counts as touching, for each triangle."""
     return _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))
 
 
-#: To find a depth between contact points: minimum and maximum number of intervals along the edge of a triangle.
+#: Minimum and maximum number of intervals along the edge of a triangle in the search for a depth between contact
+#: points.
 _FEWEST, _MOST = 6, 24
 
 
 def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> tuple[float, float]:
-    """Depth [m] of a round obstacle in the body that the contact points miss; and its approach [m].
+    """Depth [m] of a round obstacle that the contact points miss, and the approach [m] of the obstacle.
 
-    The obstacle is displaced by `moved` (3,), and the body is at positions x (V, 3). The approach is the depth in the
-    reference shape, or a tenth of the radius if the obstacle is outside of this shape.
+    The obstacle is displaced by `moved` (3,), and the body is at positions x (V, 3). The approach is the depth of the
+    obstacle in the undeformed body. If this depth is 0, the approach is a tenth of the radius.
     """
 
     def depth(y: jax.Array) -> float:
@@ -347,9 +350,9 @@ def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Arr
 
 
 def near_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Points of the triangles (3, Q, m) [m] at positions x (V, 3).
+    """Coordinates (3, Q, m) [m] of a fine grid of points on the contact triangles, for node positions x (V, 3).
 
-    Their spacing is below the radius, where possible.
+    If possible, the spacing of the points is below the radius of the obstacle.
     """
     radius, width = _radius_and_width(obstacle, mesh)
     n = int(np.clip(np.ceil(3 * width / radius), _FEWEST, _MOST))
@@ -359,13 +362,13 @@ def near_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
 
 
 def _radius_and_width(obstacle: Obstacle, mesh: TetMesh) -> tuple[float, float]:
-    """Radius of the obstacle [m] (at least a thousandth of the width), and width of the largest triangle [m]."""
+    """Radius [m] of the obstacle (at least a thousandth of the width), and width [m] of the largest triangle."""
     width = float(jnp.sqrt(jnp.max(_triangle_areas(obstacle, mesh))))
     return max(float(np.max(np.asarray(obstacle.radius))), 1e-3 * width), width
 
 
 def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> bool:
-    """Whether the surface at positions x (V, 3) touches the obstacle at its first position, but without pressure."""
+    """Whether the surface at positions x (V, 3) touches the obstacle, at its initial position, without pressure."""
     d = _distances(obstacle, mesh, x, obstacle.displacement(0, 1, 0.0))
     nothing = d.value >= -_TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
     return bool(just_touching(obstacle, mesh, d).any() & nothing.all())
@@ -379,13 +382,13 @@ def _triangle_areas(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
 
 
 def weighted_stiffness(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Stiffness times reference area of every point (Q, m) [N/m]."""
+    """Stiffness times reference area (Q, m) [N/m] of every contact point."""
     whole = _triangle_areas(obstacle, mesh) * obstacle.stiffness
     return jnp.asarray(_rule(mesh)[0], whole.dtype)[:, None] * whole[None]
 
 
 def three_numbers(value: object, name: str) -> jax.Array:
-    """A vector (3,) of a scene file.
+    """Convert a value of a scene file to a vector (3,).
 
     Raises:
         InputError: the value is not three finite numbers.
@@ -397,5 +400,5 @@ def three_numbers(value: object, name: str) -> jax.Array:
 
 
 def _numbers_of_shape(shape: str) -> tuple[str, ...]:
-    """Names of the numbers that a shape needs or may have."""
+    """Names of the dimensions that a shape needs or may have."""
     return (*SHAPES[shape], "radius") if shape == "cone" else SHAPES[shape]

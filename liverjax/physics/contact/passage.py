@@ -1,7 +1,7 @@
-"""A check whether a sphere or a cylinder passes the surface of the body within a step.
+"""Check whether a sphere or a cylinder passes through the surface of the body within a step.
 
-Contact depends only on the distance of the surface from the obstacle. So a sphere deep inside the body touches nothing,
-and a sphere with its centre inside the body is pushed to the wrong side.
+Contact depends only on the distance between the surface and the obstacle. So a sphere deep inside the body touches
+nothing, and the contact forces on a sphere with its centre inside the body point to the wrong side.
 """
 
 import numpy as np
@@ -9,14 +9,14 @@ import numpy as np
 from liverjax.mesh.locate import around_a_point, around_a_point_in_plane, straight_corners
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Maximum number of places that are checked along the path of a step.
+#: Maximum number of positions that are checked along the path of a step.
 _MOST = 256
 
 
 def in_body(
     shape: str, axis: np.ndarray, mesh: TetMesh, x: np.ndarray, centres: np.ndarray, triangles: np.ndarray
 ) -> np.ndarray:
-    """Whether the centre of a sphere, or a part of a cylinder's axis, is in the body, (n,). False for other shapes.
+    """Whether (n,) the centre of a sphere, or a part of a cylinder's axis, is in the body. False for other shapes.
 
     Args:
         shape: shape of the obstacle.
@@ -29,7 +29,7 @@ def in_body(
     found = np.zeros(len(centres), bool)
     if shape not in ("sphere", "cylinder"):
         return found
-    across = np.eye(3) if shape == "sphere" else np.linalg.svd(axis[None])[2][1:]  # a cylinder, along its axis
+    across = np.eye(3) if shape == "sphere" else np.linalg.svd(axis[None])[2][1:]  # a cylinder is seen along its axis
     places, nodes = centres @ across.T, x @ across.T
     if np.any(places.min(axis=0) > nodes.max(axis=0)) or np.any(places.max(axis=0) < nodes.min(axis=0)):
         return found
@@ -44,7 +44,7 @@ def in_body(
 
 
 def _of_touching_body(mesh: TetMesh, elements: np.ndarray, triangles: np.ndarray) -> bool:
-    """Whether some of the elements (n,) belong to a connected piece that has some of the triangles (m, 3)."""
+    """Whether one of the elements (n,) belongs to a connected piece of the mesh with one of the triangles (m, 3)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -57,10 +57,11 @@ def _of_touching_body(mesh: TetMesh, elements: np.ndarray, triangles: np.ndarray
 def passed_in_step(
     shape: str, axis: np.ndarray, mesh: TetMesh, positions: np.ndarray, centres: np.ndarray, triangles: np.ndarray
 ) -> str:
-    """What an obstacle does in the body within a long step: "has its centre in", "went through", or "".
+    """Describe how an obstacle passes the body within a long step: "has its centre in", "went through", or "".
 
-    It went through if a place on its path is in the body at the beginning and also at the end of the step. Without a
-    passage this is not so: a body recovers behind an obstacle that leaves it, and moves away before one that pushes it.
+    The obstacle went through if a position on its path is in the body both at the beginning and at the end of the step.
+    Without a passage there is no such position: the body recovers behind an obstacle that leaves it, and moves away in
+    front of an obstacle that pushes it.
 
     Args:
         positions: (2, V, 3) [m] at the beginning and at the end of the step.

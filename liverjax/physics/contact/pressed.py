@@ -1,12 +1,13 @@
 """A rigid obstacle that a given force presses into the body, for example an indenter with a weight on it.
 
-The obstacle moves only along the line of its force. Its travel t follows from the balance of forces along this line,
+The obstacle moves only along the line of its force. Its displacement t along this line follows from the balance of
+forces,
 
     dE/dt(x, t) = F,
 
-where E is the energy of the contact at positions x. The elimination of t adds -h h^T / E_tt to the stiffness of the
-contact, with h = d2E/dx dt. This dense matrix of rank one is not stored: products apply it, and a factorisation is
-corrected for it.
+with the size F of the force and the energy E of the contact at positions x. The elimination of t adds -h h^T / E_tt to
+the stiffness of the contact, with h = d2E/dx dt and E_tt = d2E/dt2. This dense matrix of rank one is not stored.
+Matrix-vector products add its effect, and a factorisation is corrected for it.
 """
 
 from collections.abc import Callable, Mapping
@@ -37,13 +38,13 @@ from liverjax.physics.contact.obstacle import (
 )
 from liverjax.solvers.attached import GivesWay
 
-#: Maximum number of steps of the search for the position of the obstacle.
+#: Maximum number of steps in the search for the position of the obstacle.
 _MOST_STEPS = 200
 
 
 @struct
 class PressedObstacle(Obstacle):
-    """An obstacle under a force."""
+    """An obstacle that a given force presses into the body."""
 
     force: Numbers = param("N", "force that presses it (3,), reached at the last step", default=(0.0, 0.0, 0.0))
 
@@ -57,29 +58,31 @@ class PressedObstacle(Obstacle):
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse what `Obstacle` refuses, a missing force, a prescribed motion, and a history without factors >= 0."""
+        """Raise InputError as `Obstacle` does, and for a missing force, a prescribed motion or negative factors."""
         super().check(mesh, name)
         history.check_times(self.times, self.history, name, (1,))
         if self.history is not None and np.any(np.asarray(self.history) < 0):
             least = float(np.min(np.asarray(self.history)))
-            raise InputError(f"{name} history has the factor {least:g}: a force presses, give factors of 0 or above")
+            raise InputError(
+                f"{name} history has the factor {least:g}: the force can only press, so give factors of 0 or above"
+            )
         if self.by is not None:
-            raise InputError(f"{name} has a force and a motion by: leave one of them out")
+            raise InputError(f"{name} has both force and by: remove one of them")
         force = np.asarray(self.force, float)
         if force.shape != (3,) or not np.all(np.isfinite(force)) or not np.any(force):
             raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give them")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Refuse what `Obstacle` refuses, and a force that moves the obstacle past the body."""
+        """Raise InputError as `Obstacle` does, and for a force that moves the obstacle past the body."""
         super().check_place(mesh, name)
         if not self._meets(mesh, contact_points):
             if self._meets(mesh, near_points):
                 raise InputError(
                     f"{name} passes between the points at which contact is tested: the triangles are too large for "
-                    "its radius; refine the mesh there"
+                    "its radius, so refine the mesh there"
                 )
             force = np.asarray(self.force, float).tolist()
-            raise InputError(f"{name} force = {force} presses it past the body: turn it or move position")
+            raise InputError(f"{name} force = {force} presses the obstacle past the body: change force or position")
 
     def _meets(self, mesh: TetMesh, points: Callable[..., jax.Array]) -> bool:
         """Whether the obstacle reaches these points of the surface when it moves along its force."""
@@ -97,7 +100,7 @@ class PressedObstacle(Obstacle):
         return False
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """No nodes are held, since the obstacle can move."""
+        """Return no nodes: the obstacle can move, so it does not constrain the body."""
         return np.zeros(0, int), np.zeros((0, 3))
 
     def at_beginning(self) -> "PressedObstacle":
@@ -110,27 +113,27 @@ class PressedObstacle(Obstacle):
         return force / jnp.linalg.norm(force)
 
     def load(self, k: Number, steps: int, dt: Number) -> jax.Array:
-        """Size () [N] of the force at the end of step k; step 0 is the beginning of the run."""
+        """Magnitude () [N] of the force at the end of step k; step 0 is the beginning of the run."""
         whole = jnp.linalg.norm(jnp.asarray(self.force, float))
         factor = k / steps if self.history is None else history.value_at(1.0, k * dt, self.times, self.history)
         # `maximum` would have half the derivative at a factor of 0.
         return jnp.where(factor >= 0, whole * factor, 0.0)
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
-        """Zero: no motion is prescribed."""
+        """Return zero, since no motion is prescribed."""
         return jnp.zeros(3)
 
     def begin(self, start: Start) -> jax.Array:
-        """The travel () [m] at the beginning of a run: 0."""
+        """Displacement () [m] along the force at the beginning of a run: 0."""
         return jnp.zeros((), start.x.dtype)
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """True: the force may act from time 0 on."""
+        """Return True, since the force may act from time 0 on."""
         return True
 
     def freeze(self, memory: Any, step: Step) -> "Pressing":
-        """The force at the beginning and at the end of the step, and the travel at the beginning."""
+        """Force term with the force at both ends of the step, and the obstacle's displacement at the beginning."""
         dt, dtype = 0.0 if step.dt is None else step.dt, step.x.dtype
         load = jnp.stack([jnp.asarray(self.load(n, step.steps, dt), dtype) for n in (step.k - 1, step.k)])
         return Pressing(
@@ -146,30 +149,32 @@ class PressedObstacle(Obstacle):
         )
 
     def advance(self, memory: jax.Array, acting: "Pressing", end: End) -> jax.Array:
-        """The travel () [m] at the end of the step."""
+        """Displacement () [m] along the force at the end of the step."""
         return acting.travel(acting.points(end.x), 1.0)
 
 
 @jax.jit
 def _gap_after(obstacle: PressedObstacle, at: jax.Array, travel: Number) -> jax.Array:
-    """Minimum distance () [m] between the obstacle and points (3, Q, m), after a travel [m] along the force."""
+    """Minimum distance () [m] between points (3, Q, m) and the obstacle, which is displaced by `travel` [m]."""
     return jnp.min(distances(obstacle, at, jnp.asarray(travel * obstacle.direction())).value)
 
 
 @struct
 class Pressing(Touching):
-    """The obstacle during a step."""
+    """Force term of a pressed obstacle, for one step."""
 
-    load: Any = param("N", "size of the force at the beginning and at the end (2,)", default=None)
+    load: Any = param("N", "magnitude of the force at the beginning and at the end (2,)", default=None)
     direction: Any = param("1", "direction of the force (3,)", default=None)
-    before: Any = param("m", "travel at the beginning ()", default=None)
+    before: Any = param("m", "displacement along the force at the beginning ()", default=None)
     nodes: jax.Array | None = param("1", "nodes of the triangles (n, m)", default=None)
-    functions: jax.Array | None = param("1", "functions of a triangle's nodes at its points (n, Q)", default=None)
+    functions: jax.Array | None = param(
+        "1", "shape functions of a triangle's nodes at its contact points (n, Q)", default=None
+    )
     hardness: Any = param("N/m", "stiffness times area of every point (Q, m)", default=None)
     near: Any = param("m", "distance that counts as touching (m,)", default=None)
 
     def points(self, x: jax.Array) -> jax.Array:
-        """Points of contact (3, Q, m) at positions x (V, 3)."""
+        """Contact points (3, Q, m) [m] at nodal positions x (V, 3)."""
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
 
     def place(self, x: jax.Array, s: Number) -> jax.Array:
@@ -177,17 +182,17 @@ class Pressing(Touching):
         return self.travel(self.points(x), s) * self.direction
 
     def travel(self, at: jax.Array, s: Number) -> jax.Array:
-        """Travel () [m] at which the contact balances the force; NaN if no such travel is found."""
+        """Displacement () [m] along the force at which the contact balances the force; NaN if none is found."""
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))
-        # Newton steps from the solution change only its derivatives: one step gives the first, two give the second.
+        # Newton steps from the solution change only its derivatives. One step gives the first, two give the second.
         for _ in range(2):
             held, slope, _ = self._resistance(at, found)
             found = found + (load - held) / jnp.where(slope > 0, slope, 1.0)
         return found
 
     def _resistance(self, at: jax.Array, travel: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """dE/dt [N] and its derivative [N/m] at a travel, and the minimum distance [m]."""
+        """Force dE/dt [N], its derivative [N/m] with respect to the displacement, and the minimum distance [m]."""
         d = distances(self.obstacle, at, travel * self.direction)
         depth, inside = depths(d, self.near), (d.value <= self.near[None]).astype(at.dtype)
         along = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
@@ -196,17 +201,17 @@ class Pressing(Touching):
         return -jnp.sum(self.hardness * depth * along), jnp.sum(slope), jnp.min(d.value)
 
     def _found(self, at: jax.Array, load: jax.Array) -> jax.Array:
-        """The travel, by Newton's method with steps of at most twice the depth.
+        """Find the displacement by Newton's method, with steps of at most twice the depth.
 
-        The contact force grows with the travel.
+        The contact force grows with the displacement.
         """
         own = jax.lax.stop_gradient(self)
         first = own._resistance(at, own.before)[0]
-        # Positions are rounded, too: the balance cannot be more accurate than hardness times this roundoff.
+        # Positions have roundoff, so the balance cannot be more accurate than hardness times this roundoff.
         size = jnp.max(jnp.abs(at)) + jnp.max(jnp.abs(jnp.asarray(own.obstacle.position, at.dtype)))
         rounded = size * jnp.max(own.hardness)
         enough = float(jnp.finfo(at.dtype).eps) * (16 * jnp.maximum(load, first) + rounded)
-        # Minimum depth that can balance the force: if all points had this depth.
+        # Lower bound of the depth: the depth that would balance the force if all points had the same depth.
         least = load / jnp.sum(own.hardness)
 
         def unfinished(c: tuple) -> jax.Array:
@@ -227,16 +232,16 @@ class Pressing(Touching):
         return jnp.where(abs(held - load) <= 1e3 * enough, travel, jnp.nan)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy of the contact minus the work of the force."""
+        """Energy [J] of the contact minus the work of the force."""
         at = self.points(x)
         travel = self.travel(at, 1.0)
         depth = jnp.minimum(distances(self.obstacle, at, travel * self.direction).value, 0.0)
         return 0.5 * jnp.sum(self.hardness * depth**2) - self.load[1] * travel
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay:
-        """The loss of stiffness that the obstacle's travel causes.
+        """Loss of stiffness because the obstacle can move.
 
-        With `definite` the change of the normals is left out, as in `definite` of the contact.
+        If `definite` is true, the change of the normals is left out, as in the method `definite` of the contact.
         """
         at = self.points(x)
         d = distances(self.obstacle, at, self.travel(at, s) * self.direction)

@@ -1,8 +1,8 @@
-"""Rigid shapes: signed distance of points, its gradient (the normal) and its second derivative.
+"""Rigid shapes: signed distance of points, the gradient of the distance (the normal) and its second derivative.
 
-A point is given relative to the position of the shape: a point of the plane, the centre of a sphere, a point on the
-axis of a cylinder, the tip of a cone. Distances are positive outside. Functions take columns x, y, z of any array
-shape.
+Points are given relative to the position of the shape. This position is a point of the plane, the centre of a sphere, a
+point on the axis of a cylinder, or the tip of a cone. Distances are positive outside the shape. The coordinates x, y, z
+of the points are separate arrays of any shape.
 """
 
 from typing import Any, NamedTuple
@@ -22,22 +22,22 @@ SHAPES: dict[str, tuple[str, ...]] = {
 
 
 class Distance(NamedTuple):
-    """Signed distance of points, with its first and second derivative."""
+    """Signed distance of points, with the first and second derivative of the distance."""
 
     value: jax.Array  # (…) [m]
-    normal: list[jax.Array]  # 3 components (…): gradient, of length 1
+    normal: list[jax.Array]  # 3 components (…): gradient, a unit vector
     bent: list[list[jax.Array]]  # 3 x 3 components (…) [1/m]: second derivative
 
 
 def distance(shape: str, y: list[jax.Array], axis: Any, radius: Number, half_angle: Number) -> Distance:
-    """Signed distance of points y (3 columns of any shape) [m] from the shape.
+    """Signed distance of points y (3 arrays of any shape) [m] from the shape.
 
     Args:
         shape: one of `SHAPES`.
-        y: columns of the points, relative to the position of the shape.
-        axis: unit vector (3,): the plane's normal to the free side, the cylinder's axis, the cone's axis inwards.
-        radius: radius [m] of sphere and cylinder, or of a cone's rounded tip. The lowest point of the rounded tip is at
-            the cone's position.
+        y: coordinates of the points, relative to the position of the shape.
+        axis: unit vector (3,): the outward normal of a plane, the axis of a cylinder, or the inward axis of a cone.
+        radius: radius [m] of a sphere, a cylinder, or the rounded tip of a cone. The lowest point of the rounded tip is
+            at the position of the cone.
         half_angle: angle [rad] between the cone's axis and its side.
     """
     if shape == "plane":
@@ -52,17 +52,17 @@ def distance(shape: str, y: list[jax.Array], axis: Any, radius: Number, half_ang
 
 
 def _normal_to(y: list[jax.Array], axis: Array) -> list[jax.Array]:
-    """The part of y normal to the axis."""
+    """Part of y perpendicular to the axis."""
     along = sum(a * c for a, c in zip(axis, y, strict=True))
     return [c - along * a for a, c in zip(axis, y, strict=True)]
 
 
 def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Distance:
-    """Distance of the points y from a sphere with its centre at 0, or from a cylinder whose axis passes through 0.
+    """Distance of the points y from a sphere centred at 0, or from a cylinder with an axis through 0.
 
     For a cylinder, y has no component along the axis.
     """
-    # At the centre no direction is defined: any direction is taken, without a division by 0.
+    # At the centre the normal is not defined; this bound avoids a division by 0.
     r = jnp.sqrt(jnp.maximum(sum(c * c for c in y), 1e-30))
     n = [c / r for c in y]
     held = [[0.0] * 3 for _ in range(3)] if axis is None else [[a * b for b in axis] for a in axis]
@@ -71,9 +71,9 @@ def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Dis
 
 
 def _cone(y: list[jax.Array], axis: jax.Array, radius: Number, half_angle: Number) -> Distance:
-    """Distance from a cone: from its side or its tip.
+    """Distance of the points y from the side or the tip of a cone.
 
-    For a round tip it is the distance from a sharp cone further inside, minus the radius.
+    For a rounded tip, this is the distance from a sharp cone further inside, minus the radius.
     """
     c, s = jnp.cos(half_angle), jnp.sin(half_angle)
     y = [v - radius * a for v, a in zip(y, axis, strict=True)]

@@ -1,10 +1,11 @@
 """Volume changes averaged at the nodes, against the volumetric locking of linear tetrahedra (Bonet and Burton 1998).
 
-The volumetric energy is the sum of V_a U(J_a) over the nodes. J_a is the mean J of the elements around node a, weighted
-by their volumes. V_a is a quarter of the sum of these volumes. There are about five times fewer nodes than elements. So
-there are five times fewer constraints if the bulk modulus is large. The pressure of a node is p_a = U'(J_a), and the
-pressure of an element is the mean over its nodes. The stiffness is the stiffness at given pressures plus G^T D^-1 G,
-with G the derivative of the nodal volumes and D = V_a/U''. This is the system of a porous step in which nothing flows.
+The volumetric energy is the sum of V_a U(J_a) over the nodes, with the volumetric energy density U of the law. J_a is
+the mean volume ratio J of the elements around node a, weighted by their volumes. V_a is a quarter of the sum of these
+volumes. A mesh has about five times fewer nodes than elements. So there are five times fewer constraints if the bulk
+modulus is large. The pressure of a node is p_a = U'(J_a), and the pressure of an element is the mean over its nodes.
+The stiffness is the stiffness at given pressures plus G^T D^-1 G, with the derivative G of the nodal volumes and D =
+V_a/U''. The step of a porous body without flow has the same system.
 
 If elements have different volumetric energies, a node has the mean of these energies, weighted by volume.
 """
@@ -36,7 +37,7 @@ def _invariants(law: Law, J: jax.Array) -> Any:
 
 
 def nodal_energy(mesh: TetMesh, law: Law) -> Law:
-    """The volumetric energy of the nodes. It has one bulk modulus per node (V,) if the moduli of elements differ."""
+    """Volumetric energy of the nodes, with one bulk modulus per node (V,) if the moduli of the elements differ."""
     U = volumetric_part(law)
     if len(U.pieces()) == 1 and all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(U)):
         return U
@@ -61,13 +62,13 @@ def energy(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
 
 
 def averaged_pressure(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
-    """U' (V,) [Pa] of the nodes, positive in tension."""
+    """Pressures U' (V,) [Pa] of the nodes, positive in tension."""
     U = volumetric_part(law)
     return U.energy_derivatives(_invariants(U, _mean(mesh, J)[0]))[0]["J"]
 
 
 def compliance(mesh: TetMesh, law: Law, J: jax.Array, positive: bool) -> BlockMatrix:
-    """D = V_a/U'' [m^3/Pa] as the matrix of the pressures; `positive`: its absolute value."""
+    """Pressure matrix D = V_a/U'' [m^3/Pa], or its absolute value if `positive` is true."""
     U = volumetric_part(law)
     mean, volumes = _mean(mesh, J)
     slope = U.energy_derivatives(_invariants(U, mean))[1]["J", "J"]
@@ -83,33 +84,33 @@ class AveragedVolume(Physics):
     law: Law = param("1", "law whose volumetric part is used")
 
     def freeze(self, memory: None, step: Step) -> "Averaged":
-        """The volumetric energy of the nodes, ready to act during a step."""
+        """Force term with the volumetric energy of the nodes, for one step."""
         return Averaged(law=nodal_energy(step.mesh, self.law))
 
 
 @struct
 class Averaged(VolumeStress):
-    """Averaged volumes during a step."""
+    """Force term of volume changes averaged at the nodes, for one step."""
 
     law: Law = param("1", "volumetric energy of the nodes")
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: Guess | None = None) -> jax.Array:
-        """See `pressure` of this module."""
+        """Pressures (V,) [Pa] of the nodes, computed by `averaged_pressure`."""
         return averaged_pressure(mesh, self.law, J)
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
-        """p cof F, with p linear in every element."""
+        """First Piola-Kirchhoff stress p cof F [Pa], with the pressure p linear in every element."""
         return scale_matrix(interpolated(mesh, pressure), cofactor(F))
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """The pressure of an element. Its slope is 0, since the pressures of the nodes are given."""
+        """Pressure of an element, with the derivative 0, since the pressures of the nodes are given."""
         p = interpolated(mesh, pressure)
         return Scalars({"J": p}, {("J", "J"): jnp.zeros_like(p)})
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """See `energy` of this module."""
+        """Volumetric energy [J] of the nodes, computed by the function `energy` of this module."""
         return energy(mesh, self.law, J)
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """See `compliance`."""
+        """Pressure matrix [m^3/Pa], computed by `compliance`."""
         return compliance(mesh, self.law, J, positive)

@@ -1,19 +1,20 @@
 """Pressures as unknowns, against volumetric locking: Taylor-Hood (P2/P1) for quadratic elements, P1/P1 for linear ones.
 
-With U(J) = K g(J)^2 / 2 the energy per volume is
+The volumetric energy is U(J) = K g(J)^2 / 2, with the bulk modulus K and the volumetric strain g of the volume ratio J.
+With pressures p the energy per volume is
 
     W_isochoric + gamma g^2 / 2 + p g - p^2 / (2 (K - gamma)),
 
-with p linear in every element and continuous. The optimal p gives U with g averaged by the functions of p. So volume
-changes are limited only on average, not at every point. The displacements keep the part gamma of the bulk modulus, so
-that their matrix is positive. It is gamma = min(mu, K/2), and a quarter of this in linear elements. When the mesh is
-refined, the solution no longer depends on gamma. Pressures are unknowns together with the positions: if they were
-eliminated, Newton's method would not converge for large K.
+with p linear in every element and continuous. If p is optimal, this energy is U with g averaged by the shape functions
+of p. So volume changes are limited only on average, not at every point. The part gamma of the bulk modulus stays in the
+displacement terms, so that their matrix is positive. It is gamma = min(mu, K/2), with the shear modulus mu, and a
+quarter of this in linear elements. When the mesh is refined, the solution no longer depends on gamma. Pressures are
+unknowns together with the positions. If they were eliminated, Newton's method would not converge for large K.
 
-Linear positions do not determine linear pressures: some pressures that alternate from node to node have no effect, and
-they would grow without bound for large K. So linear elements have a stabilisation term, - (p - mean of p)^2 / (2 mu),
-with the mean over the element (Bochev, Dohrmann and Gunzburger 2006). It decreases with the square of the element's
-size.
+In linear elements, the positions do not determine all pressures: some pressures that alternate from node to node cause
+no force. For large K they would grow without bound. So linear elements have a stabilisation term, - (p - mean of p)^2 /
+(2 mu), with the mean over the element (Bochev, Dohrmann and Gunzburger 2006). This term decreases with the square of
+the element size.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,7 +38,7 @@ from liverjax.tensors.places import given, taken
 
 
 def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = 'mixed'") -> None:
-    """Refuse the laws of a body if its pressure cannot be an unknown.
+    """Check that the laws of a body allow pressures as unknowns.
 
     Raises:
         InputError: a law without an isochoric part or bulk, or volumetric energies of several kinds.
@@ -46,7 +47,7 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
     for law in several:
         U = volumetric_part(law)
         if isochoric_part(law) is None or U is None:
-            raise InputError(f"{name} needs a law with an isochoric part and bulk, which {type(law).__name__} has not")
+            raise InputError(f"{name} needs a law with an isochoric part and bulk: {type(law).__name__} has none")
         parts = [part for own in U.pieces() for part in own.summands() if isinstance(part, Volumetric)]
         kinds |= {(part.volumetric, part.below) for part in parts}
     if len(kinds) != 1 or next(iter(kinds))[1] is not None:
@@ -54,14 +55,13 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
 
 
 def strain(kind: str, J: jax.Array) -> jax.Array:
-    """g(J) of U = K g^2 / 2, close to J - 1: J - 1 for "quadratic", ln J for "log", a similar function for "simo"."""
+    """Volumetric strain g(J) of U = K g^2 / 2: J - 1 for "quadratic", ln J for "log", a similar function for "simo"."""
     if kind == "log":
         return jnp.log(J)
     d = J - 1
     if kind == "quadratic":
         return d
-    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-1)^n d^(n-2) / n, n = 3 …). The closed form has cancellation near
-    # 1.
+    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-1)^n d^(n-2) / n, n = 3 …). The closed form cancels near J = 1.
     near = jnp.clip(d, -0.1, 0.1)
     series = 1 + sum((-1) ** n * near ** (n - 2) / n for n in range(3, 18))
     safe = jnp.where(jnp.abs(d) < 0.1, 1.0, d)
@@ -69,11 +69,11 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
     return d * jnp.sqrt(jnp.where(jnp.abs(d) < 0.1, series, whole))
 
 
-#: Order -> gamma over min(mu, K/2). In linear elements gamma causes locking, so a smaller gamma is more accurate.
+#: gamma / min(mu, K/2) for each element order. In linear elements gamma causes locking, so smaller is more accurate.
 _PART = {1: 0.25, 2: 1.0, 3: 1.0}
 
 
-#: Newton's method reaches residuals of this multiple of the precision.
+#: Newton's method reaches relative residuals of this many times the machine precision.
 _REACHED = 4096
 
 
@@ -84,11 +84,11 @@ class MixedVolume(Physics):
     law: Law = param("1", "law whose volumetric part is used")
 
     def begin(self, start: Start) -> jax.Array:
-        """Zero pressures (V,)."""
+        """Pressures (V,) at the beginning of a run: zeros."""
         return jnp.zeros(start.mesh.number_of_vertices, start.x.dtype)
 
     def freeze(self, memory: jax.Array, step: Step) -> "Mixed":
-        """The moduli, and the pressure at the beginning of the step."""
+        """Force term with the moduli, and with the pressures at the beginning of the step."""
         U = volumetric_part(self.law)
         mu, bulk = self.law.shear_modulus(), self.law.bulk_modulus()
         part = _PART[step.mesh.order] * jnp.minimum(mu, bulk / 2)
@@ -103,31 +103,31 @@ class MixedVolume(Physics):
         return Mixed(part=part, rest=bulk - part, shear=mu, before=memory, **own)
 
     def advance(self, memory: jax.Array, acting: "Mixed", end: End) -> jax.Array:
-        """The pressure at the end of the step."""
+        """Pressures (V,) [Pa] at the end of the step."""
         return end.pressure
 
 
 @struct
 class Mixed(VolumeStress):
-    """Pressures as unknowns during a step."""
+    """Force term with pressures as unknowns, for one step."""
 
-    part: Number = param("Pa", "gamma, the part of K that the displacements keep")
-    rest: Number = param("Pa", "K - gamma, the part of K that the pressures carry")
+    part: Number = param("Pa", "gamma, part of K in the displacement terms")
+    rest: Number = param("Pa", "K - gamma, part of K in the pressure terms")
     shear: Number = param("Pa", "shear modulus")
     before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
-    unit: jax.Array = param("N/m^3", "pressure of an unknown of 1 m, so that all residuals are forces")
+    unit: jax.Array = param("N/m^3", "pressure of an unknown with the value 1 m; with it all residuals are forces")
     counted: jax.Array = param(
         "1",
         "mu/K, the part of all forces that sets the tolerance. The isochoric forces count in full. In a confined body "
         "the pressures cause nearly all forces, but small volume changes determine the pressures",
     )
-    kind: str = static(about="of the volumetric energy")
+    kind: str = static(about="kind of the volumetric energy")
 
     coupled: ClassVar[bool] = False
     unknown: ClassVar[bool] = True
 
     def _slopes(self, J: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """g and its first two derivatives with respect to J."""
+        """Volumetric strain g and its first two derivatives with respect to J."""
 
         def first(J: jax.Array) -> tuple[jax.Array, jax.Array]:
             return jax.jvp(lambda J: strain(self.kind, J), (J,), (jnp.ones_like(J),))
@@ -136,33 +136,33 @@ class Mixed(VolumeStress):
         return g, g1, g2
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
-        """(gamma g + p) g' cof F."""
+        """First Piola-Kirchhoff stress (gamma g + p) g' cof F [Pa]."""
         g, g1, _ = self._slopes(determinant(F))
         return scale_matrix((self.part * g + interpolated(mesh, pressure)) * g1, cofactor(F))
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Energy [J] with the optimal pressures for volume ratios J: gamma g^2/2 + p g/2."""
+        """Energy [J] with the optimal pressures for volume ratios J: the integral of gamma g^2/2 + p g/2."""
         g = strain(self.kind, J)
         return jnp.sum(mesh.weights * (0.5 * self.part * g * g)) + 0.5 * jnp.vdot(
             self.settled(mesh, J), integrals(mesh, g)
         )
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """Stress and slope at given pressures."""
+        """First and second derivative of the energy density with respect to J, at given pressures (V,) [Pa]."""
         g, g1, g2 = self._slopes(determinant(F))
         whole = self.part * g + interpolated(mesh, pressure)
         return Scalars({"J": whole * g1}, {("J", "J"): self.part * g1 * g1 + whole * g2})
 
     def border(self, J: jax.Array) -> jax.Array:
-        """g', the derivative of g with respect to J."""
+        """Derivative g' of the volumetric strain g with respect to J."""
         return self._slopes(J)[1]
 
     def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
-        """Integrals (V,) [m^3] of the functions of p times g - p/(K - gamma): 0 at a solution."""
+        """Integrals (V,) [m^3] of the shape functions of p times g - p/(K - gamma); 0 at a solution."""
         return integrals(mesh, strain(self.kind, J)) - self.compliance(mesh, pressure)
 
     def compliance(self, mesh: TetMesh, pressure: jax.Array) -> jax.Array:
-        """Integrals (V,) [m^3] of the functions of p times p/(K - gamma).
+        """Integrals (V,) [m^3] of the shape functions of p times p/(K - gamma).
 
         In linear elements the stabilisation term is added.
         """
@@ -174,7 +174,7 @@ class Mixed(VolumeStress):
         return given(jnp.zeros_like(pressure), mesh.tetrahedra.T, jnp.stack(shares))
 
     def diagonal(self, mesh: TetMesh) -> jax.Array:
-        """Diagonal (V,) [m^3/Pa] of `compliance`."""
+        """Diagonal (V,) [m^3/Pa] of the matrix of `compliance`."""
         none = jnp.zeros_like(self.before)
         if mesh.order == 1:
             share = jnp.stack(4 * [mesh.volumes * (2 / self.rest + 0.75 / self.shear) / 20])
@@ -183,7 +183,7 @@ class Mixed(VolumeStress):
         return given(none, mesh.tetrahedra.T, share)
 
     def settled(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Pressures (V,) [Pa] that balance volume ratios J, as at a solution."""
+        """Pressures (V,) [Pa] at which `balance` is 0 for volume ratios J."""
         none, diagonal = jnp.zeros_like(self.before), self.diagonal(mesh)
 
         def solve(apply: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
@@ -195,7 +195,7 @@ class Mixed(VolumeStress):
         return jax.lax.custom_linear_solve(own, self.balance(mesh, none, J), solve, symmetric=True)
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """`compliance` as a matrix."""
+        """Pressure matrix [m^3/Pa]: `compliance` is its product with the pressures."""
 
         def block(a: int, b: int) -> jax.Array:
             same = float(a == b)
@@ -210,6 +210,6 @@ class Mixed(VolumeStress):
         return BlockMatrix(rows, ((given(zero, mesh.tetrahedra.T, own),),), mesh.pattern.row_nodes)
 
     def schur(self, mesh: TetMesh) -> jax.Array:
-        """Lumped approximation (V,) [m^3/Pa] of the matrix of the pressures after the displacements are eliminated."""
+        """Lumped approximation (V,) [m^3/Pa] of the pressure matrix after the displacements are eliminated."""
         soft = 1 / (1.5 * self.shear + self.part) + 1 / self.rest
         return integrals(mesh, jnp.broadcast_to(soft, mesh.weights.shape))

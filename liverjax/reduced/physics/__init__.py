@@ -1,1 +1,1 @@
-"""Physics of reduced models in addition to the solid: fluid and supports."""
+"""Fluid and supports of reduced models, in addition to the solid."""

@@ -1,15 +1,18 @@
-"""The fluid of a porous reduced model: pressures as sums of a few modes, and Darcy's law for their coordinates.
+"""The fluid of a porous reduced model: the pressure is a sum of a few modes, and Darcy's law gives their coordinates.
 
-The pressure is P = sum_k p_k psi_k. The discrete equation of the full model (`liverjax.physics.porosity`) is projected
-on the same modes. Its integrals are sums over the weighted points of the model:
+The pressure is P = sum_k p_k psi_k, with modes psi_k and coordinates p_k. The discrete equation of the full model
+(`liverjax.physics.porosity`) is projected onto the same modes. Its integrals are sums over the weighted points of the
+reduced model:
 
     A p = S p_before - c,    A = S + dt D,    c_k = sum_p w_p psi_k (J - J_before),
     S_kl = sum_p w_p J_before / K_lim sum_a N_a psi_ka psi_la,
     D_kl = sum_p w_p kappa / J_before (cof F_before grad psi_k) . (cof F_before grad psi_l),
 
-with the shape functions N_a of the vertices a. Storage is lumped at the vertices, as in the full model. Since A is
-positive, p is eliminated, and the remaining equations of motion have an energy. With all modes and all points these are
-the full equations.
+with the time step dt, the weight w_p of a point, the volume ratio J and the deformation gradient F at the end of the
+step. Values with `before` belong to the beginning of the step. K_lim is the bulk modulus of the storage, kappa the
+permeability, and N_a the shape function of vertex a. Storage is lumped at the vertices, as in the full model. Since A
+is positive definite, p is eliminated, and the remaining equations of motion have an energy. With all modes and all
+points, these are the full equations.
 """
 
 from typing import NamedTuple
@@ -37,35 +40,36 @@ class ReducedFluid(NamedTuple):
 
     pressure: jax.Array  # coordinates p (m,) [Pa]
     F: jax.Array  # deformation gradients (9, S)
-    J_before: jax.Array | None  # volume ratios one step earlier (S,); only for the lagged scheme
+    J_before: jax.Array | None  # volume ratios one step earlier (S,), only for the lagged scheme
 
 
 class Lumped(NamedTuple):
-    """The points store their fluid at the vertices of their elements."""
+    """Data for lumped storage: the fluid volume of each point is assigned to the vertices of the point's element."""
 
     vertices: jax.Array  # vertices of each point's element (4, S)
     parts: jax.Array  # fraction of a point's volume at each vertex (4, S) [1]
 
 
 class ReducedSponge(NamedTuple):
-    """Data of the sponge that are the same in all steps."""
+    """Data of the porous body that are the same in all steps."""
 
-    porosity: Porosity  # numbers at the points
-    lumped: Lumped | None  # None: more vertices than four per point, so fluid is stored at the points
+    porosity: Porosity  # with parameters at the points
+    lumped: Lumped | None  # None if the mesh has more than four vertices per point; then the points store the fluid
 
 
 class Flowing(NamedTuple):
-    """The fluid during a step."""
+    """Data of the fluid that are constant during a step."""
 
-    porosity: Porosity  # numbers at the points
-    inverse: jax.Array  # of A (m, m) [Pa/m^3]
-    stored: jax.Array  # S p_before, with the volumes that are known before the step's end (m,) [m^3]
+    porosity: Porosity  # with parameters at the points
+    inverse: jax.Array  # inverse of A (m, m) [Pa/m^3]
+    stored: jax.Array  # (m,) [m^3] S p_before; the lagged scheme subtracts the change of volume in the step before
     averages: jax.Array  # modes at the points, times their weights (S, m) [m^3]
     J: jax.Array  # volume ratios at the beginning (S,)
 
 
 def reduced_sponge(model: ReducedModel, scene: Scene) -> ReducedSponge:
-    """The sponge of a run. Storage is a sum over vertices, or over points if this needs fewer terms."""
+    """Return the data of the porous body for a run. Storage is a sum over vertices, or over points if this sum has
+    fewer terms."""
     porosity, mesh = porosity_at_points(model, scene), scene.mesh
     if mesh.number_of_vertices > 4 * len(model.points):
         return ReducedSponge(porosity, None)
@@ -76,7 +80,7 @@ def reduced_sponge(model: ReducedModel, scene: Scene) -> ReducedSponge:
 
 
 def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
-    """The porosity, with parameters by element replaced by parameters at the points (S,)."""
+    """Return the porosity with parameters at the points (S,) instead of one value per element."""
     assert scene.porosity is not None
     own = porosity_of_elements(scene.porosity, scene.region, scene.mesh)
     elements = model.points % scene.mesh.number_of_elements
@@ -86,7 +90,7 @@ def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
 
 
 def fluid_at_rest(model: ReducedModel, scene: Scene) -> ReducedFluid:
-    """The fluid with the initial pressure and the reference volumes."""
+    """Return the fluid with the initial pressure and the reference volumes."""
     modes, porosity, S = model.pressures, scene.porosity, model.weights.shape[0]
     assert modes is not None and porosity is not None
     volumes = integrals(scene.mesh, jnp.ones_like(scene.mesh.weights))
@@ -97,7 +101,7 @@ def fluid_at_rest(model: ReducedModel, scene: Scene) -> ReducedFluid:
 
 
 def flowing(model: ReducedModel, sponge: ReducedSponge, memory: ReducedFluid, dt: Number) -> Flowing:
-    """The fluid of a step of dt [s]."""
+    """Return the data of the fluid for a step of length dt [s] that begins with the state `memory`."""
     assert model.pressures is not None
     porosity, lumped, J = sponge.porosity, sponge.lumped, determinant(as_matrix(memory.F))
     stores, flows = storage_and_flow(model, porosity, memory.F, dt)
@@ -109,12 +113,13 @@ def flowing(model: ReducedModel, sponge: ReducedSponge, memory: ReducedFluid, dt
 
 
 def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: Number) -> tuple[jax.Array, jax.Array]:
-    """Vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5] with products S and dt D, for a step that begins at F (9, S)."""
+    """Return vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5], for a step that begins at F (9, S). Their scalar products
+    are the matrices S and dt D."""
     modes, w = model.pressures, model.weights
     assert modes is not None
     matrix = as_matrix(F)
     volume = w * jnp.maximum(determinant(matrix), darcy.LEAST_J)
-    # grad psi = cof(F) G / J per current volume J w, as in `darcy.flow`.
+    # In the current shape, grad psi = cof(F) G / J with the reference gradient G, and the volume is J w (`darcy.flow`).
     root = jnp.sqrt(dt * porosity.permeability * w**2 / volume)
     scaled = tuple(tuple((root * entry)[None] for entry in row) for row in cofactor(matrix))
     g = matvec(scaled, tuple(jnp.moveaxis(modes.slopes, 1, 0)))
@@ -122,7 +127,7 @@ def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: 
 
 
 def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array) -> jax.Array:
-    """S (m, m) [m^3/Pa] at volume ratios J (S,), as the sum over vertices."""
+    """Return S (m, m) [m^3/Pa] at volume ratios J (S,), computed as a sum over vertices."""
     modes, lumped = model.pressures, sponge.lumped
     assert modes is not None and lumped is not None
     capacity = model.weights * jnp.maximum(J, darcy.LEAST_J) / sponge.porosity.limit_bulk
@@ -131,20 +136,25 @@ def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array
 
 
 def _squares(a: jax.Array) -> jax.Array:
-    """Scalar products (m, m) of the vectors a (m, k, S)."""
+    """Return the scalar products (m, m) of the vectors a (m, k, S)."""
     flat = a.reshape(a.shape[0], -1)
     return flat @ flat.T
 
 
 def pressure_coordinates(own: Flowing, J: jax.Array) -> jax.Array:
-    """Coordinates p (m,) [Pa] at the end of a step with volume ratios J (S,) at its end."""
+    """Return the coordinates p (m,) [Pa] of the pressure at the end of a step, for volume ratios J (S,) at the end of
+    the step."""
     if own.porosity.scheme == "lagged":
         return own.inverse @ own.stored
     return own.inverse @ (own.stored - (J - own.J) @ own.averages)
 
 
 def volume_stress(model: ReducedModel, porosity: Porosity, p: jax.Array, F: jax.Array) -> jax.Array:
-    """(sigma_Heq(J) - P) cof F (9, S) [Pa] at coordinates p (m,) [Pa] and deformation gradients F (9, S)."""
+    """Return the volumetric part (sigma_Heq(J) - P) cof F (9, S) [Pa] of the first Piola-Kirchhoff stress.
+
+    `p` (m,) [Pa]: coordinates of the pressure P; `F` (9, S): deformation gradients. sigma_Heq is the equilibrium stress
+    of the drained body.
+    """
     matrix = as_matrix(F)
     stress = _scalars(model, porosity, p, matrix).first["J"]
     return jnp.stack([stress * entry for row in cofactor(matrix) for entry in row])
@@ -158,13 +168,17 @@ def _scalars(model: ReducedModel, porosity: Porosity, p: jax.Array, F: Matrix) -
 
 
 def volume_blocks(model: ReducedModel, own: Flowing, F: Matrix, pairs: tuple[tuple[int, int], ...]) -> list[Matrix]:
-    """Derivative of `volume_stress` at given pressures: `invariant_terms.blocks` with the axes as shape vectors."""
+    """Return the derivative of `volume_stress` with respect to F at constant pressures, as blocks for `pairs` of axes.
+
+    The blocks are those of `invariant_terms.blocks`, with unit vectors in place of the gradients of shape functions.
+    """
     scalars = _scalars(model, own.porosity, pressure_coordinates(own, determinant(F)), F)
     return invariant_terms.blocks(invariant_terms.state_of(scalars, F), list(IDENTITY), pairs)
 
 
 def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.Array:
-    """The part of the tangent (n, n) [N/m] that the change of the pressures with the coordinates causes."""
+    """Return the part of the tangent (n, n) [N/m] that comes from the change of the pressures with the coordinates of
+    the motion."""
     n = model.number_of_modes
     if own.porosity.scheme == "lagged":
         return jnp.zeros((n, n), model.slopes.dtype)
@@ -174,6 +188,6 @@ def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.
 
 
 def advanced_fluid(own: Flowing, F: jax.Array) -> ReducedFluid:
-    """The fluid after a step with deformation gradients F (9, S) at its end."""
+    """Return the state of the fluid after a step with deformation gradients F (9, S) at the end of the step."""
     lagged = own.porosity.scheme == "lagged"
     return ReducedFluid(pressure_coordinates(own, determinant(as_matrix(F))), F, own.J if lagged else None)

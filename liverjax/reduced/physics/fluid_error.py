@@ -1,12 +1,13 @@
-"""The error of a porous reduced run: the response of the linear sponge and its fluid to out-of-balance forces.
+"""The error of a porous reduced run: the response of the linearised poroelastic body to the out-of-balance forces.
 
 To first order, the error e of the motion and the error p of the pressure follow linear equations at the reference
 shape,
 
-    (K + K_sponge) e - B^T p = load,    A p + B (e - e_before) = S p_before,
+    (K + K_p) e - B^T p = load,    A p + B (e - e_before) = S p_before,
 
-with the matrices of `liverjax.reduced.physics.fluid` on the whole mesh. The lagged scheme uses the change of volume of
-the previous step.
+with the stiffness and inertia K of the solid and the volumetric stiffness K_p of the drained body. B gives the change
+of volume at the vertices. A and S are the matrices of `liverjax.reduced.physics.fluid`, here on the full mesh. The
+lagged scheme uses the change of volume of the previous step.
 """
 
 from collections.abc import Callable
@@ -27,18 +28,18 @@ if TYPE_CHECKING:
 
 
 class LinearFluid(NamedTuple):
-    """Sparse matrices of the linear sponge, for f free degrees of freedom and v unknown pressures."""
+    """Sparse matrices of the linearised porous body, for f free degrees of freedom and v unknown pressures."""
 
-    stiffness: "scipy.sparse.csr_array"  # of the drained sponge (f, f) [N/m]
+    stiffness: "scipy.sparse.csr_array"  # K_p, volumetric stiffness of the drained body (f, f) [N/m]
     volumes: "scipy.sparse.csr_array"  # B, change of the volume at the vertices (v, f) [m^2]
     storage: "scipy.sparse.csr_array"  # S, diagonal (v, v) [m^3/Pa]
     flow: "scipy.sparse.csr_array"  # dt D (v, v) [m^3/Pa]
-    unknown: np.ndarray  # numbers of the vertices (v,)
+    unknown: np.ndarray  # numbers of the vertices with an unknown pressure (v,)
     lagged: bool
 
 
 class ErrorBefore(NamedTuple):
-    """Errors at the end of the last step, and of the step before it."""
+    """Errors at the end of the last step, and at the end of the step before."""
 
     motion: np.ndarray  # (f,) [m]
     motion_before: np.ndarray  # one step earlier (f,) [m]
@@ -46,7 +47,8 @@ class ErrorBefore(NamedTuple):
 
 
 def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
-    """The linear sponge at the reference shape, for a scene with parameters by element."""
+    """Return the matrices of the poroelastic equations, linearised at the reference shape. Parameters of the scene must
+    be numbers or have one value per element."""
     import scipy.sparse
 
     mesh, porosity, dt = scene.mesh, scene.porosity, scene.solve.dt
@@ -75,7 +77,8 @@ def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
 
 
 def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list]":
-    """Sparse matrices for the points: values of a vertex field, slopes of a nodal field, slopes of a vertex field."""
+    """Return sparse matrices that give at the integration points: the values of a vertex field, the derivatives of a
+    nodal field, and the derivatives of a vertex field."""
     import scipy.sparse
 
     E, D = mesh.number_of_elements, np.asarray(mesh.shape_vectors)
@@ -85,7 +88,7 @@ def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list
     rows = np.arange(Q * E).reshape(Q, E)
 
     def matrix(entries: np.ndarray, count: int) -> "scipy.sparse.csr_array":
-        """The matrix from entries (n, Q, E) of the n nodes of every element."""
+        """Return the matrix from entries (n, Q, E) for the n nodes of every element."""
         nodes = np.broadcast_to(mesh.element_nodes_on_host[: len(entries), None], entries.shape)
         at = (np.broadcast_to(rows, entries.shape).ravel(), nodes.ravel())
         return scipy.sparse.csr_matrix((entries.ravel(), at), shape=(Q * E, count))
@@ -99,10 +102,11 @@ def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list
 def coupled_solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """A function (load (f,) [N], earlier errors) -> errors (f,) [m] and (v,) [Pa] at the end of the step.
+    """Return a function for one step: (load (f,) [N], earlier errors) -> errors of motion (f,) [m] and pressure (v,)
+    [Pa] at the end of the step.
 
     Args:
-        K: stiffness and inertia without the sponge (f, f) [N/m].
+        K: stiffness and inertia without the porous body (f, f) [N/m].
         fluid: `LinearFluid`.
     """
     import scipy.sparse

@@ -1,7 +1,7 @@
-"""Supports in reduced models: springs between the body and a wall, and nodes that slide along an axis.
+"""Supports in reduced models: springs between the body and a wall, and nodes that slide in a plane normal to an axis.
 
-Springs are linear in the motion, so their forces on the modes are exactly a matrix (n, n) times the coordinates. Modes
-come from motions in which nodes slide, so the modes also keep these nodes in their planes.
+Springs are linear in the motion, so their forces on the modes are exactly a matrix (n, n) times the coordinates. The
+modes come from motions with sliding nodes, so all modes keep these nodes in their planes.
 """
 
 from typing import TYPE_CHECKING
@@ -21,26 +21,27 @@ if TYPE_CHECKING:
 
 
 def refuse_other_physics(scene: Scene) -> None:
-    """Refuse named physics other than these supports.
+    """Raise InputError if the scene has physics objects other than these supports.
 
     Raises:
-        InputError: membranes, ligaments, vessels, obstacles, springs with a history, sliding nodes in oblique planes.
+        InputError: the scene has membranes, ligaments, vessels, obstacles, springs with a history, or sliding nodes in
+            oblique planes.
     """
     for own in scene.physics:
         if isinstance(own, SlidingSupport):
             if not own.axis:
                 raise InputError(
-                    "in a reduced model nodes slide in planes across x, y or z alone: turn the mesh so that the plane "
-                    "of [[support]] is one, or run the full model"
+                    "a reduced model supports sliding only in planes normal to x, y or z: rotate the mesh so that the "
+                    "plane of [[support]] is normal to an axis, or run the full model"
                 )
         elif not isinstance(own, ElasticSupport):
-            raise InputError(f"a reduced model has no [[{own.section}]]: leave it out, or run the full model")
+            raise InputError(f"a reduced model cannot have [[{own.section}]]: leave it out, or run the full model")
         elif own.history is not None:
-            raise InputError("a reduced model has no history of [[support]]: leave it out, or run the full model")
+            raise InputError("a reduced model cannot have a history of [[support]]: remove it, or run the full model")
 
 
 def identity_of_supports(scene: Scene) -> list[object]:
-    """Kinds and places of the supports, without their parameters."""
+    """Return the kinds and the nodes of the supports, without their parameters."""
     found: list[object] = []
     for own in scene.physics:
         if isinstance(own, SlidingSupport):
@@ -52,32 +53,32 @@ def identity_of_supports(scene: Scene) -> list[object]:
 
 
 def _springs(scene: Scene) -> list[NodalForce]:
-    """The springs of all elastic supports."""
+    """Return the springs of all elastic supports."""
     points = scene.mesh.points
     step = Step(scene.mesh, points, 1, 1, None, False, None, Free(jnp.ones_like(points)))
     return [own.freeze(None, step) for own in scene.physics if isinstance(own, ElasticSupport)]
 
 
 def has_springs(scene: Scene) -> bool:
-    """Whether the scene has an elastic support."""
+    """Return whether the scene has an elastic support."""
     return any(isinstance(own, ElasticSupport) for own in scene.physics)
 
 
 def forces_of_springs(scene: Scene, u: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] of all springs at displacements u (V, 3) [m]."""
+    """Return the forces (V, 3) [N] of all springs for displacements u (V, 3) [m]."""
     mesh = scene.mesh
     return sum((own.force(mesh, mesh.points + u, 1.0) for own in _springs(scene)), jnp.zeros_like(u))
 
 
 def reduced_springs(modes: jax.Array, scene: Scene) -> jax.Array | None:
-    """Stiffness (n, n) [N/m] of all springs on modes (n, V, 3); None without springs."""
+    """Return the stiffness (n, n) [N/m] of all springs for modes (n, V, 3), or None without springs."""
     if not has_springs(scene):
         return None
     return jnp.tensordot(jax.lax.map(lambda mode: forces_of_springs(scene, mode), modes), modes, axes=((1, 2), (1, 2)))
 
 
 def spring_matrix(scene: Scene) -> "scipy.sparse.csr_array":
-    """Stiffness (3 V, 3 V) [N/m] of all springs; host side."""
+    """Return the stiffness (3 V, 3 V) [N/m] of all springs as a sparse matrix. The scene must not be traced."""
     import scipy.sparse
 
     V = scene.mesh.number_of_nodes

@@ -1,4 +1,4 @@
-"""Are the choices of the scene known and compatible? Numbers are not checked, so a traced scene passes too."""
+"""Are the choices of the scene known and compatible? Numbers are not checked, so the scene may be traced."""
 
 import numpy as np
 
@@ -24,10 +24,10 @@ CHOICES = {
 
 
 def check_choices(scene: Scene) -> None:
-    """Refuse unknown or incompatible choices. Numbers are not checked, so a traced scene passes, too.
+    """Check that the choices are known and compatible. Numbers are not checked, so the scene may be traced.
 
     Raises:
-        InputError: unknown or incompatible choices; a load or a motion that is given twice, not at all or in a wrong
+        InputError: a choice is unknown or incompatible; a load or a motion is given twice, not at all or in a wrong
             shape.
     """
     check_kinds(scene)
@@ -36,22 +36,22 @@ def check_choices(scene: Scene) -> None:
         if value not in allowed:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
     if (scene.solve.kind == "harmonic") != (scene.solve.frequencies is not None):
-        raise InputError("[solve] kind = 'harmonic' and frequencies = [60.0] (Hz) go together: give both, or neither")
+        raise InputError(
+            "[solve] kind = 'harmonic' and frequencies = [60.0] (Hz) need each other: give both, or neither"
+        )
     if scene.solve.frequencies is not None and not np.size(scene.solve.frequencies):
-        raise InputError("[solve] frequencies = [] holds no frequency: give e.g. frequencies = [60.0] (Hz)")
+        raise InputError("[solve] frequencies = [] contains no frequency: give e.g. frequencies = [60.0] (Hz)")
     if scene.solve.reduced and scene.solve.kind == "harmonic":
-        raise InputError("[solve] reduced is for runs in time, kind is 'harmonic': leave it out")
+        raise InputError("[solve] reduced cannot be used with kind = 'harmonic': remove reduced")
     if scene.springpots is not None and scene.solve.kind != "harmonic":
-        raise InputError("[springpots] are for kind = 'harmonic': a run in time takes [viscosity], a Prony series")
+        raise InputError("[springpots] need kind = 'harmonic': use [viscosity], a Prony series, in a transient run")
     if scene.solve.kind == "harmonic":
         _refuse_what_moves_in_time(scene)
     _loaded(scene)
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
-        raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg if a pressure follows")
+        raise InputError("[solve] linear_solver = 'direct' cannot be used with a follower pressure: use cg")
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
-        raise InputError(
-            "[solve] linear_solver = 'direct' cannot treat nodes that move together: use cg with a rigid plate"
-        )
+        raise InputError("[solve] linear_solver = 'direct' cannot be used with a rigid plate: use cg")
     if scene.solve.volumetric in ("nodal", "mixed"):
         _own_volumes(scene)
     if scene.solve.volumetric == "mixed":
@@ -63,13 +63,13 @@ def check_choices(scene: Scene) -> None:
 
 
 def _refuse_what_moves_in_time(scene: Scene) -> None:
-    """Refuse histories and moving obstacles in harmonic motion."""
+    """Raise InputError if a part has a history, or if an obstacle moves, in harmonic motion."""
     for name in histories(scene):
-        raise InputError(f"{name}.history is for runs in time: give harmonic motion its amplitudes alone")
+        raise InputError(f"{name}.history cannot be used with kind = 'harmonic': give only the amplitudes")
     for name, part in named_physics(scene):
         if getattr(part, "by", None) is not None:
             raise InputError(
-                f"{name}.by is for runs in time: give the obstacle its place in harmonic motion as position"
+                f"{name}.by cannot be used with kind = 'harmonic': write the place of the obstacle in position"
             )
 
 
@@ -77,9 +77,9 @@ def _loaded(scene: Scene) -> None:
     if scene.points_are not in ("reference", "loaded"):
         raise InputError(f"[mesh] is = {scene.points_are!r} is not known: use reference or loaded")
     if scene.points_are == "loaded" and scene.porosity is not None:
-        raise InputError('[mesh] is = "loaded" cannot have the pressure of a fluid: leave [porosity] out')
+        raise InputError('[mesh] is = "loaded" cannot be used with a fluid: remove [porosity]')
     if scene.points_are == "loaded" and any(physics.ties for physics in scene.physics):
-        raise InputError('[mesh] is = "loaded" cannot have nodes that move together: leave the rigid plate out')
+        raise InputError('[mesh] is = "loaded" cannot be used with a rigid plate: remove the plate')
 
 
 def _mixed(scene: Scene) -> None:
@@ -89,12 +89,13 @@ def _mixed(scene: Scene) -> None:
 def _own_volumes(scene: Scene) -> None:
     name = f"[solve] volumetric = {scene.solve.volumetric!r}"
     if scene.porosity is not None:
-        raise InputError(f"{name} is for a law's own volumetric energy, which a sponge replaces: use 'element'")
+        raise InputError(f"{name} needs the volumetric energy of the law, which [porosity] replaces: use 'element'")
     several = laws_of(scene.law, scene.region)
     for law in several:
         if laws.isochoric_part(law) is None or laws.volumetric_part(law) is None:
             raise InputError(
-                f"{name} needs a law whose energy is a shear part and a volumetric part, unlike {type(law).__name__}"
+                f"{name} needs a law with separate isochoric and volumetric energies, unlike {type(law).__name__}: use "
+                "another law, or 'element'"
             )
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":
-        raise InputError(f"{name} needs part = 'isochoric' of [viscosity] or [springpots]: volumes do not relax there")
+        raise InputError(f"{name} has no relaxation of volumes: use part = 'isochoric' in [viscosity] or [springpots]")

@@ -14,7 +14,7 @@ _NO_MOTION = 1e-12
 
 
 def check_moved_where_fixed(scene: Scene) -> None:
-    """Refuse a motion along an axis along which its nodes are fixed. Traced arrays and motions of 0 pass."""
+    """Raise InputError if a node is moved and fixed along one axis. Not checked: traced arrays and motions of 0."""
     for k, motion in enumerate(scene.displaced):
         by = motion.history if motion.by is None else motion.by
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((by, motion.nodes))):
@@ -31,13 +31,13 @@ def check_moved_where_fixed(scene: Scene) -> None:
                 wrong = numbers[shared & (np.abs(vectors[:, AXES.index(axis)]) > nothing)]
                 if len(wrong):
                     raise InputError(
-                        f"fixed.{n} and displaced.{k} both prescribe node {wrong[0]} along {axis}: make their places "
-                        "differ"
+                        f"fixed.{n} and displaced.{k} both prescribe node {wrong[0]} along {axis}: select different "
+                        "nodes"
                     )
 
 
 def check_plates_alone(scene: Scene) -> None:
-    """Refuse other supports or motions of a plate's nodes: they would have no effect. Traced arrays pass."""
+    """Raise InputError if nodes of a rigid plate have other supports or motions. Traced arrays are not checked."""
     named = [(f"{kind}.{k}", part) for kind in ("fixed", "displaced") for k, part in enumerate(getattr(scene, kind))]
     every = named_physics(scene)
     plates = [(name, physics) for name, physics in every if physics.ties]
@@ -50,13 +50,16 @@ def check_plates_alone(scene: Scene) -> None:
             both = np.intersect1d(np.asarray(nodes[0]), np.asarray(nodes[1]))
             if len(both):
                 raise InputError(
-                    f"{name} and {other} share node {both[0]}, whose motion the plate alone decides: make their places "
-                    "differ"
+                    f"{name} and {other} share node {both[0]}, but only the plate may move this node: select different "
+                    "nodes"
                 )
 
 
 def check_normals(scene: Scene) -> None:
-    """Refuse a node in two oblique planes, or held along some but not all axes of its normal; traced arrays pass."""
+    """Raise InputError if a node slides in two oblique planes, or is fixed along only some axes of its normal.
+
+    Traced arrays are not checked.
+    """
     slides = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, SlidingSupport)]
     nodes = [*(f.nodes for f in scene.fixed), *(d.nodes for d in scene.displaced), *(s.nodes for _, s in slides)]
     if all(slide.axis for _, slide in slides) or any(isinstance(n, jax.core.Tracer) for n in nodes):
@@ -77,18 +80,18 @@ def check_normals(scene: Scene) -> None:
             other = taken.setdefault(node, name)
             if other != name:
                 raise InputError(
-                    f"{other} and {name} both hold node {node}, and a node slides in one plane given by its normal: "
-                    "turn the body so that planes are across x, y or z, make places differ, or leave one out"
+                    f"{other} and {name} share node {node}, but a node can slide in only one oblique plane: rotate the "
+                    "body so that the planes are normal to x, y or z, select different nodes, or remove one plane"
                 )
             if 0 < mask[node, across].sum() < across.sum():
                 raise InputError(
-                    f"{name} and a held axis both hold node {node}, in directions that are not at right angles: make "
-                    "places differ"
+                    f"{name} and a fixed axis both constrain node {node}, in directions that are not at right angles: "
+                    "select different nodes"
                 )
 
 
 def check_prescribed_once(scene: Scene) -> None:
-    """Refuse a motion of a node along an axis if the node is fixed or already moved along this axis; host side."""
+    """Raise InputError if a node is moved along an axis along which it is fixed or moved already. Runs on the host."""
     taken: dict[tuple[int, str], str] = {}
     for kind in ("fixed", "displaced"):
         for k, condition in enumerate(getattr(scene, kind)):
@@ -97,15 +100,15 @@ def check_prescribed_once(scene: Scene) -> None:
                     other = taken.setdefault((node, axis), f"{kind}.{k}")
                     if other != f"{kind}.{k}" and "displaced" in (kind, other.partition(".")[0]):
                         raise InputError(
-                            f"{other} and {kind}.{k} both prescribe node {node} along {axis}: make their places differ"
+                            f"{other} and {kind}.{k} both prescribe node {node} along {axis}: select different nodes"
                         )
 
 
 def check_motion_in_planes(scene: Scene) -> None:
-    """Refuse a prescribed motion that moves nodes out of the plane in which they slide; host side.
+    """Check that prescribed motions do not move nodes out of their sliding planes. Runs on the host.
 
     Raises:
-        InputError: one sentence that begins with the name of the motion.
+        InputError: the message begins with the name of the motion.
     """
     for name, physics in named_physics(scene):
         if not isinstance(physics, SlidingSupport):
@@ -119,6 +122,6 @@ def check_motion_in_planes(scene: Scene) -> None:
             if both.any() and np.any(np.abs(own @ normals[0]) > 1e-9 * np.abs(vectors).max()):
                 node = np.asarray(motion.nodes)[both][0]
                 raise InputError(
-                    f"displaced.{k} moves node {node} off the plane of {name}: make their places differ, or leave that "
-                    "direction out of axes"
+                    f"displaced.{k} moves node {node} out of the plane of {name}: select different nodes, or remove "
+                    "this direction from axes"
                 )

@@ -12,7 +12,7 @@ from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.springpots import SpringpotSeries
 
-#: Types of the parts of a scene: first of single parts, then of parts of which a scene may have several.
+#: Types of the parts of a scene. A scene has at most one part of each of PARTS, and any number of each of SEVERAL.
 PARTS = {
     "mesh": TetMesh,
     "law": laws.Law,
@@ -26,7 +26,7 @@ SEVERAL = {"region": Region, "fixed": Fixed, "displaced": Displaced, "traction":
 
 
 def check_kinds(scene: Scene) -> None:
-    """Refuse parts of a wrong type, for example node numbers in place of a `Fixed`."""
+    """Raise InputError if a part has a wrong type, for example node numbers instead of a `Fixed`."""
     for key, kind in PARTS.items():
         own = getattr(scene, key)
         if own is not None and not isinstance(own, kind):
@@ -34,13 +34,13 @@ def check_kinds(scene: Scene) -> None:
     for key, kind in SEVERAL.items():
         own = getattr(scene, key)
         if not isinstance(own, tuple | list):
-            raise InputError(f"{key} is of type {type(own).__name__}: give a tuple, with {_remedy(kind)} in it")
+            raise InputError(f"{key} is of type {type(own).__name__}: give a tuple that contains {_remedy(kind)}")
         for k, each in enumerate(own):
             if not isinstance(each, kind):
                 raise InputError(f"{key}.{k} is of type {type(each).__name__}: give {_remedy(kind)}")
 
 
 def _remedy(kind: type) -> str:
-    """Words for a message: how a user writes a value of this type."""
-    families: dict[object, str] = {laws.Law: "a law of lj.laws", Physics: "a physics, such as lj.Obstacle"}
+    """Words for a message, which show how a user writes a value of this type."""
+    families: dict[object, str] = {laws.Law: "a law of lj.laws", Physics: "a physics object, such as lj.Obstacle"}
     return families.get(kind, f"an lj.{kind.__name__}")

@@ -1,4 +1,4 @@
-"""Is every load, weight, motion and support given once and in the right shape? The values are not checked here."""
+"""Are all loads, weight, motions and supports given once and in the right shape? Values are not checked here."""
 
 from typing import Any
 
@@ -15,10 +15,10 @@ MASSES = ("lumped", "consistent")
 
 
 def check_loads(scene: Scene) -> None:
-    """Refuse loads and motions that are given twice, not at all or in a wrong shape. Refuse unknown axes.
+    """Check that loads and motions are given once and in the right shape, and that axes are known.
 
     Raises:
-        InputError: one sentence that begins with the name of the load, motion or support.
+        InputError: the message begins with the name of the load, motion or support.
     """
     for k, load in enumerate(scene.traction):
         _check_traction(load, f"traction.{k}")
@@ -34,7 +34,7 @@ def _check_traction(load: Traction, name: str) -> None:
     history.check_times(load.times, load.history, name)
     if np.ndim(load.history) == 2:
         if load.value is not None or load.pressure is not None:
-            raise InputError(f"{name} has a value and a history of values: leave one of them out")
+            raise InputError(f"{name} has a value and a history of values: remove one of them")
         return
     if (load.value is None) == (load.pressure is None):
         raise InputError(f"{name} needs either value (3,) or pressure, in Pa: give one of them")
@@ -50,7 +50,7 @@ def _check_motion(motion: Displaced, name: str) -> None:
     by: Any = motion.by
     shape = (3,) if isinstance(by, tuple | list) and len(by) == 3 and np.ndim(by[0]) == 0 else np.shape(by)
     if by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
-        raise InputError(f"{name} by has shape {shape}: give three numbers in m, or three a node")
+        raise InputError(f"{name} by has shape {shape}: give three numbers in m, or three per node")
     if motion.by is None and motion.history is None:
         raise InputError(f"{name} needs either by (3,) or times and history: give one of them")
 

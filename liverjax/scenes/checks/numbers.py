@@ -1,4 +1,4 @@
-"""Is every number of the scene within its bounds, and do the numbers go together? The mesh is checked elsewhere."""
+"""Is every number of the scene within its bounds, and are the numbers compatible? The mesh is checked elsewhere."""
 
 from liverjax.core import bounds
 from liverjax.physics import porosity, viscosity
@@ -9,12 +9,12 @@ from liverjax.scenes.springpots import check_springpots
 
 
 def check_bounds(scene: Scene) -> None:
-    """Refuse numbers out of bounds, and directions of length 0. Nothing is compiled.
+    """Check that numbers are within their bounds, and that directions do not have length 0. Nothing is compiled.
 
-    Traced numbers pass. `check_mesh` checks the mesh.
+    Traced numbers are not checked. `check_mesh` checks the mesh.
 
     Raises:
-        InputError: one sentence with the number's dotted name, value, bound and remedy.
+        InputError: the message contains the dotted name of the number, its value, its bound and a remedy.
     """
     bounds.check_fields(scene, leave=("mesh", "physics"))
     for name, physics in named_physics(scene):
@@ -30,10 +30,10 @@ def check_bounds(scene: Scene) -> None:
 
 
 def check_numbers(scene: Scene) -> None:
-    """Refuse numbers that cannot be used, alone or in combination. The mesh is not checked; host side.
+    """Check that each number, and their combination, can be used. The mesh is not checked. Runs on the host.
 
     Raises:
-        InputError: numbers out of bounds, or that contradict each other in law, viscosity or porosity.
+        InputError: numbers are out of bounds, or contradict each other in law, viscosity or porosity.
     """
     check_bounds(scene)
     for law in laws_of(scene.law, scene.region):

@@ -1,4 +1,4 @@
-"""Are the nodes and triangles of every part in the mesh, and can the part act there?"""
+"""Are the nodes and triangles of every part in the mesh, and can the part act on them?"""
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from liverjax.scenes.scene import Scene
 
 
 def check_known_nodes(scene: Scene) -> None:
-    """Refuse node numbers that are not in the mesh, and inverted elements; traced arrays pass."""
+    """Raise InputError if nodes are not in the mesh, or if elements are inverted. Traced arrays are not checked."""
     mesh = scene.mesh
     named: dict[str, object] = {f"fixed.{k}.nodes": hold.nodes for k, hold in enumerate(scene.fixed)}
     named |= {f"displaced.{k}.nodes": motion.nodes for k, motion in enumerate(scene.displaced)}
@@ -30,7 +30,7 @@ def check_known_nodes(scene: Scene) -> None:
 
 
 def check_places(scene: Scene) -> None:
-    """Refuse node numbers and triangles that are not in the mesh."""
+    """Raise InputError if nodes or triangles are not in the mesh, or if an inlet has no effect."""
     mesh = scene.mesh
     for kind in ("fixed", "displaced"):
         for k, condition in enumerate(getattr(scene, kind)):
@@ -52,26 +52,27 @@ def check_places(scene: Scene) -> None:
 
 
 def _has_vertices(mesh: TetMesh, nodes: object, name: str) -> None:
-    """Refuse a place of the fluid that contains only middles of edges, since only vertices have pressures."""
+    """Raise InputError if `nodes` of a drained surface or an inlet has no vertex: only vertices have pressures."""
     if not np.any(np.asarray(nodes, int) < mesh.number_of_vertices):
-        raise InputError(f"{name} meets only middles of edges, which have no pressure: make its place hold vertices")
+        raise InputError(f"{name} contains only midside nodes, which have no pressure: select a region with vertices")
 
 
 def _inlets_that_act(sponge: Porosity) -> None:
-    """Refuse an inlet in a place where the pressure is already given. The places may share an edge."""
+    """Raise InputError if the pressure is already given in all of an inlet. The node sets may share an edge."""
     given = [] if sponge.drained is None else [set(np.asarray(sponge.drained).tolist())]
     pressures = [(k, inlet) for k, inlet in enumerate(sponge.inlet) if inlet.nodes is not None]
     for k, inlet in pressures:
         own = set(np.asarray(inlet.nodes).tolist())
         if any(own <= place for place in given):
             raise InputError(
-                f"porosity.inlet.{k} gives a pressure where it is drained or given already: make their places differ"
+                f"porosity.inlet.{k} gives a pressure where nodes are drained or have a given pressure: select "
+                "different nodes"
             )
         given.append(own)
     for k, inlet in enumerate(sponge.inlet):
         corners = set() if inlet.triangles is None else set(np.ravel(inlet.triangles).tolist())
         if inlet.nodes is None and any(corners <= place for place in given):
             raise InputError(
-                f"porosity.inlet.{k} is a flux through a surface whose pressures are given or drained, where nothing "
-                "enters: make their places differ"
+                f"porosity.inlet.{k} is a flux through a surface with drained or given pressures, so it has no effect: "
+                "select another surface"
             )

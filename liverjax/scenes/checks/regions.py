@@ -1,4 +1,4 @@
-"""Checks of the regions of a scene: one function checks their parameters, another one their elements."""
+"""Checks of the regions of a scene: one function checks the parameters, another one the elements."""
 
 import jax
 import numpy as np
@@ -16,10 +16,10 @@ from liverjax.scenes.scene import Scene
 
 
 def check_region_numbers(scene: Scene) -> None:
-    """Refuse parameters of regions that no step can use. Traced parameters pass.
+    """Check the parameters of all regions. Traced parameters are not checked.
 
     Raises:
-        InputError: a part that the scene does not have, an unknown name, values out of bounds, a wrong number of modes.
+        InputError: the scene does not have the part; an unknown name; values out of bounds; a wrong number of modes.
     """
     for k, region in enumerate(scene.region):
         _check_law(scene.law, region, f"region.{k}")
@@ -28,16 +28,16 @@ def check_region_numbers(scene: Scene) -> None:
 
 
 def check_region_elements(scene: Scene) -> None:
-    """Refuse regions whose elements no scene can use; host side.
+    """Check the elements of all regions. Runs on the host.
 
     Raises:
-        InputError: no elements, unknown elements, a region that changes nothing, two laws for one element.
+        InputError: a region has no elements, has unknown elements or changes nothing; an element has two laws.
     """
     last = scene.mesh.number_of_elements - 1
     for k, region in enumerate(scene.region):
         elements = np.asarray(region.elements)
         if elements.size == 0 or elements.min() < 0 or elements.max() > last:
-            raise InputError(f"region.{k} names elements outside 0 to {last}: renumber them")
+            raise InputError(f"region.{k} has element numbers outside 0 to {last}: correct the numbers")
         if not region.law and not region.viscosity and not region.porosity:
             raise InputError(f"region.{k} changes nothing: give e.g. law = {{mu = 2000.0}}")
     _check_own_laws(scene.region)
@@ -52,26 +52,26 @@ def _check_law(law: Law, region: Region, name: str) -> None:
 
 
 def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> None:
-    """Refuse viscous parameters of a region that no step can use. Traced parameters pass.
+    """Check the viscous parameters of a region. Traced parameters are not checked.
 
     Raises:
-        InputError: no [viscosity] in the scene, a wrong number of modes, values out of bounds.
+        InputError: the scene has no [viscosity]; a wrong number of modes; values out of bounds.
     """
     own = region.viscosity
     if not own:
         return
     if prony is None:
         raise InputError(
-            f"{name}: viscosity needs a [viscosity] in the scene: give one, with ratios = [0.0] if the rest has none"
+            f"{name}: viscosity needs [viscosity] in the scene; add it, with ratios = [0.0] if the rest is elastic"
         )
     unknown = sorted(set(own) - set(VISCOUS))
     if unknown:
-        raise InputError(f"{name}: viscosity has {unknown[0]}: only {' and '.join(VISCOUS)} can differ in a region")
+        raise InputError(f"{name}: viscosity has {unknown[0]}, but only {' and '.join(VISCOUS)} can differ in a region")
     modes = np.shape(prony.ratios)[0]
     for key, value in own.items():
         if np.shape(value) != (modes,):
             n = np.size(value)
-            raise InputError(f"{name}: viscosity.{key} has {n} numbers and the scene {modes} modes: give {modes}")
+            raise InputError(f"{name}: viscosity.{key} has {n} numbers, but the scene has {modes} modes: give {modes}")
     if any(isinstance(value, jax.core.Tracer) for value in (*own.values(), prony.ratios)):
         return
     changed: Content = {key: np.asarray(value, float) for key, value in own.items()}
@@ -82,16 +82,16 @@ def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> No
 
 
 def check_region_porosity(porosity: Porosity | None, region: Region, name: str) -> None:
-    """Refuse porous parameters of a region that no step can use. Traced parameters pass.
+    """Check the porous parameters of a region. Traced parameters are not checked.
 
     Raises:
-        InputError: no [porosity] in the scene, an unknown name, values out of bounds.
+        InputError: the scene has no [porosity]; an unknown name; values out of bounds.
     """
     own: Content = dict(region.porosity or {})
     if not own:
         return
     if porosity is None:
-        raise InputError(f"{name}: porosity needs a [porosity] in the scene: give one")
+        raise InputError(f"{name}: porosity needs [porosity] in the scene; add it")
     for key, value in own.items():
         if key not in POROUS:
             raise InputError(f"{name}: porosity has {key}, which cannot differ in a region: {hint(key, POROUS)}")
@@ -107,7 +107,7 @@ def check_region_porosity(porosity: Porosity | None, region: Region, name: str) 
 
 
 def _check_hidden(regions: tuple[Region, ...], elements: int) -> None:
-    """Refuse a region without effect: later regions replace its parameters in all of its elements."""
+    """Raise InputError if a region has no effect: later regions replace its parameters in all of its elements."""
     taken: dict[str, np.ndarray] = {}
     nothing = np.zeros(elements, bool)
     for k, region in reversed(list(enumerate(regions))):
@@ -115,8 +115,8 @@ def _check_hidden(regions: tuple[Region, ...], elements: int) -> None:
         law = taken.get("law", nothing)[own]  # a complete law replaces all parameters
         if all(np.all(taken.get(n, nothing)[own] | (law if n.startswith("law.") else False)) for n in names):
             raise InputError(
-                f"region.{k} changes nothing: later regions give all of its elements the same parameters again; leave "
-                "it out, or give other places"
+                f"region.{k} changes nothing, because later regions set the same parameters in all of its elements: "
+                "remove it, or select other elements"
             )
         for name in names:
             taken.setdefault(name, nothing.copy())[own] = True
@@ -130,16 +130,16 @@ def _names_of(region: Region) -> set[str]:
 
 
 def _check_own_laws(regions: tuple[Region, ...]) -> None:
-    """Refuse regions that do not determine which law an element has."""
+    """Raise InputError if the regions do not clearly determine the law of an element."""
     for k, region in enumerate(regions):
         if not isinstance(region.law, Law):
             continue
         elements = np.asarray(region.elements)
         if np.unique(elements).size < elements.size:
-            raise InputError(f"region.{k} names an element twice: name each once")
+            raise InputError(f"region.{k} contains an element twice: list each element once")
         for later, other in enumerate(regions[k + 1 :], k + 1):
             if other.law and np.isin(np.asarray(other.elements), elements).any():
                 raise InputError(
-                    f"region.{later} changes the law of elements to which region.{k} gives a law of its own: give them "
-                    "separate elements, or write the parameters into that law"
+                    f"region.{later} changes the law of elements that have a separate law from region.{k}: select "
+                    "different elements, or write the parameters into that law"
                 )

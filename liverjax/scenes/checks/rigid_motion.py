@@ -1,4 +1,4 @@
-"""Is every piece of the body held against rigid motions?"""
+"""Is every connected piece of the body supported against rigid motions?"""
 
 from collections.abc import Callable, Container
 
@@ -12,20 +12,20 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
-    """Name of a further physics (as in `check_physics`) -> number of nodal directions that it holds at first."""
+    """Return name (as in `check_physics`) -> number of nodal directions that each further physics fixes at first."""
     named = [(name, physics) for name, physics in named_physics(scene) if only is None or name in only]
     return {name: len(physics.holds(scene.mesh)[0]) for name, physics in named}
 
 
 def check_hold(scene: Scene, before: dict[str, int]) -> None:
-    """Refuse a static body that is loose because changed numbers let a physics hold fewer directions than `before`.
+    """Check that a static body is not loose because changed numbers let a physics fix fewer directions than `before`.
 
     Args:
         scene: `Scene` with the changed numbers.
-        before: see `holding`.
+        before: result of `holding` with the old numbers.
 
     Raises:
-        InputError: a connected piece of the body is no longer held.
+        InputError: a connected piece of the body is no longer supported.
     """
     still = scene.solve.kind == "static" or scene.points_are == "loaded"
     if still and any(number < before[name] for name, number in holding(scene, before).items()):
@@ -33,23 +33,21 @@ def check_hold(scene: Scene, before: dict[str, int]) -> None:
 
 
 def check_held(scene: Scene) -> None:
-    """Refuse a connected piece that is not held: then no static solution exists."""
+    """Raise InputError if a connected piece is not supported, because then no static solution exists."""
     loose = loose_piece(scene, lambda physics: physics.holds(scene.mesh))
     if loose:
         doubled = doubled_vertices(scene.mesh)
-        split = (
-            f"merge the {doubled} nodes that are at the place of another one, if the mesh should be joined there, or "
-        )
+        split = f"merge the {doubled} nodes that coincide with another node, if the mesh should be connected there, or "
         remedy = f"{split if doubled else ''}add [[fixed]] or kind = 'dynamic'"
-        raise InputError(f"nothing holds {loose} against every rigid motion: {remedy}")
+        raise InputError(f"the supports do not prevent every rigid motion of {loose}: {remedy}")
 
 
 def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.ndarray]]) -> str:
-    """The first connected piece with a free rigid motion, in words; "" if there is none.
+    """Describe the first connected piece with a free rigid motion. Return "" if there is none.
 
     Args:
         scene: `Scene`.
-        holds: function that gives the node numbers (n,) and the directions (n, 3) that a further physics holds.
+        holds: function that returns the node numbers (n,) and the directions (n, 3) that a further physics fixes.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -71,9 +69,9 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
 
 
 def _rigid_rank(points: np.ndarray, directions: np.ndarray, size: float) -> int:
-    """Rank of the six rigid motions, projected on held directions (n, 3) at points (n, 3) of a body of this size."""
+    """Rank of the six rigid motions, projected on fixed directions (n, 3) at points (n, 3) of a body of this size."""
     if not len(points):
         return 0
-    # A rotation about e moves x by e x x; the component of this motion along d is (x x d) . e.
+    # A rotation about e moves x by cross(e, x). The component of this motion along d is cross(x, d) . e.
     motions = np.concatenate([directions, np.cross(points / max(size, 1e-300), directions)], axis=1)
     return int(np.linalg.matrix_rank(motions, tol=1e-6))

@@ -1,1 +1,1 @@
-"""Factors of the sparse symmetric matrices of a mesh."""
+"""Factorisation of the sparse symmetric matrices of a mesh."""

@@ -1,22 +1,25 @@
-"""Nested dissection of a mesh (George 1973, SIAM J. Numer. Anal. 10, 345): the order of eliminating groups of nodes.
+"""Nested dissection of a mesh (George 1973, SIAM J. Numer. Anal. 10, 345): an order to eliminate groups of nodes.
 
-The elements are divided in two again and again, and the nodes between two parts are eliminated after both. Work grows
-with the cube of the number of nodes between. Of all planes normal to nine directions, the one with the least estimated
-work is taken. In a mesh without layers the elements beside a plane have many nodes in common. There the smallest set of
-nodes that separates both sides is better: the smallest cut of a graph (Ford and Fulkerson 1956, Can. J. Math. 8, 399).
+The elements are divided into two parts repeatedly. The nodes that both parts share are eliminated after the others. The
+work grows with the cube of the number of shared nodes. Planes normal to nine directions are tried, and the plane with
+the least estimated work is used. In a mesh without layers, the elements on the two sides of a plane share many nodes.
+There the smallest set of nodes that separates both sides is better. This set is the minimum cut of a graph (Ford and
+Fulkerson 1956, Can. J. Math. 8, 399).
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-#: A group of so few nodes is not divided; from so many nodes on, diagonal planes and smallest cuts are tried.
+#: A group of at most LEAF nodes is not divided. With more than MANY nodes, diagonal planes and minimum cuts are tried.
 LEAF, MANY = 40, 400
-#: Least part of the elements on one side of a plane; part on each side of the plane that a smallest cut may reach.
+#: LEAST: minimum fraction of the elements on each side of a plane. BESIDE: a minimum cut stays among this fraction of
+#: the elements on each side of the plane.
 LEAST, BESIDE = 0.25, 0.07
-#: A smallest cut is taken if its estimated work is below this part of the plane's: planes leave straighter parts.
+#: A minimum cut is used if its estimated work is below this fraction of the work of the plane. Planes are preferred
+#: because they leave parts with straighter boundaries.
 BETTER = 0.9
-#: Normals of the planes.
+#: Normal vectors of the planes.
 DIRECTIONS = np.array(
     [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1]]
 )
@@ -26,12 +29,12 @@ class _Part(NamedTuple):
     """A part of the elements, the nodes that are eliminated inside it, and its nodes that are eliminated later."""
 
     elements: np.ndarray  # (n,)
-    nodes: np.ndarray  # (k,), rising
+    nodes: np.ndarray  # (k,), in ascending order
     border: np.ndarray  # (m,)
 
 
 class _Cut(NamedTuple):
-    """Elements in an order, of which the first ones are on one side."""
+    """A division of elements into two sides: in `order`, the first `first` elements are on one side."""
 
     work: float
     order: np.ndarray  # (n,)
@@ -42,12 +45,14 @@ class _Cut(NamedTuple):
 
 
 def work(own: Any, border: Any) -> Any:
-    """Multiplications that eliminate `own` unknowns, which are coupled with `border` others."""
-    return own * (own * own / 3 + own * border + border * border)  # powers would take most of the dissection's time
+    """Number of multiplications to eliminate `own` unknowns that are coupled with `border` other unknowns."""
+    return own * (own * own / 3 + own * border + border * border)  # `**` would take most of the dissection's time
 
 
 def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, list[int]]]:
-    """Groups of nodes with the numbers of their children; a group comes after its children.
+    """Return groups of nodes in the order of elimination, each with the indices of its child groups.
+
+    A group comes after its children.
 
     Args:
         elements: nodes (n, E) of every element; an element with fewer nodes repeats one of them.
@@ -79,7 +84,7 @@ def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray
 
 
 def _best_cut(elements: np.ndarray, centres: np.ndarray, part: _Part, V: int) -> _Cut:
-    """The plane, or the smallest cut near it, that leaves least work."""
+    """Return the plane, or the minimum cut near this plane, with the least estimated work."""
     n, span = len(part.elements), (np.empty(V, int), np.empty(V, int))
     least, most = max(1, int(LEAST * n)), min(n - 1, int(np.ceil((1 - LEAST) * n)))
     best = _Cut(np.inf, part.elements, 1)
@@ -105,7 +110,7 @@ def _best_cut(elements: np.ndarray, centres: np.ndarray, part: _Part, V: int) ->
 
 
 def _first_and_last(nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray]) -> None:
-    """Write the first and the last element of each node, (V,) each, for the nodes (n, E) of elements in an order."""
+    """Write the first and the last element of each node into `span`. `nodes` (n, E) belong to elements in an order."""
     number = np.repeat(np.arange(nodes.shape[1]), len(nodes))
     every = nodes.T.ravel()
     span[0][every[::-1]] = number[::-1]
@@ -113,8 +118,9 @@ def _first_and_last(nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray]) -> N
 
 
 def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.ndarray], at: slice) -> np.ndarray:
-    """Work of the cuts after the elements `at` of an order with these nodes (n, E): the work of the nodes between, and
-    twice the work of the next cut on each side, as if the side were a cube.
+    """Estimated work of cuts. A cut divides elements in an order, with nodes (n, E), after one of the elements `at`.
+
+    It is the work for the shared nodes plus twice the work of the next cut on each side, as if each side were a cube.
     """
     n, m = nodes.shape[1], len(part.border)
     _first_and_last(nodes, span)
@@ -129,13 +135,13 @@ def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.nda
 def _smallest_cuts(
     near: np.ndarray, nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray], ends: tuple[int, int]
 ) -> list[np.ndarray]:
-    """Which elements (h,) are on the first side, for the first and the last of all cuts with the fewest nodes.
+    """Return which elements (h,) are on the first side, for the first and the last of all minimum cuts.
 
     Args:
-        near: nodes (E, h) of elements low to high of an order.
-        nodes: (k,) rising, nodes that a cut may pass through; other nodes do not connect parts.
+        near: nodes (n, h) of the h elements from low to high - 1 of an order.
+        nodes: (k,) nodes, in ascending order, through which a cut may pass. Other nodes do not connect the parts.
         span: first and last element of each node in this order.
-        ends: low and high; elements before low are on the first side, elements from high on are on the second side.
+        ends: low and high. Elements before low are on the first side, and elements from high on are on the second side.
     """
     import scipy.sparse
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -150,7 +156,7 @@ def _smallest_cuts(
     into, element = at[known], 2 * k + np.broadcast_to(np.arange(h), near.shape)[known]
     first, last = np.flatnonzero(span[0][own] < low), np.flatnonzero(span[1][own] >= high)
     source, sink, inside = 2 * k + h, 2 * k + h + 1, np.arange(k)
-    # A path enters node i at number i of the graph and leaves it at i + k. Only the edge between them has capacity 1.
+    # Paths enter mesh node i at vertex i of the graph and leave it at i + k. Only the edge between both has capacity 1.
     lines = np.concatenate([inside, k + into, element, np.full(len(first), source), k + last])
     columns = np.concatenate([k + inside, element, into, first, np.full(len(last), sink)])
     wide = np.where(np.arange(len(lines)) < k, 1, k + 1).astype(np.int32)
@@ -163,7 +169,7 @@ def _smallest_cuts(
 
 
 def _neighbours_together(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The nodes in an order in which near nodes follow each other."""
+    """Return the nodes in an order in which nodes that are near in space follow each other."""
     if len(nodes) <= 8:
         return nodes
     side = points[nodes, np.argmax(np.ptp(points[nodes], axis=0))]

@@ -1,14 +1,14 @@
-"""Memory of the machine that a factorisation may use."""
+"""Find out how much memory of the machine a factorisation may use."""
 
 import os
 from pathlib import Path
 
-#: Files of Linux: the memory that is free or can be freed; limit and use of a container [bytes].
+#: Files of Linux: memory that is free or can be freed [kB]; limit of a container, and its memory in use [bytes].
 _FREE, _LIMIT, _USED = Path("/proc/meminfo"), Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
 
 
 def free_memory() -> float:
-    """Memory [bytes] that this process can still get; infinite where the system does not tell it."""
+    """Memory [bytes] that this process can still allocate; infinite if the system does not report it."""
     try:
         lines = dict(line.split(":") for line in _FREE.read_text().splitlines())
         free = 1024 * float(lines["MemAvailable"].split()[0])

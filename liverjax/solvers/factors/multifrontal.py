@@ -1,13 +1,16 @@
-"""Factorisation of sparse symmetric matrices of a mesh, on the host, by dense matrices: real or complex symmetric.
+"""Multifrontal factorisation, on the host, of sparse matrices of a mesh that are real or complex symmetric.
 
-`liverjax.solvers.factors.dissection` gives the order. Each group of nodes is eliminated in a dense matrix of itself and
-its border (Duff and Reid 1983, ACM TOMS 9, 302), `PIVOTS` unknowns at a time, so that nearly all work is products of
-matrices. Groups whose children are done are eliminated in parallel, one per core. By symmetry the lower triangles are
-enough. If only one piece can run, its tiles run in parallel instead. Pivots are chosen within the unknowns that are
-eliminated together. Large matrices are factorised in single precision and solved with refinement: half the time and
-memory, and the same digits. If the refinement does not converge, double precision follows. Factors that would not fit
-in memory are kept as 16-bit integers, with a scale for each row: half the memory again, with about two more steps of
-refinement.
+`liverjax.solvers.factors.dissection` gives the order of elimination. Each group of nodes is eliminated in a dense
+matrix of the group and its border, the later unknowns that are coupled with it (Duff and Reid 1983, ACM TOMS 9, 302).
+`PIVOTS` unknowns are eliminated at a time, so that nearly all work is in matrix products. By symmetry the lower
+triangles are enough. Groups are eliminated in parallel, one per core, as soon as their children are done. If only one
+piece can run, the parts of its matrix products (tiles) run in parallel instead. Pivots are chosen only among unknowns
+that are eliminated together.
+
+Large matrices are factorised in single precision, and solutions are refined iteratively. This needs half the time and
+memory, and the solution has the same number of digits. If the refinement does not converge, double precision is used.
+Factors that would not fit in memory are stored as 16-bit integers, with a scale factor for each row. This halves the
+memory again, and needs about two more refinement steps.
 """
 
 import itertools
@@ -24,13 +27,13 @@ from liverjax.solvers.factors.dissection import work
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Unknowns from which on single precision pays.
+#: Number of unknowns from which on single precision saves time.
 SINGLE_FROM = 20_000
-#: Unknowns of a group that are eliminated together, and the columns that they change together.
+#: Number of unknowns of a group that are eliminated together; number of columns of a tile.
 PIVOTS, TILE = 128, 192
-#: Part of all work below which groups are eliminated with their descendants, in one piece.
+#: A group and its descendants are eliminated in one piece if their work is less than this part of all work.
 PIECE = 1 / 32
-#: Most steps of refinement; backward error that ends it, and backward error above which a solution is wrong.
+#: Maximum number of refinement steps; backward error that ends them; backward error above which a solution is wrong.
 STEPS, ENOUGH, WRONG = 12, 4e-16, 1e-11
 
 
@@ -39,53 +42,53 @@ class Front(NamedTuple):
 
     own: np.ndarray  # (n,)
     border: np.ndarray  # (m,)
-    children: list[int]  # earlier groups whose remaining matrices are added to this one
+    children: list[int]  # indices of the earlier groups that leave their remaining matrices to this group
 
 
 class Eliminated(NamedTuple):
-    """Unknowns that were eliminated together: A^-1 of their own matrix, and X = A^-1 B for the unknowns after them."""
+    """Result for unknowns that were eliminated together: their matrix is A, and B couples them with later unknowns."""
 
     own: np.ndarray  # (n,)
     after: np.ndarray  # (m,)
-    inverse: np.ndarray  # (n, n)
-    X: np.ndarray  # (n, m), or whole numbers (n, m or 2 m)
-    sizes: np.ndarray | None = None  # (n,) value of the whole number 1 in each row
+    inverse: np.ndarray  # (n, n) A^-1
+    X: np.ndarray  # (n, m) A^-1 B; as 16-bit integers (n, m), or (n, 2 m) if complex
+    sizes: np.ndarray | None = None  # (n,) factor on the integers of each row
 
     def times(self, y: np.ndarray) -> np.ndarray:
-        """X y, (n,)."""
+        """Product X y (n,)."""
         if self.sizes is None:
             return self.X @ y
         return self.sizes * (self.X.astype(self.sizes.dtype).view(y.dtype) @ y)
 
     def transposed_times(self, y: np.ndarray) -> np.ndarray:
-        """X^T y, (m,)."""
+        """Product X^T y (m,)."""
         if self.sizes is None:
             return y @ self.X
         return (self.sizes * y) @ self.X.astype(self.sizes.dtype).view(y.dtype)
 
 
 class Factor(NamedTuple):
-    """The result of an elimination."""
+    """Result of a factorisation."""
 
-    matrix: "scipy.sparse.csr_array"  # scaled
-    scale: np.ndarray  # (N,)
+    matrix: "scipy.sparse.csr_array"  # with scaled rows and columns
+    scale: np.ndarray  # (N,) the factors on rows and columns
     steps: list[Eliminated]
 
     @property
     def nbytes(self) -> int:
-        """Memory [bytes]."""
+        """Memory [bytes] of the matrix and its factor."""
         return self.matrix.data.nbytes + sum(step.inverse.nbytes + step.X.nbytes for step in self.steps)
 
 
 def fronts(
     neighbours: "scipy.sparse.csr_array", groups: list[tuple[np.ndarray, list[int]]], node: np.ndarray
 ) -> list[Front]:
-    """The groups of nodes as groups of unknowns, with their borders.
+    """Convert groups of nodes to groups of unknowns, and determine the border of each group.
 
     Args:
-        neighbours: (V, V), an entry for each two nodes whose unknowns are coupled.
+        neighbours: matrix (V, V) with an entry for each pair of nodes with coupled unknowns.
         groups: result of `liverjax.solvers.factors.dissection.dissected`.
-        node: (N,) the node of each unknown.
+        node: node of each unknown (N,).
     """
     order = np.argsort(node, kind="stable")
     ends = np.searchsorted(node[order], np.arange(neighbours.shape[0] + 1))
@@ -103,22 +106,23 @@ def fronts(
 
 
 def _unknowns(nodes: np.ndarray, order: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Unknowns of nodes, node by node."""
+    """Unknowns of the given nodes, ordered by node."""
     first, number = ends[nodes], ends[nodes + 1] - ends[nodes]
     before = np.cumsum(number) - number
     return order[np.repeat(first - before, number) + np.arange(number.sum())]
 
 
 def single_bytes(plan: list[Front], kind: np.dtype) -> float:
-    """Memory [bytes] of a factor in single precision; `kind` says whether the matrix is real or complex."""
+    """Memory [bytes] of a factor in single precision; `kind` is the type of the matrix entries, real or complex."""
     own, border = (np.array([len(part) for part in parts], float) for parts in zip(*(f[:2] for f in plan), strict=True))
     together = np.minimum(own, PIVOTS)
     return float(np.sum(own * (0.5 * (own + together) + border))) * (8 if kind.kind == "c" else 4)
 
 
 def needed_bytes(plan: list[Front], kind: np.dtype, single: bool, small: bool) -> float:
-    """Memory [bytes] that an elimination in the order of the plan needs: the factor, the matrix of one group, and the
-    lower triangles that groups have left to their parents. Groups in parallel need more.
+    """Memory [bytes] that an elimination in the order of the plan needs. Groups in parallel need more.
+
+    It contains the factor, the matrix of one group, and the lower triangles that groups have left to their parents.
     """
     each = (8 if kind.kind == "c" else 4) * (1 if single else 2)
     of_factor, waiting, most = 0.0, 0.0, 0.0
@@ -132,16 +136,16 @@ def needed_bytes(plan: list[Front], kind: np.dtype, single: bool, small: bool) -
 
 
 def factorised(A: "scipy.sparse.csr_array", plan: list[Front], single: bool, small: bool = False) -> Factor:
-    """The factor of A, from the elimination of one group after the other.
+    """Factorise A: eliminate one group of unknowns after the other.
 
     Args:
-        A: (N, N).
-        plan: `fronts`.
-        single: in single precision.
-        small: keep the factor as 16-bit integers; in single precision only.
+        A: symmetric matrix (N, N).
+        plan: result of `fronts`.
+        single: whether to factorise in single precision.
+        small: whether to store the factor as 16-bit integers; only if `single`.
 
     Raises:
-        numpy.linalg.LinAlgError: values that are not finite, or a group whose own matrix has no inverse.
+        numpy.linalg.LinAlgError: A has values that are not finite, or the matrix of a group is singular.
     """
     A, scale = _scaled(A)
     if not np.all(np.isfinite(A.data)):
@@ -162,20 +166,20 @@ class _Elimination(NamedTuple):
     small: bool
     rests: list[np.ndarray | None]  # the remaining matrix that each group leaves to its parent
     steps: list[list[Eliminated]]  # results of each group
-    running: dict[Future, int]  # pieces that are eliminated now
+    running: dict[Future, int]  # pieces in progress
 
     def idle(self) -> int:
-        """Cores that a piece may use: its own, and those without a piece."""
+        """Number of cores that a piece may use: one, and all cores without a piece."""
         return max(1, cores() + 1 - len(self.running))
 
     def piece(self, groups: list[int]) -> None:
-        """Eliminate `groups` one after the other, with the tiles of each group on the cores that are idle."""
+        """Eliminate `groups` one after the other. The tiles of each group run on the idle cores."""
         place = np.full(self.A.shape[0], -1)
         fronts = [self.plan[k] for k in groups]
         memory = np.empty(max((len(own) + len(border)) * len(own) for own, border, _ in fronts), self.kind)
         for k, front in zip(groups, fronts, strict=True):
             own, m = _own_columns(self.A, front, place, memory), len(front.border)
-            rest = np.zeros((m, m), self.kind, order="F")  # much of its upper half is never touched
+            rest = np.zeros((m, m), self.kind, order="F")  # much of its upper triangle is never written
             for c in front.children:
                 left = self.rests[c]
                 if left is not None:  # None: a part of the body that is not coupled with the others
@@ -189,7 +193,7 @@ class _Elimination(NamedTuple):
 
 
 def _all_pieces(own: _Elimination) -> list[Eliminated]:
-    """Eliminate all pieces, as many at a time as there are cores. The sums do not depend on which ends first."""
+    """Eliminate all pieces, at most one per core at a time. The result does not depend on which piece ends first."""
     pieces, waits_for = _work_in_pieces(own.plan)
     running = own.running
     with ThreadPoolExecutor(cores()) as pool:
@@ -207,12 +211,12 @@ def _all_pieces(own: _Elimination) -> list[Eliminated]:
 
 
 def cores() -> int:
-    """Cores that the process may use."""
+    """Number of cores that the process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _work_in_pieces(plan: list[Front]) -> tuple[list[list[int]], list[set[int]]]:
-    """Groups that are eliminated in one piece, and the pieces that each piece waits for."""
+    """Return the groups of each piece, and the pieces that must end before each piece begins."""
     n, m = (
         np.array([len(part) for part in parts], float) for parts in zip(*(front[:2] for front in plan), strict=True)
     )
@@ -234,14 +238,15 @@ def _work_in_pieces(plan: list[Front]) -> tuple[list[list[int]], list[set[int]]]
 
 
 def _scaled(A: Any) -> tuple[Any, np.ndarray]:
-    """The matrix with scales (N,) on both sides that make the largest entry of every row nearly 1, and these scales
-    (Ruiz 2001).
+    """Scale rows and columns of A so that the largest entry of every row is nearly 1 (Ruiz 2001).
+
+    Return the scaled matrix and the factors (N,).
     """
     import scipy.sparse
 
     A = A.tocsr()
     size, scale, in_row = abs(A.data), np.ones(A.shape[0]), np.diff(A.indptr)
-    known, other = np.flatnonzero(in_row), np.empty(A.nnz)  # new memory would take longer than the sums
+    known, other = np.flatnonzero(in_row), np.empty(A.nnz)  # new memory would take longer than the arithmetic
     for _ in range(3):
         largest = np.zeros(len(scale))
         if len(known):
@@ -255,7 +260,10 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
 
 
 def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
-    """The group's own columns of A (n + m, n), 0 above the diagonal; `place` gets its unknowns' and border's places."""
+    """Columns (n + m, n) of A for the unknowns of the group, with 0 above the diagonal.
+
+    The row of each unknown of the group and its border is written into `place`.
+    """
     n, size = len(front.own), len(front.own) + len(front.border)
     place[front.own], place[front.border] = np.arange(n), np.arange(n, size)
     F = memory[: size * n].reshape((size, n), order="F")
@@ -268,9 +276,9 @@ def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) ->
 
 
 def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) -> None:
-    """Add a child's lower triangle to the own columns and the rest, at rising places `at`.
+    """Add the lower triangle `left` of a child to the group's own columns and to the rest, at ascending indices `at`.
 
-    Consecutive places are added together.
+    Consecutive indices are added together.
     """
     n = own.shape[1]
     ends = np.unique([0, *(np.flatnonzero(np.diff(at) != 1) + 1), np.searchsorted(at, n), len(at)])
@@ -282,9 +290,10 @@ def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) ->
 
 
 def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[[], int]) -> list[Eliminated]:
-    """Eliminate a group with its columns (n + m, n); take its part off the lower triangle of the rest (m, m).
+    """Eliminate a group with the columns `own` (n + m, n). Subtract its part from the lower triangle of `rest` (m, m).
 
-    The own columns change after each `PIVOTS` unknowns, the rest once at the end: long products are the fastest.
+    The own columns are updated after each `PIVOTS` unknowns. The rest is updated once at the end, since large matrix
+    products are the fastest.
     """
     n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
     X = np.empty((n, len(rest)), own.dtype)
@@ -304,13 +313,13 @@ def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[
 
 
 def _solved_part(matrices: tuple[np.ndarray, np.ndarray, np.ndarray], width: int, j: int) -> None:
-    """Some columns of the inverse times the transposed rows below."""
+    """Compute `width` columns, from column j on, of the inverse times the transposed rows below."""
     inverse, below, out = matrices
     np.matmul(inverse, below[j : j + width].T, out=out[:, j : j + width])
 
 
 def _take_off(A: np.ndarray, left: np.ndarray, right: np.ndarray, cores: int) -> None:
-    """Subtract left (N, k) times right (k, M) from A (N, M): the tiles on the diagonal and what is below them."""
+    """Subtract left (N, k) times right (k, M) from A (N, M), only in the tiles on and below the diagonal."""
 
     def columns(j: int) -> None:
         part = A[j:, j : j + TILE]
@@ -322,7 +331,7 @@ def _take_off(A: np.ndarray, left: np.ndarray, right: np.ndarray, cores: int) ->
 
 
 def _dealt_out(task: Callable[[int], None], size: int, cores: int, width: int) -> None:
-    """Do the task of every part of so many columns, on so many cores."""
+    """Divide `size` columns into parts of `width` columns. Call `task` with the first column of each, in parallel."""
     starts = range(0, size, width)
     if cores == 1 or len(starts) < 2:
         for j in starts:
@@ -333,7 +342,7 @@ def _dealt_out(task: Callable[[int], None], size: int, cores: int, width: int) -
 
 
 def _in_whole_numbers(step: Eliminated) -> Eliminated:
-    """The step with X as 16-bit integers."""
+    """Convert X of a step to 16-bit integers."""
     parts = np.ascontiguousarray(step.X).view(step.X.real.dtype)
     sizes = np.abs(parts).max(axis=1, initial=0.0) / np.iinfo(np.int16).max
     sizes = np.where(sizes > 0, sizes, 1.0).astype(parts.dtype)
@@ -341,7 +350,7 @@ def _in_whole_numbers(step: Eliminated) -> Eliminated:
 
 
 def _inverted(A: np.ndarray) -> np.ndarray:
-    """The inverse of a matrix that is not empty."""
+    """Inverse of a matrix that is not empty. Raises LinAlgError if the matrix is singular."""
     from scipy.linalg import get_lapack_funcs
 
     factor, invert = get_lapack_funcs(("getrf", "getri"), (A,))
@@ -353,7 +362,7 @@ def _inverted(A: np.ndarray) -> np.ndarray:
 
 
 def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
-    """The refined solution x (N,) of A x = b, and its backward error: the residual over the size of its terms."""
+    """Solve A x = b with iterative refinement. Return x (N,) and the backward error (see `_backward_error`)."""
     A, scale = factor.matrix, factor.scale
     b, x = scale * b, np.zeros(len(b), A.dtype)
     size, left, last = abs(A), b, np.inf
@@ -370,13 +379,13 @@ def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _backward_error(size: Any, x: np.ndarray, b: np.ndarray, out: np.ndarray) -> float:
-    """Backward error of the whole system: |b - A x| over |A| |x| + |b|."""
+    """Backward error: the norm of `out` = b - A x, divided by the sum of the norms of |A| |x| and b."""
     terms = np.linalg.norm(size @ abs(x)) + np.linalg.norm(b)
     return float(np.linalg.norm(out) / terms) if terms > 0 else 0.0
 
 
 def _once(factor: Factor, b: np.ndarray) -> np.ndarray:
-    if not factor.steps:  # nothing is free
+    if not factor.steps:  # there are no free unknowns
         return b
     y = b.astype(factor.steps[0].inverse.dtype)
     for step in factor.steps:
