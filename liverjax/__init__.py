@@ -20,7 +20,7 @@ if "JAX_DEFAULT_MATMUL_PRECISION" not in os.environ:
     # By default, a GPU multiplies float32 numbers with 11 bits. Quadratic elements then had errors of up to 6 %.
     jax.config.update("jax_default_matmul_precision", "highest")
 if len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)) == 1:
-    # On one core JAX has one thread. A direct solve on the host would wait for this thread (deadlock). So use two.
+    # On one core JAX has one thread. A direct solve, outside the compiled program, would wait for it. So use two.
     os.environ.setdefault("NPROC", "2")
 
 from liverjax import laws

@@ -111,4 +111,4 @@ def test_a_posterior_says_that_it_takes_noise_as_independent(tmp_path):
     main([*words, "--out", str(tmp_path)])
     content = json.loads((tmp_path / "fit.json").read_text())
     assert content["details"][alike_points.INDEPENDENT] < 40
-    assert any("takes the noise of all moduli as independent" in w for w in content["warnings"])
+    assert any("assumes independent noise of all moduli" in w for w in content["warnings"])

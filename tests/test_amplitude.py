@@ -131,7 +131,7 @@ def test_the_command_fits_with_the_series_of_a_sweep(tmp_path, capsys):
     options = ["--model", str(tmp_path / "fit.json"), "--max-strain", "0.7", "--out", str(out)]
     assert command.main(["amplitude", "fung_demiray", str(file), *options]) == 0
     said = capsys.readouterr()
-    assert "third harmonic" in said.out and "left out as requested" in said.err
+    assert "third harmonic" in said.out and "are ignored as requested" in said.err
     content = json.loads((out / "fit.json").read_text())
     (own,) = content["laws"]
     assert own["parameters"]["c1"] == pytest.approx(900, rel=1e-4) and len(own["third_harmonic_over_first"]) == 11
@@ -230,7 +230,7 @@ def test_laws_that_follow_a_sweep_as_well_are_named(tmp_path, tanned):
         best._replace(law=best.law._replace(aicc=best.law.aicc + d, label=n)) for n, d in (("b", 3), ("c", 9))
     )
     told = law_fit.said_of(sweep, [best, other, far])
-    assert any(t.startswith("b follow the sweep as well as") for t in told)
+    assert any(t.startswith("b fit the sweep as well as") for t in told)
     assert not any("as well as" in t for t in law_fit.said_of(sweep, [best, far]))
 
 

@@ -194,7 +194,10 @@ def _spring(**given) -> dict:
             {"displaced": (lj.Displaced(nodes=jnp.array([27]), by=jnp.zeros(3)),)},
             "displaced.0.nodes names node 27, but the nodes are",
         ),
-        ({"traction": (lj.Traction(triangles=LOST, pressure=1.0),)}, "traction.0.triangles has [1, 2, 4], which is not a"),
+        (
+            {"traction": (lj.Traction(triangles=LOST, pressure=1.0),)},
+            "traction.0.triangles has [1, 2, 4], which is not a",
+        ),
         (
             {"traction": (lj.Traction(triangles=TOP.ravel(), pressure=1.0),)},
             "traction.0.triangles has shape (6,): give",
@@ -352,9 +355,15 @@ def test_runs_refuse_what_means_nothing(change, sentence):
 @pytest.mark.parametrize(
     ("parameters", "sentence"),
     [
-        ({"law.mu": [770.0, -100.0]}, "lane 1: law.mu = -100.0 must be above 0 Pa"),
-        ({"viscosity.ratios.0": [0.5, 1.7]}, "lane 1: viscosity.ratios = [1.7] must be at most 1"),
-        ({"displaced.0.by": [[0.01, 0.02], [0.0, 0.01]]}, "lane 0: displaced.0 by has shape (2,)"),
+        ({"law.mu": [770.0, -100.0]}, "parameter set 1 (counted from 0): law.mu = -100.0 must be above 0 Pa"),
+        (
+            {"viscosity.ratios.0": [0.5, 1.7]},
+            "parameter set 1 (counted from 0): viscosity.ratios = [1.7] must be at most 1",
+        ),
+        (
+            {"displaced.0.by": [[0.01, 0.02], [0.0, 0.01]]},
+            "parameter set 0 (counted from 0): displaced.0 by has shape (2,)",
+        ),
     ],
 )
 def test_every_lane_of_a_batch_is_checked(parameters, sentence):

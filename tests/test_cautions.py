@@ -110,7 +110,7 @@ def test_waves_without_a_mass_are_told():
     push = lj.Traction(triangles=lj.boundary.boundary_triangles(BOX)[:1], value=np.array([0.0, 0.0, 5.0]))
     bare = replace(scene(BOX, kind="harmonic", frequencies=np.array([60.0])), traction=(push,))
     assert cautions_of_waves(bare) == [
-        "the scene has no [body], so the motion has no inertia: write density = 1060.0 in [body]"
+        "the scene has no [body], so the body has no inertia: write density = 1060.0 in [body]"
     ]
     heavy = replace(bare, body=lj.Body(density=1060.0))
     (said,) = cautions_of_waves(heavy)

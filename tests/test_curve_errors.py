@@ -99,10 +99,12 @@ def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
     law = lj.laws.Ogden(mu=(333.3,), alpha=(6.0,), bulk=None)
     (shear,) = (c for c in synthetic(law, 0.02, 0) if c.label.startswith("simple"))
     (candidate,) = stress_stretch.candidates("ogden", terms=1)
-    told = [s for s in stress_stretch.fit(candidate, [shear], 32).warnings if s.startswith("other parameters follow")]
+    told = [
+        s for s in stress_stretch.fit(candidate, [shear], 32).warnings if s.startswith("other parameter values fit")
+    ]
     assert len(told) == 1 and "add a test in tension or compression" in told[0]
     every = stress_stretch.fit(candidate, synthetic(law, 0.02, 0), 32).warnings
-    assert not [s for s in every if s.startswith("other parameters follow")]
+    assert not [s for s in every if s.startswith("other parameter values fit")]
 
 
 def test_a_parameter_without_data_is_told():
@@ -148,7 +150,7 @@ def test_laws_that_tie_are_named_with_their_moduli():
         best._replace(aicc=best.aicc + d, label=n, shear_modulus=m) for d, n, m in ((2, "b", 900.0), (9, "c", 5.0))
     )
     (told,) = stress_stretch.tied_laws([best, other, far], "curves")
-    assert told.startswith("b follow the curves as well as neo_hookean does") and "with G0 from 7" in told
+    assert told.startswith("b fit the curves as well as neo_hookean does") and "with G0 from 7" in told
     assert "to 900 Pa" in told and not stress_stretch.tied_laws([best, far], "curves")
 
 

@@ -61,7 +61,7 @@ def test_one_wrong_stretch_is_not_taken_for_several_samples(tmp_path):
         moved[k] = wrong
         lines = [f"uniaxial,{s:.4f},{1e3 * (x - x**-2.0):.6g}" for s, x in zip(moved, stretch, strict=True)]
         (tmp_path / "c.csv").write_text("\n".join(["test,stretch,nominal_stress_Pa", *lines]) + "\n")
-        assert not any("turn back" in note for note in curves.read_curves([tmp_path / "c.csv"])[1])
+        assert not any("reverses" in note for note in curves.read_curves([tmp_path / "c.csv"])[1])
 
 
 def test_several_ratios_of_the_stretches_are_no_return(tmp_path):
@@ -75,10 +75,10 @@ def test_several_ratios_of_the_stretches_are_no_return(tmp_path):
                 P, Q = (200 * (own - 1 / (a * b) ** 2 / own) for own in (a, b))
                 lines.append(f"{a:.9f},{b:.9f},{1 / (a * b):.9f},{P:.9g},{Q:.9g}")
         (tmp_path / "b.csv").write_text("\n".join(lines) + "\n")
-        return [note for note in curves.read_curves([tmp_path / "b.csv"])[1] if "turn back" in note]
+        return [note for note in curves.read_curves([tmp_path / "b.csv"])[1] if "reverses" in note]
 
     assert not notes_of((1.0, 0.5, 0.0)) and not notes_of((0.2, 0.0))
-    assert "turn back once" in notes_of((0.5, 0.5))[0]
+    assert "reverses once" in notes_of((0.5, 0.5))[0]
 
 
 def test_unloading_preload_and_decimal_commas_are_seen(tmp_path, capsys):
@@ -95,8 +95,8 @@ def test_unloading_preload_and_decimal_commas_are_seen(tmp_path, capsys):
 
     (plain,), notes = read(rows)
     assert not notes and not stress_stretch.loaded_at_rest([plain])
-    assert "turn back once" in read(rows + back)[1][0] and "turn back 3 times" in read((rows + back) * 2)[1][0]
-    assert "turn back 2 times" in read([(s, f * p) for f in (0.7, 1.0, 1.3) for s, p in rows])[1][0]  # three samples
+    assert "reverses once" in read(rows + back)[1][0] and "reverses 3 times" in read((rows + back) * 2)[1][0]
+    assert "reverses 2 times" in read([(s, f * p) for f in (0.7, 1.0, 1.3) for s, p in rows])[1][0]  # three samples
     with pytest.raises(InputError, match=r"stretches of 0\.5 and 30 do not have opposite stresses"):  # strains in %
         read([(s, 10 * s) for s in np.linspace(0.5, 30, 20)])
     assert not read(rows + [(2 - s, 1e3 * (2 - s - (2 - s) ** -2.0)) for s, _ in rows])[1]  # tension, then compression
@@ -189,7 +189,7 @@ def test_rows_without_a_stress_are_left_out_and_counted(tmp_path):
     (tmp_path / "c.csv").write_text(f"test,stretch,nominal_stress_kPa\n{rows}")
     (found,), notes = curves.read_curves([tmp_path / "c.csv"])
     assert np.allclose(found.stress, 1e3 * np.array([0, 1, 2, 4, 5]))
-    assert notes == ["c.csv: rows without a stress are left out: 1"]
+    assert notes == ["c.csv: rows without a stress are ignored: 1"]
 
 
 def test_headings_with_capitals_and_without_a_unit_are_read(tmp_path):

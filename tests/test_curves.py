@@ -137,7 +137,7 @@ def test_coefficients_that_are_given_are_fitted_and_the_others_named(tmp_path):
     (candidate,) = stress_stretch.candidates(f"{file}:third")
     assert candidate.names == ("c10", "c01", "c20", "c30")
     (note,) = candidate.notes
-    assert "c11 kept at 0 as given" in note and "c02, c21, c12, c03 left out" in note
+    assert "c11 kept at 0 as given" in note and "c02, c21, c12, c03 not fitted" in note
     truth = lj.laws.MooneyRivlin(c10=250.0, c01=90.0, c20=30.0, c30=60.0, bulk=None)
     found = stress_stretch.fit(candidate, synthetic(truth))
     assert np.allclose(found.values, [250.0, 90.0, 30.0, 60.0], rtol=1e-4)
@@ -168,7 +168,7 @@ def test_a_curve_that_no_law_follows_is_named():
     found = stress_stretch.fit(candidate, [tension, tension._replace(label="again"), foreign])
     (sentence,) = stress_stretch.unfollowed([tension, tension._replace(label="again"), foreign], [found])
     assert sentence.startswith(
-        "another unit: no law follows this curve. The nearest law (neo_hookean) misses the curve by"
+        "another unit: no law fits this curve. The nearest law (neo_hookean) misses the curve by"
     )
 
 
@@ -262,7 +262,7 @@ def test_a_law_that_misses_the_curve_is_not_taken_for_wrong_columns(tmp_path, ca
     (tmp_path / "c.csv").write_text("test,stretch,nominal_stress_Pa\n" + rows)
     main(["curves", "neo_hookean", str(tmp_path / "c.csv"), "--out", str(tmp_path)])
     said = capsys.readouterr().err
-    assert "the law is inadequate: try other laws" in said and "would follow" not in said
+    assert "the law is inadequate: try other laws" in said and "would fit" not in said
 
 
 @pytest.mark.draws

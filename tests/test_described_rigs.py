@@ -150,7 +150,7 @@ def test_rows_of_a_contact_that_shrinks_are_left_out(tmp_path, shape, back):
         with pytest.raises(lj.InputError, match="goes back from"):
             read_described(backwards)
         # 2 % of the depth is not yet a reversal.
-        assert said[0].startswith("13 rows from 4.8 s on are left out")
+        assert said[0].startswith("13 rows from 4.8 s on are ignored")
         assert test.time[-1] == pytest.approx(4.7)
 
 
@@ -241,7 +241,7 @@ def test_the_commands_take_a_description(tmp_path):
         ({"drive": "torque"}, "use displacement or force"),
         ({"height": 1e-4}, "more than half of the height"),
         ({"data": 3}, "must name a file"),
-        ({"ramp": 0.5}, "ramp = 0.5 cannot be used: leave it out"),
+        ({"ramp": 0.5}, "ramp = 0.5 cannot be used: remove ramp"),
         ({"min_time": -3.0}, "min_time = -3 cannot be seconds after the load"),
         ({"data": "none.csv"}, "none.csv"),
         ({"data": "shear.csv"}, "needs columns of time, displacement and force"),

@@ -64,7 +64,7 @@ def test_a_number_is_named_once(tmp_path, capsys):
     (tmp_path / "seen.csv").write_text("node,ux,uy,uz\n7,0,0,0.01\n")
     command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "seen.csv"), "--noise", "1e-3"]
     assert main([*command, "--parameters", "law.mu,law.mu", "--out", str(tmp_path / "out")]) == 2
-    assert "--parameters names law.mu twice: leave one out" in capsys.readouterr().err
+    assert "--parameters names law.mu twice: remove one" in capsys.readouterr().err
 
 
 def test_numbers_that_no_mesh_determines_are_not_blamed_on_the_mesh():

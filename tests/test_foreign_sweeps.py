@@ -322,7 +322,7 @@ def test_there_are_as_many_as_said():
 
 def test_holes_are_named(tmp_path):
     (note,) = read_sweep(written(tmp_path, "plain, holes")).notes
-    assert "2 of 8 points are left out as unusable: line 2: storage_modulus_Pa is empty; line 3: " in note
+    assert "2 of 8 points are ignored as unusable: line 2: storage_modulus_Pa is empty; line 3: " in note
     assert any("from |G*| and the phase" in n for n in read_sweep(written(tmp_path, "clipboard")).notes)
 
 

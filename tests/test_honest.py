@@ -195,7 +195,7 @@ def test_exact_data_are_moved_by_no_end():
 @pytest.mark.slow
 def test_noise_alone_is_not_told_to_be_an_end_and_a_wrong_model_is():
     right = [honest_modes(two_modes(0.02, seed=k), 2) for k in range(12)]
-    told = [any("half decade moves" in w for w in f.warnings) for f in right]
+    told = [any("half decade changes" in w for w in f.warnings) for f in right]
     assert sum(told) <= 2  # one of twenty is expected; before, half of them were reported
     # Where noise dominates, the changes have the predicted scatter (chi^2 of 12 numbers: 4 to 23).
     moved = (("first", "equilibrium_modulus"), ("last", "shear_modulus"), ("last", "relaxation_times[1]"))
@@ -211,7 +211,7 @@ def test_noise_alone_is_not_told_to_be_an_end_and_a_wrong_model_is():
     )
     G = 300 + 100 * (1j * OMEGA) ** 0.4
     f = honest_modes(Sweep(OMEGA, *noisy(G, 0.02)), 3)
-    assert any("half decade moves" in w for w in f.warnings) and "shear_modulus" in edges.moved(f)
+    assert any("half decade changes" in w for w in f.warnings) and "shear_modulus" in edges.moved(f)
 
 
 def test_what_a_model_misses_is_no_noise_that_explains_a_change():
@@ -248,7 +248,7 @@ def test_the_front_page_says_that_its_ends_decide(tmp_path, capsys):
     assert "Kramers-Kronig" in content["warnings"][0]
     # The last point is affected by the instrument. It is left out with a note; --max-frequency keeps it, with a
     # warning.
-    assert any("1 of 31 points above 12.64 Hz is left out" in note for note in content["notes"])
+    assert any("1 of 31 points above 12.64 Hz is ignored" in note for note in content["notes"])
     main([str(LIONS_MANE), "--method", "closed-form", "--max-frequency", "16", "--out", str(tmp_path)])
     kept = json.loads((tmp_path / "fit.json").read_text())
     assert len(kept["shear_waves"]["frequency_Hz"]) == 31
@@ -278,7 +278,7 @@ def test_the_total_error_has_every_share(tmp_path):
     # Leaving out the last half decade changes G0 by less than this error. So the table has no star, and there is no
     # warning.
     assert abs(change) < told["standard_errors"]["shear_modulus"]
-    ends = [w for w in told["warnings"] if "half decade moves" in w]
+    ends = [w for w in told["warnings"] if "half decade changes" in w]
     assert len(ends) == 1 and "relaxation_times" in ends[0] and "modulus" not in ends[0]
 
 
@@ -303,10 +303,10 @@ def test_points_outside_the_limits_are_left_out_and_said():
     s = read_sweep(LIONS_MANE)
     kept = within(s, 0.02, 12.65)
     assert kept.angular_frequency[0] > 0.1257 and kept.angular_frequency[-1] == pytest.approx(79.4327)
-    assert "left out as requested" in kept.notes[-1] and len(kept.storage_sd) == len(kept.storage)
+    assert "are ignored as requested" in kept.notes[-1] and len(kept.storage_sd) == len(kept.storage)
     assert within(s, None, None) is s and within(s, None, 1e9) is s
     for low, high, sentence in (
-        (None, 0.01, r"leave 0 of 31 points .*leave 3 or more"),
+        (None, 0.01, r"keep only 0 of 31 points .*keep 3 frequencies or more"),
         (None, -1.0, "--max-frequency -1 is no frequency"),
         (float("nan"), None, "--min-frequency nan is no frequency"),
     ):

@@ -128,7 +128,7 @@ def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
     assert np.isclose(content["contact_point"], START, atol=2e-6) and not content["warnings"]
     assert (tmp_path / "fit.png").stat().st_size > 1000
     told = capsys.readouterr()
-    assert "79 points after the deepest one are left out" in told.err and "half-space" in told.out
+    assert "79 points after the deepest one are ignored" in told.err and "half-space" in told.out
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
     [
         ("a,b\n1,2\n", [], "no header names depth and force"),
         ("depth_m,force_N\n0,0\n1e-4,x\n", [], "line 3: 'x' is not a finite number"),
-        ("depth_m,force_N\n0,0\n1e-4,1\n", [], "2 loading points"),
+        ("depth_m,force_N\n0,0\n1e-4,1\n", [], "the loading has 2 points"),
         ("depth_m,force_N\n" + "".join(f"-{k}e-5,-{k}e-3\n" for k in range(8)), [], "so change its sign"),
         (
             "depth_m,force_N\n" + "".join(f"{k}e-5,-{k**2}e-3\n" for k in range(30)),

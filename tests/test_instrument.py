@@ -51,7 +51,7 @@ def test_what_is_corrected_comes_nearer_and_has_an_honest_error():
         mended.append(np.abs(fit.uncertainty.values / values - 1))
         z.append((fit.uncertainty.values - values) / fit.uncertainty.standard_errors)
         assert (
-            "larger than the value that it subtracted" in better.notes[-1]
+            "larger than the value that was subtracted" in better.notes[-1]
             and "are corrected for it" in better.notes[-1]
         )
     assert np.mean(mended) < 0.7 * np.mean(plain)
@@ -117,7 +117,7 @@ def test_the_error_of_friction_is_that_of_scipy():
     assert numbers["friction_standard_error"] == pytest.approx(2e-7 * error, rel=0.01)
     assert (
         "the instrument's friction is 1" in better.notes[-1]
-        and "larger than the value that it subtracted" in better.notes[-1]
+        and "larger than the value that was subtracted" in better.notes[-1]
     )
 
 
@@ -181,7 +181,7 @@ def test_the_command_fits_friction_and_refuses_it_without_a_size(tmp_path, capsy
     assert abs(found["friction_off_by_N_m_s"]) < 4 * found["friction_standard_error"]
     assert main(words) == 2 and "give a positive number, e.g. 1e-7, and --radius" in capsys.readouterr().err
     sized = [*words, "--radius", "0.01", "--height", "0.004"]
-    assert main([*sized, "--model", "auto"]) == 2 and "leave out --model auto" in capsys.readouterr().err
+    assert main([*sized, "--model", "auto"]) == 2 and "remove --model auto" in capsys.readouterr().err
 
 
 def test_without_raw_columns_nothing_happens():

@@ -242,7 +242,7 @@ def test_parts_of_sums_and_of_laws_without_bulk():
     assert bare.isochoric_part() is bare and bare.volumetric_part() is None
     assert (bare + fluid).isochoric_part() is bare and (bare + fluid).volumetric_part() is fluid
     assert fluid.isochoric_part() is None and (bare + LAWS["saint_venant_kirchhoff"]).isochoric_part() is None
-    with pytest.raises(lj.InputError, match="one each per term"):
+    with pytest.raises(lj.InputError, match="one mu and one alpha for each term"):
         (bare + lj.laws.Ogden(mu=(1.0, 2.0), alpha=(2.0,), bulk=1.0)).check()
 
 

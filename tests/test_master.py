@@ -244,7 +244,7 @@ def test_a_sweep_at_several_temperatures_that_fits_nothing_gets_the_remedy(tmp_p
         (
             "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n1,2,1,20\n2,3,1,20\n3,4,1,20\n",
             [],
-            "two or more temperatures, these are all at 20",
+            "two or more temperatures, but all sweeps are at 20",
         ),
         (
             "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n"
@@ -253,7 +253,7 @@ def test_a_sweep_at_several_temperatures_that_fits_nothing_gets_the_remedy(tmp_p
             "do not match",
         ),
         ("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_K\n1,2,1,-3\n2,3,1,20\n", [], "absolute zero"),
-        ("", ["--with", "a.csv"], "leave out --with"),
+        ("", ["--with", "a.csv"], "remove --with"),
     ],
 )
 def test_what_cannot_be_shifted_gets_one_sentence(tmp_path, capsys, text, options, sentence):

@@ -238,7 +238,10 @@ def _confined(order: int, ratio: float, tolerance: float) -> lj.Scene:
     )
 
 
-_CONFINED = pytest.mark.parametrize(("order", "ratio", "tolerance"), [(1, 1e4, 1e-6), (2, 1e4, 1e-4), (1, 1e3, 1e-4)])
+#: At K/mu = 1e6, roundoff of the forces of a displacement form counted as a solution: 4 % of a force was missing.
+_CONFINED = pytest.mark.parametrize(
+    ("order", "ratio", "tolerance"), [(1, 1e4, 1e-6), (2, 1e4, 1e-4), (1, 1e3, 1e-4), (1, 1e6, 1e-6)]
+)
 
 
 @_CONFINED

@@ -339,7 +339,7 @@ def test_the_command_writes_the_model(model, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--model", "spectrum", "--modes", "3"], "--modes 3 works with --model prony only: leave it out"),
+        (["--model", "spectrum", "--modes", "3"], "--modes 3 works with --model prony only: remove it"),
         (["--model", "auto", "--profile"], "--profile works with --model prony only"),
     ],
 )
@@ -447,7 +447,9 @@ def test_limits_of_prony_modes_have_the_error_of_their_band(name, limits):
         if true is not None:
             assert abs(content[key] - true) < 3 * content["standard_errors"][key]
             assert abs(content[key] - true) > 3 * family_limits.limit_errors(fit.uncertainty, fit.model, None)[key]
-            assert any(f"{family_limits.NAMES[key]} of the" in w and "measured band only" in w for w in fit.warnings)
+            assert any(
+                f"{family_limits.NAMES[key]} of the" in w and "only over the measured" in w for w in fit.warnings
+            )
     prony = viscoelastic.closed_form(s, 2)
     assert sweep_report.summary(prony, s)["standard_errors"]["shear_modulus"] == prony.uncertainty.standard_errors[0]
 

@@ -29,11 +29,11 @@ def test_what_is_put_is_got(name, value):
     [
         ("0.nu", "no: did you mean 0.mu?"),
         ("0.volumetric", "no: use one of 0.mu, 0.bulk"),
-        ("1.mu.2", "no: '2' leads nowhere: use an index from 0 to 1"),
-        ("2.mu", "no: '2' leads nowhere: use an index from 0 to 1"),
+        ("1.mu.2", "no: '2' is not a name or index here: use an index from 0 to 1"),
+        ("2.mu", "no: '2' is not a name or index here: use an index from 0 to 1"),
         ("mu", "no: did you mean 0.mu or 1.mu?"),
-        ("0.mu.0", "no: '0' leads nowhere"),
-        ("", "no: '' leads nowhere: use an index from 0 to 1"),
+        ("0.mu.0", "no: '0' is not a name or index here"),
+        ("", "no: '' is not a name or index here: use an index from 0 to 1"),
     ],
 )
 def test_names_that_lead_nowhere_are_refused(name, sentence):

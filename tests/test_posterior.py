@@ -288,7 +288,7 @@ def test_the_posterior_through_the_simulation_is_checked_by_simulating(tmp_path)
     ("arguments", "sentence"),
     [
         (["--samples", "5"], "--samples 5 is out of range: give 100 to 100000"),
-        (["--samples", "1000", "--model", "spectrum"], "leave it out for --model spectrum"),
+        (["--samples", "1000", "--model", "spectrum"], "remove it for --model spectrum"),
         ([str(PORCINE), "--samples", "1000"], "is for one sample only, and 2 files are given"),
     ],
 )

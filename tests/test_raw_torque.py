@@ -86,7 +86,7 @@ def test_the_phase_alone_tells_the_share_of_the_instrument(tmp_path):
 def test_what_is_not_told_changes_nothing(tmp_path):
     s = export(tmp_path / "a.txt", sample=False, phase=False)
     told = without_inertia(s)  # neither the torque of the sample nor its size
-    assert told.grey is None and told.inertia is None and "give --radius and --height for it" in told.notes[-1]
+    assert told.grey is None and told.inertia is None and "give --radius and --height" in told.notes[-1]
     light = export(tmp_path / "b.txt", inertia=1e-12)
     assert without_inertia(light).grey is None and len(without_inertia(light).storage) == 20
 
@@ -94,7 +94,7 @@ def test_what_is_not_told_changes_nothing(tmp_path):
 def test_phases_written_as_lags_are_turned(tmp_path):
     s = export(tmp_path / "l.txt", sample=False)
     turned = without_inertia(s._replace(raw={"phase": -s.raw["phase"]}))
-    assert "their sign is changed" in turned.notes[0]
+    assert "after a change of sign" in turned.notes[0]
     assert np.allclose(turned.inertia, without_inertia(s).inertia, rtol=1e-9)
 
 
@@ -110,7 +110,7 @@ def test_raw_columns_without_a_unit_are_named_and_degrees_are_read(tmp_path):
 
 
 def test_a_sweep_of_nothing_but_the_instrument_is_refused(tmp_path):
-    with pytest.raises(InputError, match="nearly all points show the instrument"):
+    with pytest.raises(InputError, match="the instrument dominates at nearly all points"):
         without_inertia(export(tmp_path / "e.txt", inertia=1.0))
 
 

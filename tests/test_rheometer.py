@@ -177,7 +177,7 @@ BAD = {
     "milli": (HEADER.replace("storage_modulus_Pa", "storage_modulus_mPa") + ROWS, "unit 'mPa'"),
     "angular in Hz": (HEADER.replace("frequency_Hz", "angular_frequency_Hz") + ROWS, "angular frequency in Hz"),
     "disagree": ("angular_frequency_rad_s," + HEADER + "1,1,300,30\n2,2,400,60\n", "disagree"),
-    "decimal comma": (HEADER + '"1,5","337,8","34,7"\n', "it has 1 frequency"),
+    "decimal comma": (HEADER + '"1,5","337,8","34,7"\n', "the file has 1 frequency"),
     "decimal comma bare": (HEADER + "1,5,337,8,34,7\n", "6 cells under 3 headings"),
     "one frequency": (HEADER + "1,300,30\n1,310,31\n1,320,33\n", "at least two different"),
     "huge": (HEADER + ROWS.replace("400", "1e200"), "beyond any measurement"),

@@ -49,7 +49,7 @@ def test_unusable_points_are_left_out_and_named(tmp_path, bad):
     assert s.storage.tolist() == [200, 300, 400] and s.loss.tolist() == [20, 30, 60]
     (note,) = s.notes
     told = "loss_modulus_Pa is empty" if bad == "nan" else f"loss_modulus_Pa = {float(bad):g} is "
-    assert "1 of 4 points is left out" in note and f"line 5: {told}" in note
+    assert "1 of 4 points is ignored" in note and f"line 5: {told}" in note
 
 
 def test_too_few_usable_points_are_refused(tmp_path):
@@ -103,7 +103,7 @@ def test_one_modulus_of_tension_makes_the_other_one_too(tmp_path):
     found = read_sweep(tmp_path / "s.csv")
     assert np.allclose(found.loss, 100) and any("loss_modulus_Pa are of tension" in n for n in found.notes)
     (tmp_path / "s.csv").write_text("frequency_Hz,tensile_storage_modulus_Pa,shear_loss_modulus_Pa\n" + rows)
-    with pytest.raises(InputError, match="name both alike"):
+    with pytest.raises(InputError, match="name both in the same way"):
         read_sweep(tmp_path / "s.csv")
 
 

@@ -147,22 +147,54 @@ def test_workbooks_that_cannot_be_read_are_one_sentence(tmp_path, monkeypatch):
 BELOW = "Point,Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)\n1,0.1,1000,100\n2,0.5,1100,120\n3,1,1200,150\n"
 
 
-@pytest.mark.parametrize("word", ["Mean", "SD", "Average:", "Std. Dev.", "Mittelwert", "CV (%)"])
+@pytest.mark.parametrize("word", ["Mean", "±SD", "Average:", "Std. Dev.", "Mean (n=3)", "CV (%)"])
 def test_a_summary_below_a_table_is_no_point(tmp_path, word):
     """A row "Mean" was fitted as a sixth point, at the mean of the frequencies."""
     s = read_sweep(_write(tmp_path, f"{BELOW}4,5,1400,200\n{word},1.65,1175,142\n"))
     assert list(s.storage) == [1000, 1100, 1200, 1400] and f"line 6 is a summary of other rows ({word})" in s.notes[0]
 
 
-def test_a_word_that_most_rows_have_marks_no_summary(tmp_path):
-    text = "Value,Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)\n" + 3 * "mean,{},1000,100\n"
-    s = read_sweep(_write(tmp_path, text.format(0.1, 1, 10)))
-    assert len(s.storage) == 3 and s.notes == ()
+def test_a_summary_may_stand_in_the_column_of_the_frequency(tmp_path):
+    text = "Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)\n0.1,1000,100\n1,1200,150\n10,1500,260\n"
+    s = read_sweep(_write(tmp_path, text + "Mean,1233,170\nSD,200,60\n"))
+    assert list(s.storage) == [1000, 1200, 1500] and len(s.notes) == 2
 
 
+@pytest.mark.parametrize(
+    "rows",
+    [
+        "mean,0.1,1000,100\nmean,1,1200,150\nmean,10,1500,260\n",
+        "A,0.1,1000,100\nMax,1,1200,150\nMax,10,1500,260\n",
+        "Auto,0.1,1000,100\nMean,1,1200,150\nAuto,10,1500,260\n",
+    ],
+)
+def test_a_word_of_a_label_marks_no_summary(tmp_path, rows):
+    """A sample or a torque range may have such a name. The four highest frequencies of a sweep were ignored."""
+    s = read_sweep(_write(tmp_path, f"Range,Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)\n{rows}"))
+    assert list(s.storage) == [1000, 1200, 1500] and s.notes == ()
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Frequency (Hz), Storage modulus (Pa), Loss modulus (Pa)\t",
+        "Frequency\t(Hz), Storage modulus\t(Pa), Loss modulus\t(Pa)",
+    ],
+)
+def test_other_signs_in_a_header_of_commas_are_no_delimiters(tmp_path, header):
+    s = read_sweep(_write(tmp_path, f"{header}\n0.1, 1000, 100\n1, 1200, 150\t\n10, 1500, 260\n"))
+    assert list(s.storage) == [1000, 1200, 1500] and np.isclose(s.angular_frequency[0], 0.2 * np.pi)
+
+
+@pytest.mark.parametrize("space", ["", " "])
 @pytest.mark.parametrize("between", "\t;")
-def test_commas_before_units_are_no_delimiters(tmp_path, between):
-    rows = (("Frequency, Hz", "G', Pa", "G'', Pa"), ("0,1", "1000", "100"), ("1", "1200", "150"), ("10", "1500", "260"))
+def test_commas_before_units_are_no_delimiters(tmp_path, between, space):
+    rows = (
+        (f"Frequency,{space}Hz", f"G',{space}Pa", f"G'',{space}Pa"),
+        ("0,1", "1000", "100"),
+        ("1", "1200", "150"),
+        ("10", "1500", "260"),
+    )
     s = read_sweep(_write(tmp_path, "\n".join(between.join(row) for row in rows)))
     assert list(s.storage) == [1000, 1200, 1500] and np.isclose(s.angular_frequency[0], 0.2 * np.pi)
 

@@ -60,7 +60,7 @@ def test_the_reader_weighs_by_the_scatter_and_says_so(tmp_path):
     lost = file.read_text().splitlines()
     lost[4:7] = [line.rsplit(",", 1)[0] + ",-3.0" for line in lost[4:7]]
     file.write_text("\n".join(lost))
-    assert any("3 points are left out because loss_modulus_Pa is not above" in note for note in read_sweep(file).notes)
+    assert any("3 points are ignored because loss_modulus_Pa is not above" in note for note in read_sweep(file).notes)
     assert not any("misses the data" in w or "not noise" in w for w in fit.warnings)
 
 

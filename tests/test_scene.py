@@ -106,7 +106,11 @@ def test_parameters_by_the_files_own_names(folder):
     assert np.allclose(changed.viscosity.ratios, [0.1, 0.333])
     assert changed.body.density == 1000.0 and changed.solve.dt == 0.1
     assert jax.tree.structure(changed) == jax.tree.structure(scene)  # nothing is compiled again
-    for name, near in (("law.0.mew", "mu"), ("viscosty.ratios", "viscosity"), ("law.5.mu", "leads nowhere")):
+    for name, near in (
+        ("law.0.mew", "mu"),
+        ("viscosty.ratios", "viscosity"),
+        ("law.5.mu", "is not a name or index here"),
+    ):
         with pytest.raises(lj.InputError, match=near):
             lj.with_parameters(scene, {name: 1.0})
 

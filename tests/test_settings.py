@@ -268,7 +268,10 @@ MESHES = {
         {"shape": "box", "size": [1, 1, 1], "cells": [1, 1, 1], "radius": 3.0},
         "radius has no effect for shape = 'box'",
     ),
-    "box rim": ({"shape": "box", "size": [1, 1, 1], "cells": [1, 1, 1], "match_area": True}, "match_area has no effect"),
+    "box rim": (
+        {"shape": "box", "size": [1, 1, 1], "cells": [1, 1, 1], "match_area": True},
+        "match_area has no effect",
+    ),
     "cylinder": (
         {"shape": "cylinder", "radius": 1.0, "height": 1.0, "cell_size": 1.0, "size": [1, 1, 1]},
         "size has no effect",

@@ -92,7 +92,7 @@ def test_one_sentence_for_what_cannot_be_used(changes, sentence):
 
 
 def test_depths_beyond_the_table_are_refused():
-    with pytest.raises(InputError, match="leave deeper points out"):
+    with pytest.raises(InputError, match="remove all deeper points"):
         Layer(Indenter("cone", 1e-3, 0.4)).force(np.array([1.0]))
     for rig in (Indenter("punch", 1e-2, 0.5, radius=1e-3), Indenter("sphere", 1e-2, 0.5, radius=5e-3)):
         with pytest.raises(InputError, match="depth = nan m is not within"):

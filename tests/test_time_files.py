@@ -73,12 +73,12 @@ BAD = {
     "the other test": ("time_s,creep_compliance_1/Pa\n" + ROWS, [], "a relaxation test needs"),
     "few rows": ("time_s,relaxation_modulus_Pa\n1,2\n", [], "1 rows of numbers"),
     "unit": ("time_s,relaxation_modulus [bar]\n" + ROWS, [], "unit 'bar' of modulus is not known"),
-    "text": ("time_s,relaxation_modulus_Pa\n0.1,900\n1,soft\n", [], "line 3: '1,soft' has a cell that is no number"),
+    "text": ("time_s,relaxation_modulus_Pa\n0.1,900\n1,soft\n", [], "line 3: '1,soft' has a cell that is not a number"),
     "order": ("time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n0.5,6\n2,5\n3,5\n", [], "follows"),
     "stamps": (
         "time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n1,6\n2,5\n3,5\n",
         [],
-        "two rows have the time 1 s: write times with more digits, or replace both by a mean",
+        "two rows have the time 1 s: write times with more digits, or replace both rows by their mean",
     ),
     "backwards": (
         "time_s,relaxation_modulus_Pa\n3,5\n2,6\n1,7\n0.5,8\n",
@@ -96,14 +96,14 @@ BAD = {
     "ramp in rows": (
         "time_s,strain,stress_Pa\n0,0,0\n1,0.5,7\n2,1,6\n3,1,5\n",
         ["--ramp", "1"],
-        "since the rows show how the load rose: leave it out",
+        "since the rows show how the load rose: remove it",
     ),
     "ramp too long": (
         "time_s,strain,stress_Pa\n0,0,0\n1,1,7\n2,1,6\n3,1,5\n",
         ["--ramp", "2"],
-        "since the load rose between 0 and 1 s: leave it out",
+        "since the load rose between 0 and 1 s: remove it",
     ),
-    "late": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "5"], "2 usable responses are left"),
+    "late": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "5"], "2 usable responses remain"),
     "early": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "-1"], "--min-time -1 cannot be seconds after"),
     "modes": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--modes", "9"], "--modes 9 is out of range"),
     "radius": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--radius", "4"], "--radius 4 cannot be"),
@@ -185,7 +185,7 @@ def test_empty_cells_and_thousands_of_records(text, tmp_path):
     (tmp_path / "a.csv").write_text(text)
     found = read_time_test(tmp_path / "a.csv", "relaxation")
     assert found.answer[found.used].tolist() == [1200.5, 1100.25, 987.5, 950]
-    assert any("1 of 5 rows are left out: a cell in them is empty" in n for n in found.notes)
+    assert any("1 of 5 rows are ignored: a cell in them is empty" in n for n in found.notes)
 
 
 def test_an_offset_that_one_row_shows_is_told(tmp_path):
@@ -230,7 +230,7 @@ def test_a_load_that_rises_between_two_rows_may_be_a_step(tmp_path, capsys):
         error, out = found["total_errors"]["shear_modulus"], capsys.readouterr()
         assert abs(found["shear_modulus"] - 2000) < 1.1 * error
         assert (error > 500) == (not options)
-        assert ("If it was a step at 1 s, G0 is 2000 Pa instead of 281" in out.err) == (not options)
+        assert ("If the change was a step at 1 s, G0 is 2000 Pa instead of 281" in out.err) == (not options)
     assert found["standard_errors"]["shear_modulus"] < 10
 
 
@@ -242,7 +242,7 @@ def test_a_load_before_the_rows_may_be_a_step_at_the_beginning(tmp_path, capsys)
     assert main(["relaxation", str(file), "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "fit.json").read_text())
     assert abs(found["shear_modulus"] - 900) < 1.2 * found["total_errors"]["shear_modulus"]
-    assert "a straight rise is assumed. If it was a step at 0 s, G0 is" in capsys.readouterr().err
+    assert "a linear rise is assumed. If the load was a step at 0 s, G0 is" in capsys.readouterr().err
     # With one column and a stated ramp, nothing is unknown.
     file = write(tmp_path / "m.csv", "time_s,relaxation_modulus_Pa", t, relaxation(SOLID, t) * noise)
     assert main(["relaxation", str(file), "--ramp", "0.2", "--out", str(tmp_path)]) == 0
@@ -285,7 +285,7 @@ def test_rest_before_the_load_and_a_strain_that_scatters_do_not_matter(tmp_path,
     test = read_time_test(write(tmp_path / "t.csv", "time_s,strain [1],stress_Pa", t, strain, stress), "relaxation")
     assert abs(test.begun - 3.98) < 0.1 and test.resolved[0] < 0.2
     assert any("rows before it are not fitted" in note for note in test.notes)
-    assert any("a straight ramp from 3.98 to 4.18 s" in note for note in test.notes) == bool(noise)
+    assert any("a linear ramp from 3.98 to 4.18 s" in note for note in test.notes) == bool(noise)
     f = fits.fit(test)
     assert f.modes == 2 and np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=0.08 if noise else 0.03)
 
@@ -303,7 +303,7 @@ def test_a_ramp_that_scatters_gives_what_the_exact_ramp_gives(tmp_path, noise):
     exact = fits.fit(read_time_test(write(tmp_path / "a.csv", head, t, strain, stress), "relaxation"))
     shown = strain + noise * 0.01 * rng.standard_normal(len(t))
     test = read_time_test(write(tmp_path / "b.csv", head, t, shown, stress), "relaxation")
-    assert any("a straight ramp from" in note for note in test.notes)
+    assert any("a linear ramp from" in note for note in test.notes)
     own = fits.fit(test)
     # 60 readings with 1 % of scatter give an error of 0.13 % in the strain level, and as much from the end of the ramp.
     assert np.isclose(own.uncertainty.values[0], exact.uncertainty.values[0], rtol=0.01)
@@ -402,7 +402,7 @@ def test_lines_of_words_unknown_units_and_further_tables_are_told(tmp_path):
     file.write_text("\n".join([*lines[:20], "segment 2: hold,,", *lines[20:]]))
     marked = read_time_test(file, "relaxation", ramp=0.0)
     assert np.array_equal(marked.answer, whole.answer, equal_nan=True)
-    assert marked.notes == ("line 21, 'segment 2: hold,,', has no numbers and is left out",)
+    assert marked.notes == ("line 21, 'segment 2: hold,,', has no numbers and is ignored",)
     file.write_text("\n".join([*lines, "", "sample B", *lines]))
     two = read_time_test(file, "relaxation", ramp=0.0)
     assert np.array_equal(two.answer, whole.answer, equal_nan=True) and "2 tables of a test" in two.notes[0]

@@ -130,7 +130,7 @@ def test_history_has_only_what_the_scheme_needs(table_2):
         ({"ratios": (0.6, 0.5)}, "add up to less than 1"),
         ({"ratios": (-0.1, 0.5)}, "at least 0"),
         ({"relaxation_times": (0.0, 1.0)}, "must be above 0 s"),
-        ({"relaxation_times": (1.0,)}, "one each per mode"),
+        ({"relaxation_times": (1.0,)}, "one ratio and one relaxation time for each mode"),
         ({"scheme": "euler"}, "use exponential or backward_euler"),
         ({"part": "deviatoric"}, "use all or isochoric"),
         ({"part": "isochoric"}, "SaintVenantKirchhoff has not"),

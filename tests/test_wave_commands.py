@@ -137,7 +137,7 @@ def test_too_few_balances_and_a_length_in_millimetres_are_refused(tmp_path, caps
     """4 x 4 x 4 voxels have one brick, with fewer balance equations than pressures."""
     path = written(tmp_path, ".npz", plane_waves((4, 4, 4)))
     assert command.main(["waves", str(path), "--noise", "1e-7", "--out", str(tmp_path / "out")]) == 2
-    assert "give 0 equations, without those for the unknown pressures. At least 10 are" in capsys.readouterr().err
+    assert "give 0 equations more than unknown pressures. At least 10 are" in capsys.readouterr().err
     path = written(tmp_path, ".npz", plane_waves((7, 7, 9), noise=1e-7))
     assert command.main(["waves", str(path), "--out", str(tmp_path / "out"), "--length", "4"]) == 2
     assert "--length 4 m is much longer than the organ (0.016 m)" in capsys.readouterr().err
@@ -150,7 +150,9 @@ def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
     for write in (lambda file: file.write_text("no progress"), lambda file: h5py.File(file, "w").close()):
         file = tmp_path / "progress.h5"
         write(file)
-        with pytest.raises(InputError, match=r"belongs to another fit|is damaged, or from another program: leave out"):
+        with pytest.raises(
+            InputError, match=r"belongs to another fit|is damaged, or from another program: remove --resume"
+        ):
             stiffness_map._first_or_resumed(course, file)
 
 
@@ -193,7 +195,7 @@ def test_a_map_goes_on_from_its_own_problem_alone(tmp_path, other):
     if changed:
         w = w._replace(**{changed: 1.01 * getattr(w, changed)})
     different = stiffness_map.course_of(own.body, m, w, modulus(HERTZ), 0.02 if other == "length" else length)
-    with pytest.raises(InputError, match=rf"belongs to another fit \({other} differs?\): leave out --resume"):
+    with pytest.raises(InputError, match=rf"belongs to another fit \({other} differs?\): remove --resume"):
         stiffness_map._first_or_resumed(different, file)
 
 
@@ -221,12 +223,12 @@ def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
 @pytest.mark.parametrize(
     "options, words",
     [
-        (["--density", "1"], "cannot be an organ's"),
+        (["--density", "1"], "cannot be the density of an organ"),
         (["--stride", "0"], "--stride 0"),
         (["--noise", "-1"], "--noise -1 must be above 0"),
         (["--frequencies", "0"], "must be above 0 Hz"),
         (["--mask", "none.npz"], "no such file"),
-        (["--stride", "3"], "waves need at least 3"),
+        (["--stride", "3"], "at least 3 are needed along"),
     ],
 )
 def test_options_that_cannot_be_are_refused_in_a_sentence(tmp_path, options, words, capsys):

@@ -207,7 +207,7 @@ def test_a_damaged_or_unknown_file_gets_a_sentence(tmp_path, ending):
 @pytest.mark.parametrize("asked", [[50.0, 70.0], [60.0, 80.0, 100.0], [60.0]])
 def test_other_frequencies_than_those_of_the_file_are_refused(tmp_path, asked):
     path = written(tmp_path, ".npz", plane_waves((5, 5, 5)))
-    with pytest.raises(InputError, match="leave out --frequencies"):
+    with pytest.raises(InputError, match="remove --frequencies"):
         wave_field.read_waves(path, asked)
 
 
@@ -373,3 +373,15 @@ def test_labels_that_lie_elsewhere_than_the_waves_are_refused(tmp_path, turned):
         return
     read = wave_field.read_waves(tmp_path / "w.nii", labels=tmp_path / "l.nii", frequencies=list(HERTZ))
     assert np.array_equal(read.labels, labels)
+
+
+def test_arrays_of_nearly_known_names_are_told(tmp_path):
+    """A mask of a wrong name was ignored without a word."""
+    field = plane_waves((5, 5, 5))
+    arrays = {"displacement": field.displacement, "spacing": field.spacing, "frequencies": HERTZ}
+    np.savez(tmp_path / "waves.npz", **arrays, masks=field.mask, image=np.zeros(3))
+    assert "the array 'masks' is not used: did you mean mask?" in wave_field.read_waves(tmp_path / "waves.npz").notes
+    arrays["Displacement"] = arrays.pop("displacement")
+    np.savez(tmp_path / "waves.npz", **arrays)
+    with pytest.raises(InputError, match=r"no waves.*'Displacement' is not used: did you mean displacement"):
+        wave_field.read_waves(tmp_path / "waves.npz")

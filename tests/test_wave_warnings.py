@@ -48,7 +48,7 @@ def test_a_frequency_of_noise_alone_is_named_and_a_number_at_its_bound():
     size = float(np.sqrt(np.mean(np.abs(field.displacement[0]) ** 2) / 2))
     assert not cautions._of_no_motion(field._replace(noise=np.array([0.05 * size])), 0)
     (said,) = cautions._of_no_motion(field._replace(noise=np.array([0.98 * size])), 0)
-    assert "are hardly larger than their noise" in said and said.endswith("leave this frequency out")
+    assert "are hardly larger than their noise" in said and said.endswith("remove the data of this frequency")
     own = {"numbers": {"exponent": 1.0, "springpot": 2.0}, "standard_errors": {"exponent": None, "springpot": 0.1}}
     blank = {"regions": None, "map": None, "frequencies_Hz": [], "whole": {}, "direct_inversion": {"whole": {}}}
     spring = {"whole": own | {"model": "springpot", "frequencies": 3, "mean_relative_error": 0.043}}
@@ -163,7 +163,7 @@ def test_moduli_that_no_springpot_has_are_written_all_the_same(tmp_path):
 
 def test_a_field_that_holds_no_number_is_named(tmp_path):
     field = plane_waves((6, 6, 6), noise=1e-7)
-    for part, words in ((slice(None), "the noise at 100 Hz cannot .* remove this field"), (slice(0, 3), "")):
+    for part, words in ((slice(None), "noise at 100 Hz cannot .* remove this displacement field"), (slice(0, 3), "")):
         U = field.displacement.copy()
         U[1, part] = np.nan
         np.savez(tmp_path / "w.npz", displacement=U, spacing=[H] * 3, frequencies=HERTZ)

@@ -11,7 +11,7 @@ def in_place() -> str:
     u = data["unloaded"][0]
     return (
         f"largest displacement under a fifth of gravity: {said}; the unloaded shape is found in {u['run_s']:.2g} s, "
-        "and its loads bring it back to the given shape to within "
+        "and the loads deform it into the given shape with an error of "
         f"{u['back_m']:.0e} m"
     )
 
@@ -23,10 +23,10 @@ def indented() -> str:
     fits = data["fits"]
     moduli, covered = [r["modulus_off"] for r in fits], [r["modulus_covered"] for r in fits]
     return (
-        f"a layer as thick as the contact's radius passes for {soft[1.0]['hertz']:.2g} times its modulus with Hertz, "
-        f"one ten times as thick for {soft[10.0]['hertz']:.2g} times; with {percent(data['noise'])} of noise fits are "
-        f"{percent(min(moduli))} to {percent(max(moduli))} off (median), intervals cover {percent(min(covered))} to "
-        f"{percent(max(covered))}"
+        f"for a layer as thick as the contact radius, Hertz's formula gives {soft[1.0]['hertz']:.2g} times the true "
+        f"modulus, for a layer ten times as thick {soft[10.0]['hertz']:.2g} times; with {percent(data['noise'])} of "
+        f"noise the error of fits is {percent(min(moduli))} to {percent(max(moduli))} (median), and 95 % intervals "
+        f"cover the true modulus in {percent(min(covered))} to {percent(max(covered))} of cases"
     )
 
 
@@ -38,12 +38,18 @@ def table() -> str:
 def _liver() -> list[str]:
     (data,) = load("liver_in_place")
     rows = [
-        "The liver phantom at rest under 2 m/s2, hyperelastic, four load steps. The tip is the node that moves most by",
-        "itself; beside it what the mesh's estimate adds. Quadratic elements on the same mesh tell if it is right;",
-        "with them no solution was found where there is a thin capsule, which wrinkles. Estimates and runs in",
-        "motion were timed beside a dozen other jobs, about fifteen times as long as on two free cores:",
+        'The hyperelastic liver phantom is at rest under gravity of 2 m/s2, applied in four load steps. "Held at two '
+        'places" means that only two regions of the surface are fixed. The tip is the node that moves most in this '
+        "case.",
+        '"The mesh adds" is the estimated error of the mesh at the tip. Quadratic elements on the same mesh show if '
+        "this estimate is right.",
+        "With quadratic elements no solution was found with the thin capsule, because it wrinkles. Estimates and runs "
+        "in",
+        "motion were timed while a dozen other jobs were running, and took about fifteen times as long as on two free "
+        "cores:",
         "",
-        "| held | elements | largest | mean | tip | the mesh adds | Newton a step | run | compile | estimate |",
+        "| supports | elements | largest displacement | mean | tip | the mesh adds | Newton iterations per step | run "
+        "| compilation | estimate |",
         "|---" * 10 + "|",
     ]
     for r in data["rest"]:
@@ -53,22 +59,30 @@ def _liver() -> list[str]:
         rows.append(f"| {r['name']} | {form} | {found} | {_tip(r)} | {r['newton_per_step']:.1f} | {times} |")
     for r in data["rest"]:
         if "plane_N" in r and r["converged"] and r["name"] == "with plane":
-            rows += ["", f"The plane carries {r['plane_N']:.2g} N; the surface is {1e6 * r['depth_m']:.2g} um in it."]
+            rows += [
+                "",
+                f"The plane carries {r['plane_N']:.2g} N. The surface enters it by {1e6 * r['depth_m']:.2g} um.",
+            ]
     rows.append("")
     for u in data["unloaded"]:
         rows.append(
-            f"The unloaded shape of the phantom as loaded, {u['name']}: {1e3 * u['largest_m']:.2g} mm away, found "
-            f"in {u['run_s']:.2g} s; the run from it ends {u['back_m']:.0e} m from the given shape."
+            f"The given shape is now assumed to be the loaded shape ({u['name']}). The unloaded shape differs from it "
+            f"by {1e3 * u['largest_m']:.2g} mm and is found in {u['run_s']:.2g} s. Its loads deform it into the given "
+            f"shape with an error of {u['back_m']:.0e} m."
         )
     rows += [
         "",
-        "In motion, let fall at once, steps of 0.05 s; the tip at its peak. The estimate of the complete model fails",
-        "in some steps. With all parts its equations have negative curvature: the capsule is pressed together in its",
-        "plane and has no stiffness against bending, and quadratic functions can wrinkle between the vertices. Along",
-        "the direction that conjugate gradients met, the capsule lost more than the body held. Held at two places, the",
-        "change turns elements inside out from the third step on.",
-        "These estimates used richer elements, without the fluid's pressures. Scenes with a fluid and without vessels",
-        "are now estimated on a finer mesh: this table has not been run again since.",
+        "The next table is for the motion after gravity is switched on suddenly, in steps of 0.05 s. The displacement "
+        "of the tip is its peak. The estimate of the complete model fails",
+        "in some steps. With all supports, the energy in its equations has directions of negative curvature. The "
+        "reason is that the capsule is compressed in its",
+        "plane and has no bending stiffness, and quadratic functions can wrinkle between the vertices. In",
+        "the direction that the conjugate gradients found, the energy of the capsule decreases by more than the "
+        "energy of the body increases. If the phantom is held at two places, the",
+        "estimated change inverts elements from the third step on.",
+        "These estimates used elements of the next higher order, without the error of the fluid's pressures. For "
+        "scenes with a fluid and without vessels,",
+        "the program now uses a finer mesh instead. This table has not been computed again since then.",
         "",
         "| model | elements | peak | tip | the mesh adds | fluid's pressure | run | estimate |",
         "|---" * 8 + "|",
@@ -88,7 +102,7 @@ def _finer(data: dict) -> list[str]:
     for r in data.get("finer", []):
         if r["converged"]:
             more = r["peak_m"] / linear[r["name"]]["peak_m"] - 1
-            found.append(f"{r['name']}: the peak is {percent(more)} higher, the step was cut {r['cuts']} times")
+            found.append(f"{r['name']}: the peak is {percent(more)} higher, and the step was cut {r['cuts']} times")
         else:
             found.append(f"{r['name']}: a step failed")
     return [f"Quadratic elements on the same mesh, in motion: {'; '.join(found)}.", ""] if found else []
@@ -97,14 +111,15 @@ def _finer(data: dict) -> list[str]:
 def _clamps(data: dict) -> list[str]:
     """Line on why quadratic elements fail where the phantom is fixed at two regions only."""
     said = [
-        f"{r['name']}: {r['elements']} at {r['time_s']:.2g} s, all within {_mm(r['away_m'])} of a held node; a "
-        f"place carries {r['mean_Pa']:.0f} Pa on average; the law allows a volume of 0 at {r['gone_Pa']:.0f} Pa"
+        f"{r['name']}: {r['elements']} at {r['time_s']:.2g} s, all within {_mm(r['away_m'])} of a fixed node, where a "
+        f"fixed region carries {r['mean_Pa']:.0f} Pa on average and the law reaches a volume of 0 at "
+        f"{r['gone_Pa']:.0f} Pa"
         for r in data.get("clamps", [])
     ]
     why = (
-        "Held at two places, quadratic elements are pressed inside out at the edges of the clamps. There the pressure "
-        "is several times the mean, and the energies of the volume are finite where it is gone. Half the time step "
-        "and robust steps end the same. Elements inside out: "
+        "If the phantom is held at two places, quadratic elements are inverted at the edges of the fixed regions. "
+        "There the pressure is several times the mean, and the volumetric energies are finite at a volume of 0. Half "
+        "the time step and `robust` give the same result. Numbers of inverted elements: "
     )
     return [f"{why}{'; '.join(said)}.", ""] if said else []
 
@@ -118,7 +133,9 @@ def _tip(r: dict) -> str:
     tip = _mm(r["tip_m"]) if "tip_m" in r else ""
     if "mesh_m" not in r:
         return f"{tip} | "
-    return f"{tip} | " + (f"{1e3 * r['mesh_m']:+.2g} mm" if r["mesh_found"] else "no estimate: a step of it failed")
+    return f"{tip} | " + (
+        f"{1e3 * r['mesh_m']:+.2g} mm" if r["mesh_found"] else "no estimate, because one of its steps failed"
+    )
 
 
 def _seconds(r: dict) -> str:
@@ -133,14 +150,14 @@ def _claim(motion: list[dict]) -> list[str]:
         own = {name.partition(",")[0]: peak for name, peak in peaks.items() if name.endswith(where)}
         if {"hyperelastic", "viscous", "porohyperelastic", "complete"} <= set(own):
             said.append(
-                f"{where}: viscosity takes the peak from {_mm(own['hyperelastic'])} to {_mm(own['viscous'])}, fluid "
-                f"from "
-                f"{_mm(own['hyperelastic'])} to {_mm(own['porohyperelastic'])} and, of the viscous one, to "
+                f"{where}: viscosity changes the peak of the elastic body from {_mm(own['hyperelastic'])} to "
+                f"{_mm(own['viscous'])}; the fluid changes the peak of the elastic body from "
+                f"{_mm(own['hyperelastic'])} to {_mm(own['porohyperelastic'])} and that of the viscous body to "
                 f"{_mm(own['complete'])}"
             )
     if not said:
         return []
-    claim = "The chapter says that porosity prevents unrealistic deformations. With the numbers of its Table 2, "
+    claim = "The chapter says that porosity prevents unrealistic deformations. Results with its Table 2, "
     return [claim + "; ".join(said) + "."]
 
 
@@ -148,8 +165,10 @@ def _layers() -> list[str]:
     (data,) = load("indentation")
     ratios = sorted({r["thickness"] for r in data["layers"]})
     rows = [
-        "A sphere on a bonded layer: modulus that Hertz's half-space finds over the true one, by the layer's thickness",
-        "over the contact's radius sqrt(R d); in brackets the error of the force by the series of Dimitriadis et al.",
+        "The next table is for a sphere on a bonded layer. It contains the modulus that Hertz's formula for a "
+        "half-space gives, divided by the true modulus. The thickness of the layer is divided",
+        "by the contact radius sqrt(R d). The numbers in brackets are the errors of the force from the series of "
+        "Dimitriadis et al.",
         "(equation 12, for an incompressible layer):",
         "",
         "| Poisson's ratio | " + " | ".join(f"thickness {t:g}" for t in ratios) + " |",
@@ -164,9 +183,11 @@ def _layers() -> list[str]:
         rows.append(f"| {poisson:g} | " + " | ".join(cells) + " |")
     rows += [
         "",
-        f"Fits of curves with {percent(data['noise'])} of noise, modulus and contact point together (Poisson 0.5):",
+        f"Fits of modulus and contact point to curves with {percent(data['noise'])} of noise (Poisson's ratio 0.5). "
+        "Intervals are those of 95 %:",
         "",
-        "| thickness | curves | modulus off (median) | covered | contact point off, of the depth | covered | a curve |",
+        "| thickness | curves | error of the modulus (median) | intervals that contain the modulus | error of the "
+        "contact point divided by the depth | intervals that contain the contact point | time per curve |",
         "|---" * 7 + "|",
     ]
     for r in data["fits"]:

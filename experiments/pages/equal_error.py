@@ -49,8 +49,14 @@ def came_out() -> str:
         speed = {way: data["seconds"] / found[1] for way, found in met.items() if found is not None}
         full = max((way for way in speed if "reduced" not in way), key=lambda way: speed[way])
         small, chapters = (next((f"{v:.2g}" for w, v in speed.items() if k in w), "-") for k in ("reduced", "chapter"))
-        told.append(f"{model} {small} reduced, {speed[full]:.2g} in full ({full}), {chapters} by the chapter's way")
-    return f"simulated seconds a second at an error of {percent(target)} (-: not met): {'; '.join(told)}"
+        told.append(
+            f"{model} {small} with a reduced model, {speed[full]:.2g} with the full model ({full}), {chapters} with "
+            "the chapter's method"
+        )
+    return (
+        f"simulated seconds per second of run time at an error of {percent(target)} (-: this error was not reached): "
+        f"{'; '.join(told)}"
+    )
 
 
 def table() -> str:
@@ -58,8 +64,8 @@ def table() -> str:
     (data,) = load("equal_error")
     targets = sorted(data["targets"], reverse=True)
     rows = [
-        "| model | way | least error found | "
-        + " | ".join(f"at {percent(t)}: step | steps a second | simulated s a second" for t in targets)
+        "| model | method | smallest error | "
+        + " | ".join(f"error {percent(t)}: step | steps per second | simulated seconds per second" for t in targets)
         + " |",
         "|---" * (3 + 3 * len(targets)) + "|",
     ]
@@ -79,17 +85,18 @@ def reduced(data: dict) -> str:
         for model, r in ((m, own["reduced"]) for m, own in data["models"].items())
     )
     truths = ", ".join(f"{model} {percent(own['truth_halved'])}" for model, own in data["models"].items())
-    return f"Reduced models: {made}. The truths change with twice the step by: {truths}."
+    return f"Reduced models: {made}. With a step of twice the length, the reference solutions change by: {truths}."
 
 
 def by_weight(data: dict) -> str:
     """Table of the errors of a linear and a corotational body, for each weight."""
     names = [name for name in data["weights"][0] if name != "weight"]
     rows = [
-        "What linear and corotational bodies leave out, with the same short steps as the hyperelastic one, by the part",
-        "of the load:",
+        "Errors of linear and corotational bodies, computed with the same short steps as the hyperelastic body, for "
+        "several",
+        "fractions of the load:",
         "",
-        "| part of the load | " + " | ".join(names) + " |",
+        "| fraction of the load | " + " | ".join(names) + " |",
         "|---" * (1 + len(names)) + "|",
     ]
     rows += [

@@ -9,9 +9,10 @@ def main_job() -> str:
     moved = found["shear_modulus"] / closed["shear_modulus"] - 1
     sd = found["standard_errors"]["shear_modulus"] / found["shear_modulus"]
     return (
-        f"{found['modes']} modes miss the measured moduli by {percent(found['mean_relative_error'])}; the simulation "
-        f"moves G0 by {percent(abs(moved))} of itself (its standard error: {percent(sd)}); of {found['total_s']:.0f} s "
-        f"in all, {found['compile_time_s']:.0f} s are compilation"
+        f"the moduli of {found['modes']} fitted modes differ from the measured ones by "
+        f"{percent(found['mean_relative_error'])}; the simulation changes G0 by {percent(abs(moved))} (standard error "
+        f"of G0: {percent(sd)}); of the {found['total_s']:.0f} s of run time, {found['compile_time_s']:.0f} s are "
+        "compilation"
     )
 
 
@@ -23,8 +24,9 @@ def methods() -> str:
     )
     noisy = data["noisy"][0]["error"]
     return (
-        f"closed form exact in {closed['run_s']:.2g} s; torsion at 50 steps a cycle {percent(simulated['error'])} in "
-        f"{simulated['run_s']:.2g} s; 1 % of noise on the moduli costs {percent(noisy)} whichever way"
+        f"the closed form is exact and takes {closed['run_s']:.2g} s; the torsion fit with 50 steps per cycle has an "
+        f"error of {percent(simulated['error'])} and takes {simulated['run_s']:.2g} s; 1 % of noise in the moduli "
+        f"causes an error of {percent(noisy)} with every method"
     )
 
 
@@ -35,9 +37,9 @@ def torsion_speed() -> str:
     errors, exact = (fit["distance_to_the_minimum_in_standard_errors"] for fit in (measured, synthetic))
     (compiled, compiled_before), (run, run_before) = measured["compile_s"], measured["evaluation_s"]
     return (
-        f"moduli the same to {percent(moduli)} at every frequency; the minimum to {errors:.0e} standard errors (of "
-        f"data without noise, whose errors are tiny, to {exact:.1g}); it compiles {compiled_before / compiled:.2g} "
-        f"times and runs {run_before / run:.2g} times as fast"
+        f"the moduli differ by at most {percent(moduli)} at every frequency; the fitted parameters differ by "
+        f"{errors:.0e} standard errors (by {exact:.1g} for data without noise, whose standard errors are tiny); "
+        f"compilation is {compiled_before / compiled:.2g} times and the run {run_before / run:.2g} times as fast"
     )
 
 
@@ -45,8 +47,8 @@ def posterior() -> str:
     (data,) = load("propagate_posterior")
     low, high = (1e3 * edge[-1] for edge in data["interval_m"])
     return (
-        f"{high - low:.2g} mm of {1e3 * data['mean_m'][-1]:.3g}; "
-        "first G0 and the short time, in the end G0 and its ratio"
+        f"the 95 % interval is {high - low:.2g} mm wide, at a mean of {1e3 * data['mean_m'][-1]:.3g} mm; at first most "
+        "of this comes from G0 and the short relaxation time, at the end from G0 and the ratio of this time"
     )
 
 
@@ -55,8 +57,10 @@ def training() -> str:
     best = data["surrogate"][-1]
     mesh = data["mesh"]
     return (
-        f"median error {percent(best['median_error'])}, near collapse {percent(best['largest_error'])}; the rows "
-        f"themselves, of linear elements, are {percent(mesh['median'])} (median) off those of quadratic ones"
+        f"the surrogate has a median error of {percent(best['median_error'])}, and an error of "
+        f"{percent(best['largest_error'])} "
+        f"near collapse; the training runs themselves use linear elements and differ from runs with quadratic elements "
+        f"by {percent(mesh['median'])} (median)"
     )
 
 
@@ -65,9 +69,10 @@ def lesion() -> str:
     r = next(r for r in data["rows"] if r["noise_of_largest"] == 0.01 and "sphere" in r)
     s = r["sphere"]
     return (
-        f"at 1 % noise a map finds its centre to {r['centre_off_mm']:.2g} mm ({r['seconds']:.0f} s) but only "
-        f"{percent(r['largest_modulus_over_truth'])} of its modulus; a sphere, begun from the map, its centre to "
-        f"{s['centre_off_mm']:.2g} mm and its modulus to {percent(abs(s['modulus_off']))} ({s['seconds']:.0f} s)"
+        f"with 1 % of noise, a map finds the centre with an error of {r['centre_off_mm']:.2g} mm in {r['seconds']:.0f} "
+        f"s, but only {percent(r['largest_modulus_over_truth'])} of the modulus; the fit of a sphere, which starts "
+        f"from the map, finds the centre with an error of {s['centre_off_mm']:.2g} mm and the modulus with an error of "
+        f"{percent(abs(s['modulus_off']))} in {s['seconds']:.0f} s"
     )
 
 
@@ -78,7 +83,7 @@ def creep() -> str:
         f"the standard error of a relaxation time of {data['true'][4]:g} s outside the sweep's band falls from "
         f"{sd['sweep']:,.0f} s (not determined) to {sd['sweep + creep']:.2g} s with creep, "
         f"{sd['sweep + pull']:.2g} s with "
-        f"a pull, {sd['sweep + creep + pull']:.2g} s with both"
+        f"a tension test, {sd['sweep + creep + pull']:.2g} s with both"
     )
 
 
@@ -93,14 +98,14 @@ def coverage() -> str:
 
     p, gap, squeezed = (rows[n]["parameters"] for n in ("noise", "gap", "compression"))
     return (
-        f"{_by_the_program(data)}95 % intervals of the moduli cover the true ones by truth, where N modes or a "
-        f"springpot beside a spring are fitted to {data['sweeps']:,} sweeps, with noise alone: {listed('noise')}; with "
-        f"the "
-        f"inertia off: {listed('inertia')}; with the gap off: {listed('gap')} (told of it "
-        f"by `--gap-error`: {listed('gap', 'moduli_with_gap_error')}); trimmed under compression: "
-        f"{listed('compression')}. Relaxation times of two modes: {percent(p['times'])}, with all disturbances "
-        f"{percent(squeezed['times'])}; G0: {percent(p['G0'])}, with the gap off {percent(gap['G0'])}. "
-        f"{_predicted_decades(data['prediction'])}"
+        f"{_by_the_program(data)}Fixed models (N modes, or a spring in parallel with a springpot) were fitted to "
+        f"{data['sweeps']:,} sweeps of each material. The 95 % intervals of the moduli cover the true values in these "
+        f"percentages of cases. With noise alone: {listed('noise')}; with an error of the inertia: "
+        f"{listed('inertia')}; with an error of the gap: {listed('gap')} (with `--gap-error`: "
+        f"{listed('gap', 'moduli_with_gap_error')}); with samples trimmed under compression: {listed('compression')}. "
+        f"Intervals of the relaxation times of two modes: {percent(p['times'])}, with all disturbances "
+        f"{percent(squeezed['times'])}. Intervals of G0: {percent(p['G0'])}, with an error of the gap "
+        f"{percent(gap['G0'])}. {_predicted_decades(data['prediction'])}"
     )
 
 
@@ -113,10 +118,10 @@ def _by_the_program(data: dict) -> str:
         return ", ".join(f"{kind} {percent(found[model])}" for kind, found in own.items())
 
     return (
-        f"with `--model auto`, 95 % intervals of the moduli cover the true ones by truth: {by('auto')} (without the "
-        f"choice of the model among the errors {by('auto_alone')}); with N modes: "
-        f"{by('prony')}; with `--model spectrum` a wide spectrum {percent(own['spectrum']['spectrum'])} "
-        f"({data['program']['sweeps']} sweeps of each truth, noise alone). "
+        "For each kind of true material, this is how often the 95 % intervals of the moduli cover the true values "
+        f"with noise alone ({data['program']['sweeps']} sweeps of each material). With `--model auto`: {by('auto')} "
+        f"(without the uncertainty of the choice of the model: {by('auto_alone')}); with N modes: {by('prony')}; with "
+        f"`--model spectrum` for a wide spectrum: {percent(own['spectrum']['spectrum'])}. "
     )
 
 
@@ -125,12 +130,12 @@ def _predicted_decades(found: dict) -> str:
         return ""
     last, first = found["last"], found["first"]
     return (
-        f"The model chosen on two decades predicts the last one better than the next different model in "
-        f"{percent(last['better'])}, the first one in {percent(first['better'])} of {first['sweeps']} (where the "
-        f"criterion decides, "
-        f"{percent(last['better_where_decided'])} and {percent(first['better_where_decided'])}). Against the next "
-        f"model of any kind, which mostly has the chosen one as a special case and says nearly the same, it "
-        f"is {percent(last['better_than_any_second'])} and {percent(first['better_than_any_second'])}"
+        "The model that is chosen from two decades predicts the last decade better than the next different model in "
+        f"{percent(last['better'])} of {first['sweeps']} cases, and the first decade in {percent(first['better'])} "
+        f"(where the criterion decides: {percent(last['better_where_decided'])} and "
+        f"{percent(first['better_where_decided'])}). It is better than the next model of any kind in "
+        f"{percent(last['better_than_any_second'])} and {percent(first['better_than_any_second'])}. This next model "
+        "mostly contains the chosen model as a special case and predicts nearly the same moduli"
     )
 
 
@@ -138,6 +143,6 @@ def curves() -> str:
     brain, rubber = load("curves_brain", "curves_rubber")
     best = [min(data["laws"], key=lambda f: f["mean_relative_error"]) for data in (brain, rubber)]
     return " and ".join(
-        f"{material}: {f['law']}, {percent(f['mean_relative_error'])}"
+        f"{material}: {f['law']} (mean misfit {percent(f['mean_relative_error'])})"
         for material, f in zip(("brain", "rubber"), best, strict=True)
     )

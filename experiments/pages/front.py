@@ -18,14 +18,13 @@ def job() -> str:
     whole, used = found["total_errors"]["shear_modulus"] / 1e3, found["frequencies"]
     times = ", ".join(f"{t:.2g}" for t in found["relaxation_times"])
     return (
-        f"Lion's mane mushroom (Hericium erinaceus), {used} of 31 measured frequencies (the last is the instrument's): "
-        f"G0 = {kilo:.3g} kPa\nwith an error of {sd:.2g} kPa by noise and of {whole:.2g} kPa in all (the ends of the "
-        f"band cause most of it), relaxation times\n{times} s; the fit misses the moduli by "
-        f"{percent(found['mean_relative_error'])} on average. No\nlinear material of any spectrum comes closer than "
-        f"{percent(found['details']['consistency']['kramers_kronig_misfit'])} (root mean square of |G\\*|): so much is "
-        "in the data.\n"
-        f"{found['total_s']:.0f} s in all on two cores, {found['compile_time_s']:.0f} s of them compilation; a second "
-        f"call takes {found['second_call_s']:.0f} s."
+        f"The sample is a lion's mane mushroom. The fit uses {used} of 31 measured frequencies; the last one shows an "
+        f"effect of the instrument.\nG0 is {kilo:.3g} kPa. Its error is {sd:.2g} kPa due to noise and {whole:.2g} kPa "
+        f"in total, mostly because of the ends of the band of frequencies.\nThe relaxation times are {times} s. The "
+        f"fitted moduli differ from the measured ones by {percent(found['mean_relative_error'])} on average. No "
+        f"linear\nmaterial can differ by less than {percent(found['details']['consistency']['kramers_kronig_misfit'])} "
+        f"(root mean square of |G\\*|). The command takes {found['total_s']:.0f} s on two cores, and "
+        f"{found['compile_time_s']:.0f} s of them\nare compilation. A second call takes {found['second_call_s']:.0f} s."
     )
 
 
@@ -48,33 +47,39 @@ def questions() -> dict[str, tuple[list[dict], Callable[[dict], str]]]:
         return f"{r['name']}, {r['dt']:.2g} s"
 
     return {
-        "moduli by the torsion simulation: recursion, steps a cycle": (
+        "moduli from the torsion simulation: recursion, time steps per cycle": (
             steps,
             lambda r: f"{r['scheme'].replace('chapter', 'backward_euler')}, {r['steps']}",
         ),
-        "the same: mesh, its linear bias divided out or not": (
+        "moduli from the torsion simulation: mesh, its error divided out or not": (
             meshes,
             lambda r: f"{r['nodes']} nodes, {'divided out' if r['kind'] == 'corrected' else 'not'}",
         ),
         "parameters of a sweep without noise: method of the fit": (ways["exact"], lambda r: r["name"]),
         # The explicit integrator of the comparison is not an option of the program.
-        "liver in motion, elastic: integrator, step": (
+        "moving liver phantom, elastic: integrator, time step": (
             [r for r in of_liver("explicit against implicit (hyperelastic)") if not r["name"].startswith("explicit")],
             stepped,
         ),
-        "viscous: integrator, recursion, step": (of_liver("time step, integrator, recursion (viscous)"), stepped),
-        "complete: porous scheme, step": (of_liver("porous scheme (complete)"), stepped),
-        "viscous, one step size: Newton's tolerance": (
-            of_liver("Newton's tolerance (viscous, 0.05 s)"),
-            lambda r: f"{r['newton_per_step']:.2g} iterations a step",
+        "moving liver phantom, viscous: integrator, recursion, time step": (
+            of_liver("time step, integrator, recursion (viscous)"),
+            stepped,
         ),
-        "static cube pulled by 20 %: precision, tolerance": (
+        "moving liver phantom, viscous and porous: porous scheme, time step": (
+            of_liver("porous scheme (complete)"),
+            stepped,
+        ),
+        "moving liver phantom, viscous, steps of 0.05 s: Newton's tolerance": (
+            of_liver("Newton's tolerance (viscous, 0.05 s)"),
+            lambda r: f"{r['newton_per_step']:.2g} iterations per step",
+        ),
+        "static cube stretched by 20 %: precision, tolerance": (
             cube["cube"],
             lambda r: f"{r['precision']}, {r['tolerance']:.0e}",
         ),
         "Cook's membrane, K/mu = 3: elements": (elements.rows_of("Cook's membrane", 3.0), lambda r: r["name"]),
-        "the same, K/mu = 1e4": (elements.rows_of("Cook's membrane", 1e4), lambda r: r["name"]),
-        "a beam under a following pressure (Land): elements": (
+        "Cook's membrane, K/mu = 1e4: elements": (elements.rows_of("Cook's membrane", 1e4), lambda r: r["name"]),
+        "beam under a pressure that follows its surface (Land): elements": (
             elements.rows_of("Land's beam", None),
             lambda r: r["name"],
         ),
@@ -96,14 +101,15 @@ def choices() -> str:
     error = max(table["laws"]["neo_hookean"][f"{what}_error"] for what in ("stress", "tangent"))
     rows += [
         "",
-        "The errors of the liver phantom are those of the time step alone. Its mesh of linear tetrahedra adds far",
-        f"more: at rest, in {mesh['ended']} runs of the training set, {percent(mesh['median'])} (median) to "
-        f"{percent(mesh['largest'])} of the displacement against quadratic elements.",
+        "For the liver phantom, the table gives only the error of the time step. The error of its linear tetrahedra is",
+        f"much larger: in {mesh['ended']} static runs, the displacement differs from that of quadratic elements by "
+        f"{percent(mesh['median'])} (median) to {percent(mesh['largest'])}.",
         "",
-        f"Assembly needs no choice: the terms are exact to {error_text(error)}; for {fig4['elements']:,} neo-Hookean",
-        f"tetrahedra the contracted terms take {1e3 * r['seconds']['contracted']:.2g} ms, the chapter's six "
-        f"{slower['chapter']:.2g} times as long, standard",
-        f"finite elements in the same layout {slower['standard FEM']:.2g} times, a vmapped `jax.hessian` "
+        f"The assembly of force and stiffness needs no choice. Its error is {error_text(error)}. For "
+        f"{fig4['elements']:,} neo-Hookean tetrahedra it",
+        f"takes {1e3 * r['seconds']['contracted']:.2g} ms. The chapter's six stiffness terms take "
+        f"{slower['chapter']:.2g} times as long, standard finite elements with",
+        f"the same layout of arrays {slower['standard FEM']:.2g} times, and `jax.hessian` with `jax.vmap` "
         f"{slower['vmapped Hessian']:.2g} times.",
     ]
     return "\n".join(rows)
@@ -115,9 +121,10 @@ def simulation() -> str:
     cube = solve["static_cube"]
     rows = {(r["model"], r["dt"], r["newton"]): r for r in liver["rows"]}
     lines = [
-        f"The liver phantom, {liver['tetrahedra']:,} tetrahedra, in steps of 0.05 s with Newton to 1e-6:",
+        f"The liver phantom has {liver['tetrahedra']:,} tetrahedra. It moves in steps of 0.05 s, and Newton's method "
+        "iterates until the residual is below 1e-6:",
         "",
-        "| model | steps a second | simulated over run time | error of positions |",
+        "| model | steps per second | simulated time divided by run time | error of positions |",
         "|---|---|---|---|",
     ]
     for model in ("hyperelastic", "viscous", "complete"):
@@ -128,9 +135,10 @@ def simulation() -> str:
         [
             *lines,
             "",
-            'The error is that of implicit Euler, which damps; `integrator = "newmark"` does not. A cube of '
-            f"{cube['tetrahedra']:,} tetrahedra",
-            f"that is pulled by 20 % in one load step takes {cube['seconds']:.2g} s (residual {cube['residual']:.0e}).",
+            'The error is that of implicit Euler, which damps the motion. `integrator = "newmark"` does not damp it. A '
+            f"cube of {cube['tetrahedra']:,} tetrahedra",
+            f"is stretched by 20 % in one load step. This run takes {cube['seconds']:.2g} s (residual "
+            f"{cube['residual']:.0e}).",
         ]
     )
 
@@ -141,9 +149,10 @@ def runs() -> str:
     kills = lives["kills"]["kills"] + sum(r["killed"] for r in lives["loopback"])
     lost = lives["kills"]["finished_chunks_lost"]
     return (
-        f"A block of 384 tetrahedra: {bench['rows_a_minute']['1']:,.0f} rows a minute on one core, "
-        f"{bench['two_devices_over_one']:.3g} times that on two, residuals\n"
-        f"to {bench['largest_residual']:.0e}; after {kills} kills {lost} finished chunks were lost."
+        f"With a block of 384 tetrahedra, a sweep makes {bench['rows_a_minute']['1']:,.0f} runs per minute on one "
+        f"core, and {bench['two_devices_over_one']:.3g} times as many on\ntwo cores. The largest residual is "
+        f"{bench['largest_residual']:.0e}. In a test, processes were killed {kills} times, and {lost} finished chunks "
+        "were\nlost."
     )
 
 
@@ -152,7 +161,8 @@ def gradients() -> str:
     (cost,) = load("gradient_cost")
     liver = {(r["model"], r["steps"], r["store"]): r for r in cost["rows"]}
     rows = [
-        "| the complete liver, 5,351 tetrahedra | store | gradient over run | memory | predicted |",
+        "| complete liver model, 5,351 tetrahedra | `store` | time of gradient divided by time of run | memory | "
+        "predicted |",
         "|---|---|---|---|---|",
     ]
     for (model, steps, store), r in liver.items():
@@ -166,9 +176,9 @@ def gradients() -> str:
         [
             *rows,
             "",
-            f"Error of the derivative by mu (complete model, 162 tetrahedra, up to 100 steps): {error_text(forward)} "
-            "against forward mode,",
-            f"{error_text(central)} against the best central difference.",
+            "The derivative with respect to mu was checked for the complete model with 162 tetrahedra and up to 100 "
+            f"steps. It differs from forward mode by {error_text(forward)},",
+            f"and from the best central difference by {error_text(central)} (relative differences).",
         ]
     )
 
@@ -177,7 +187,8 @@ def maps() -> str:
     """Table of the lesion."""
     (found,) = load("lesion")
     rows = [
-        "| noise | map: centre off | time | sphere: centre off | radius off | modulus off | standard error | time |",
+        "| noise | map: error of the centre | time | sphere: error of the centre | error of the radius | "
+        "error of the modulus | standard error of the modulus | time |",
         "|---" * 8 + "|",
     ]
     for r in found["rows"]:
@@ -201,7 +212,11 @@ def maps() -> str:
 def together() -> str:
     """Table of intervals of the slowest mode, for each combination of tests."""
     (found,) = load("creep_and_sweep")
-    rows = ["| fitted (synthetic, 2 % noise) | G0 | slow ratio | slow time | run, compile included |", "|---" * 5 + "|"]
+    rows = [
+        "| fitted tests (synthetic, 2 % noise) | G0 | ratio of the slow mode | its relaxation time | "
+        "run time with compilation |",
+        "|---" * 5 + "|",
+    ]
     for r in found["rows"]:
         if r["tests"] == "creep":
             continue
@@ -213,7 +228,7 @@ def together() -> str:
         cells = (interval("shear_modulus", " Pa"), interval("ratios[0]", ""), interval("relaxation_times[0]", " s"))
         rows.append(f"| {r['tests']} | " + " | ".join(cells) + f" | {r['seconds']:.0f} s |")
     true = found["true"]
-    rows.append(f"| truth | {true[0]:g} Pa | {true[1]:g} | {true[4]:g} s | |")
+    rows.append(f"| true values | {true[0]:g} Pa | {true[1]:g} | {true[4]:g} s | |")
     return "\n".join(rows)
 
 
@@ -232,14 +247,14 @@ def extremes() -> str:
     compiling = [r["compile_s"]["projected"] / r["compile_s"]["off"] for r in cost["rows"]]
     part = "all" if left.least == 1 else f"at least {percent(left.least)}"
     return (
-        f"From the start itself the minimiser brings back {span(mild)} of {inverted['seeds']} scrambled starts for "
-        f"each law ({half.laws} laws) if up to\na fifth of the elements are inverted, "
-        f"and {span(half)} if half of them are; "
-        f"{percent(half.folded)} of the others end folded, in\nanother equilibrium. At rest a start is only a guess. "
-        f"`projected` leaves an inverted one for the reference shape, and\n{part} come back, because the load can be "
-        "followed from there. Where robustness is not needed, it costs\n"
-        f"{100 * max(over - 1, 0):.0f} % of run time at most, and compiling takes "
-        f"{min(compiling):.2g} to {max(compiling):.2g} times as long."
+        f"`projected` was tested with {half.laws} laws. For each law and each number of inverted elements, runs began "
+        f"at {inverted['seeds']}\nrandom positions. In a time step from these positions, the minimiser finds the right "
+        f"equilibrium in {span(mild)} of\nthe runs if up to a fifth of the elements are inverted, and in {span(half)} "
+        f"if half of them are inverted. {percent(half.folded)} of the\nother runs end in another equilibrium, in which "
+        "the body is folded. In static runs, `projected` begins at the reference\nshape if elements are inverted. "
+        f"Then the load can be followed from there, and {part} of the runs find the right\nequilibrium. If `projected` "
+        f"is not needed, it makes a run at most {100 * max(over - 1, 0):.0f} % longer, and compilation takes "
+        f"{min(compiling):.2g} to {max(compiling):.2g}\ntimes as long."
     )
 
 

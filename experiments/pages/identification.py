@@ -8,13 +8,14 @@ def precision() -> str:
     (data,) = load("precision")
     tetrahedra = data["laws"][0]["tetrahedra"]
     rows = [
-        f"| law, {tetrahedra:,} tetrahedra | float64 | float32 | error of the force | of the stiffness |",
+        f"| law, {tetrahedra:,} tetrahedra | time, float64 | time, float32 | error of the force, float32 | "
+        "error of the stiffness, float32 |",
         "|---" * 5 + "|",
     ]
     for r in data["laws"]:
         ms = " | ".join(f"{1e3 * r['seconds'][p]:.2g} ms" for p in ("float64", "float32"))
         rows.append(f"| `{r['law']}` | {ms} | {r['force_error']:.0e} | {r['stiffness_error']:.0e} |")
-    rows += ["", "| solve | precision | tolerance | residual | error | run | ended |", "|---" * 7 + "|"]
+    rows += ["", "| model | precision | tolerance | residual | error | run time | status |", "|---" * 7 + "|"]
     for r in [{"model": "static cube"} | r for r in data["cube"]] + data["liver"]:
         residual = f"{r['residual']:.0e} | {r['error']:.0e} | {r['run_s']:.2g} s"
         rows.append(f"| {r['model']} | {r['precision']} | {r['tolerance']:.0e} | {residual} | {r['code']} |")
@@ -24,7 +25,10 @@ def precision() -> str:
 def jax_releases() -> str:
     """Table of the same programs with different releases of jax."""
     (data,) = load("jax_releases")
-    head = "| jax | torsion: transposes written, compiled; copies | run | compile | complete liver | compile |"
+    head = (
+        "| jax | torsion program: transposes before, after compilation; copies | run | compilation | complete liver | "
+        "compilation |"
+    )
     rows = [head, "|---" * 6 + "|"]
     for r in data["rows"]:
         t, liver = r["torsion"], r["liver"]
@@ -37,7 +41,11 @@ def jax_releases() -> str:
 def gradients() -> str:
     """Table of all costs of a gradient."""
     (data,) = load("gradient_cost")
-    rows = ["| model | tetrahedra | steps | store | run | gradient | over | memory | predicted |", "|---" * 9 + "|"]
+    rows = [
+        "| model | tetrahedra | steps | `store` | run | gradient | gradient divided by run | memory | "
+        "predicted memory |",
+        "|---" * 9 + "|",
+    ]
     for r in data["rows"]:
         memory = f"{r['planned_bytes'] / 1e6:.3g} MB | {r['predicted_bytes'] / 1e6:.3g} MB"
         times = f"{short(r['forward_s'])} s | {short(r['gradient_s'])} s | {r['ratio']:.3g}"
@@ -49,8 +57,8 @@ def lesion() -> str:
     """Table of all maps."""
     (data,) = load("lesion")
     rows = [
-        "| noise | length of the prior | chi2 a component | centre off | largest modulus over true | "
-        "error of ln(modulus), uniform body | run |",
+        "| noise | correlation length of the prior | chi2 per component | error of the centre | "
+        "largest modulus divided by true modulus | error of ln(modulus), the same for a uniform body | run |",
         "|---" * 7 + "|",
     ]
     for r in data["rows"]:
@@ -72,12 +80,14 @@ def plate() -> str:
     (data,) = load("elastography")
     hertz = data["frequencies_Hz"]
     rows = [
-        "The table is about a plate of 80 x 100 x 10 mm of 3 kPa with four cylinders of 10 kPa, on voxels of 2 mm. The",
-        "data are the exact series of an unbounded medium, with "
-        f"{percent(data['noise'])} of noise. Storage moduli in kPa; regions at "
-        f"{', '.join(f'{h:g}' for h in hertz)} Hz, the map and the direct inversion at {hertz[-1]:g} Hz:",
+        "In this example, a plate of 80 x 100 x 10 mm with a modulus of 3 kPa contains four cylinders of 10 kPa. The "
+        "voxels are 2 mm long. The",
+        "data come from the exact series for an unbounded medium, with "
+        f"{percent(data['noise'])} of noise. The table contains storage moduli in kPa. Those of the regions are at "
+        f"{', '.join(f'{h:g}' for h in hertz)} Hz, those of the map and of the direct inversion at {hertz[-1]:g} Hz:",
         "",
-        "| | true | regions ± standard error | map, median ± its sd | direct inversion, median |",
+        "| | true value | regions ± standard error | median of the map ± standard deviation | "
+        "median of the direct inversion |",
         "|---|---|---|---|---|",
     ]
     for r in data["rows"]:
@@ -89,11 +99,13 @@ def plate() -> str:
     cover = data["covered_90"]
     rows += [
         "",
-        f"On {data['environment']['cores']} cores regions took {data['regions_s']:.0f} s and the map "
+        f"On {data['environment']['cores']} cores the regions took {data['regions_s']:.0f} s and the map "
         f"{data['map_s']:.0f} s, with {data['unknowns']:,} unknowns at {len(hertz)} frequencies.",
-        f"90 % intervals of the map hold the true storage modulus in {_span(cover['storage'])} of the voxels, and the "
-        f"loss modulus in {_span(cover['loss'])}. The map is smooth at edges; there its deviation is that of a place "
-        "known to the prior's length. By the distance from the nearest edge:",
+        f"The 90 % intervals of the map contain the true storage modulus in {_span(cover['storage'])} of the voxels, "
+        f"and the true loss modulus in {_span(cover['loss'])}. The map is smooth at edges. So its standard deviation "
+        "near an edge is large: the position of the edge is known only within the correlation length of the prior. "
+        "The next table gives the percentage of voxels whose interval contains the true storage modulus, by distance "
+        "from the nearest edge:",
         "",
         "| " + " | ".join(_between(row) for row in cover["by_distance"]) + " |",
         "|" + len(cover["by_distance"]) * "---|",
@@ -112,7 +124,7 @@ def _between(row: dict) -> str:
     low, high = (None if row[key] is None else 1e3 * row[key] for key in ("from_m", "to_m"))
     side = "inside" if high is not None and high <= 0 else "outside"
     ends = [abs(end) for end in (low, high) if end is not None]
-    return f"{min(ends):g} to {max(ends):g} mm {side}" if len(ends) == 2 else f"beyond {ends[0]:g} mm {side}"
+    return f"{min(ends):g} to {max(ends):g} mm {side}" if len(ends) == 2 else f"more than {ends[0]:g} mm {side}"
 
 
 def liver_waves_came_out() -> str:
@@ -123,9 +135,9 @@ def liver_waves_came_out() -> str:
         true, own = complex(*r["true_Pa"]), complex(*r["regions_Pa"])
         drawn = complex(*r["map_median_Pa"])
         said.append(
-            f"{r['name']} {percent(abs(own / true - 1))} off by regions, {percent(abs(drawn / true - 1))} by the map"
+            f"{r['name']} {percent(abs(own / true - 1))} with regions and {percent(abs(drawn / true - 1))} with a map"
         )
-    return f"complex moduli at {percent(data['noise'])} of noise: {'; '.join(said)}"
+    return f"errors of the complex moduli with {percent(data['noise'])} of noise: {'; '.join(said)}"
 
 
 def plate_came_out() -> str:
@@ -138,8 +150,9 @@ def plate_came_out() -> str:
     plain = data["rows"][0]
     off = [abs(v / plain["true_storage_Pa"] - 1) for v in plain["storage_Pa"]]
     return (
-        f"storage modulus of the plate {percent(max(off))} off at most, of cylinders by radius: {', '.join(said)}; "
-        f"90 % intervals of the map hold {percent(min(data['covered_90']['storage']))} of the voxels"
+        f"the error of the storage modulus is at most {percent(max(off))} for the plate; for cylinders with these "
+        f"radii it is: {', '.join(said)}; the 90 % intervals of the map contain the true value in "
+        f"{percent(min(data['covered_90']['storage']))} of the voxels"
     )
 
 

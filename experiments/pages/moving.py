@@ -10,8 +10,9 @@ def came_out() -> str:
     near = [r["effectivity"] for r in rows]
     left = {order: max(r["left"] for r in rows if r["order"] == order) for order in (1, 2)}
     return (
-        f"the estimate is {min(near):.2g} to {max(near):.2g} of the error of a beam that swings; added, it leaves at "
-        f"most {percent(left[1])} of it with linear elements, {percent(left[2])} with quadratic ones"
+        f"for a swinging beam, the estimated error is {min(near):.2g} to {max(near):.2g} times the true error; with "
+        f"the estimate added, at most {percent(left[1])} of the error remain with linear elements, {percent(left[2])} "
+        "with quadratic elements"
     )
 
 
@@ -19,14 +20,18 @@ def table() -> str:
     """Table of all rows."""
     (data,) = load("moving_mesh")
     rows = [
-        "A beam is let go. Motion, error and estimate are of its end, root mean square over all steps; effectivity is",
-        "the estimate over the error; left: what is still off with the estimate added, over the error. The truth is",
-        f"864 quadratic elements with consistent masses, whose own last refinement moves it by "
+        "A beam is released. Motion, error and estimate are those of its end (root mean square over all steps). "
+        "Effectivity is",
+        "the estimate divided by the error. The remaining error is the error with the estimate added, divided by the "
+        "error without it. The reference solution is that of",
+        f"864 quadratic elements with consistent masses. The last refinement of this mesh changed it by "
         f"{percent(max(r['truth_m'] / r['motion_m'] for r in data['moving']))} at most.",
-        "A body that falls freely has a closed form. With lumped masses few quadratic elements bend as they fall; the",
-        "estimate knows it, 1.5 times too large: the factor is for what cubic functions do not show of other errors.",
+        "The motion of a freely falling body has a closed form. With lumped masses, a body of few quadratic elements "
+        "bends while it falls. The",
+        "estimate shows this error, but it is 1.5 times too large. The reason is a factor that allows for the part of "
+        "other errors that cubic functions do not show.",
         "",
-        "| motion | elements | number | masses | motion | error | effectivity | left |",
+        "| case | elements | number of elements | masses | motion | error | effectivity | remaining error |",
         "|---" * 8 + "|",
     ]
     for r in [*data["falling"], *data["moving"]]:

@@ -8,13 +8,16 @@ TESTS = ("tension", "punch", "creep")
 def rigs() -> str:
     """Table of meshes at one shape of the sample, then that of the default mesh."""
     if not _ran():
-        return "The rigs' readings against an independent solver: `python -m experiments stability_rigs` has not run."
+        return "The rigs have not been compared with an independent solver (`python -m experiments stability_rigs`)."
     (data,) = load("stability_rigs")
     rows = [
-        "Readings of the rigs at small strain, against an axisymmetric solver that shares no line with the project",
-        "(`axisymmetric_reference.py`): error, run time of a step; height = radius, K/mu = 20 and 1e4. A whole",
-        "cylinder has cells of one size, a sector is graded to the rims and to the punch's edge; the default is in",
-        "bold. Times are of one of two cores; the other was busy:",
+        "The forces and displacements of the rigs at small strain are compared with an axisymmetric solver that has "
+        "no code in common with the project",
+        "(`axisymmetric_reference.py`). Each cell contains the error and the run time of a step, for height = radius "
+        "and K/mu = 20 or 1e4. A whole",
+        "cylinder has cells of one size. A sector has smaller cells at the rims and at the edge of the punch. The "
+        "default is in",
+        "bold. Times are for one of two cores. The other core was busy:",
         "",
         "| mesh | elements (tension) | " + " | ".join(f"{t}, {k}" for t in TESTS for k in ("20", "1e4")) + " |",
         "|---" * (2 + 2 * len(TESTS)) + "|",
@@ -29,7 +32,8 @@ def rigs() -> str:
     aspects = sorted({r["height_over_radius"] for r in data["default"]})
     rows += [
         "",
-        "The default at every shape: error of the reading, largest run time of a step:",
+        "The default mesh for several heights (R is the radius). Each cell contains the error and the largest run "
+        "time of a step:",
         "",
         "| test | K/mu | " + " | ".join(f"height {a:g} R" for a in aspects) + " |",
         "|---" * (2 + len(aspects)) + "|",
@@ -51,9 +55,9 @@ def came_out() -> str:
     first = [r for r in data["meshes"] if r["mesh"] == "whole, order 1" and r["test"] == "tension"]
     coarse = min((r for r in first if r["bulk_over_shear"] == 20.0), key=lambda r: r["elements"])
     return (
-        f"height from 0.2 to 5 radii, K/mu from 3 to 1e4: {', '.join(f'{t} {percent(w)}' for t, w in worst.items())} "
-        f"at most; a whole cylinder of {coarse['elements']} linear elements is {percent(coarse['error'])} off in "
-        "tension at K/mu = 20"
+        "largest errors for heights of 0.2 to 5 radii and K/mu of 3 to 1e4: "
+        f"{', '.join(f'{t} {percent(w)}' for t, w in worst.items())}; a whole cylinder of {coarse['elements']} linear "
+        f"elements has an error of {percent(coarse['error'])} in tension at K/mu = 20"
     )
 
 

@@ -38,11 +38,16 @@ def _inverted() -> list[str]:
     (data,) = load("stability_inverted")
     cases = list(next(iter(data["laws"].values()))["plain"])
     rows = [
-        f"A hanging block of {data['elements']} tetrahedra from {data['seeds']} scrambled starts a column: per cent",
-        "that end at the minimum reached from rest, to 1e-6 of the size, in float32 to 1e-4 (most iterations; time a",
-        "start). First the minimiser from the start itself (one step of motion of 10,000 s, in which no start may be",
-        "left), where it was tried; then plain Newton. The last rows are at rest, where a start is but a guess: an",
-        "inverted one is left for the reference shape, so their rates are those of following the load from there:",
+        f"A hanging block of {data['elements']} tetrahedra begins at {data['seeds']} random (scrambled) positions for "
+        "each column. The table contains the percentage of runs",
+        "that end at the minimum that is reached from rest, to 1e-6 of the size (float32: 1e-4). In brackets: the "
+        "largest number of iterations; time per",
+        "run. In the first rows, the minimiser begins at these positions themselves, in one time step of 10,000 s, in "
+        "which they cannot be",
+        "replaced. This was tried for some laws only. Then follow rows of plain Newton. The last rows are static "
+        "runs, in which the positions are only a first guess.",
+        "If elements are inverted, these runs begin at the reference shape instead. So their percentages show how "
+        "often the load can be followed from there:",
         "",
         "| law | solver | " + " | ".join(cases) + " |",
         "|---" * (2 + len(cases)) + "|",
@@ -63,10 +68,13 @@ def _steps() -> list[str]:
     (data,) = load("stability_steps")
     sizes, wanted, tolerance = sorted({r["dt"] for r in data["rows"]}), data["steps"], data["tolerance"]
     rows = [
-        f"The liver phantom under its full weight, {wanted} steps of each size: steps in equilibrium (residual below",
-        f"{tolerance['float64']:g}, in float32 {tolerance['float32']:g}), Newton iterations a step, steps a second;",
-        "for float32 the largest distance of a node from float64 at the end, over the largest displacement, where all",
-        "steps of both are in equilibrium:",
+        f"The liver phantom under its full weight, {wanted} steps of each size. Each cell contains the number of steps "
+        "in equilibrium (residual below",
+        f"{tolerance['float64']:g}, in float32 {tolerance['float32']:g}), the Newton iterations per step and the steps "
+        "per second.",
+        "For float32 it also contains the largest distance of a node from the result of float64 at the end, divided "
+        "by the largest displacement, if all",
+        "steps of both runs are in equilibrium:",
         "",
         "| model | robust | precision | " + " | ".join(f"{dt:g} s" for dt in sizes) + " |",
         "|---" * (3 + len(sizes)) + "|",
@@ -88,8 +96,9 @@ def _cost() -> list[str]:
     compiles = [f"{r['compile_s']['off']:.0f} to {r['compile_s']['projected']:.0f} s" for r in data["rows"]]
     apart = max(r["largest_difference_m"] for r in data["rows"])
     return [
-        "Where it is not needed, under a fifth of gravity, robust takes so many times the run time of a run without:",
-        f"{', '.join(times)} (positions differ by {apart:.0e} m); compiling grows from",
+        "Under a fifth of gravity, `robust` is not needed. The run time with `robust` divided by the run time without "
+        "it is:",
+        f"{', '.join(times)} (positions differ by {apart:.0e} m). The compilation time grows from",
         f"{', '.join(compiles)}.",
     ]
 
@@ -98,10 +107,13 @@ def _locking() -> list[str]:
     (data,) = load("stability_bulk")
     kinds = [(v, p) for p in ("float64", "float32") for v in ("element", "nodal")]
     rows = [
-        "Locking, against a finer mesh with averaged volumes in float64 (factorised; Newton iterations, run time).",
-        "Stalled: the digits allow no residual below the tolerance of 1e-4, and the best point was kept:",
+        "The next table shows errors due to locking. The reference is a finer mesh with averaged volumes in float64, "
+        "and matrices are factorised. The table also gives Newton iterations and run time.",
+        '"Stalled" means that the precision of the numbers allows no residual below the tolerance of 1e-4. The best '
+        "result was kept:",
         "",
-        "| body | cells | K/mu | by element | at the nodes | by element, float32 | at the nodes, float32 |",
+        "| body | cells | K/mu | volumes of elements | volumes averaged at nodes | volumes of elements, float32 | "
+        "volumes averaged at nodes, float32 |",
         "|---" * 7 + "|",
     ]
 
@@ -129,9 +141,10 @@ def inverted_came_out() -> str:
         return "all" if found.least == 1 else f"at least {percent(found.least)}"
 
     return (
-        f"from the start itself, projected, {percent(half.least)} to {percent(half.most)} of those half inverted come "
-        f"back ({half.laws} laws; {percent(half.folded)} of the others end folded, in equilibrium), with 20 % inverted "
-        f"{part(fifth)}; at rest {part(left)}, because an inverted guess is left for the reference shape"
+        f"in a time step from such positions, `projected` finds the right equilibrium in {percent(half.least)} to "
+        f"{percent(half.most)} of the runs if half of the elements are inverted ({half.laws} laws; "
+        f"{percent(half.folded)} of the other runs end folded, in another equilibrium), and in {part(fifth)} if 20 % "
+        f"are inverted; in static runs it is {part(left)}, because the run then begins at the reference shape"
     )
 
 
@@ -145,8 +158,8 @@ def steps_came_out() -> str:
         return f"{sum(r['converged'] == data['steps'] for r in mine)} of {len(mine)}"
 
     return (
-        f"with it the complete model converges at {good('float64')} step sizes from 1 ms to 10 s, in float32 at "
-        f"{good('float32')}"
+        f"with `robust` the complete model converges with {good('float64')} step sizes from 1 ms to 10 s, in float32 "
+        f"with {good('float32')}"
     )
 
 
@@ -159,7 +172,8 @@ def bulk_came_out() -> str:
     ]
     off = {r["volumetric"]: abs(r["error"]) for r in rows}
     return (
-        f"Cook at K/mu = 1e4: by element {percent(off['element'])} off, averaged at the nodes {percent(off['nodal'])}"
+        f"error of Cook's membrane at K/mu = 1e4: {percent(off['element'])} with volumes of elements, "
+        f"{percent(off['nodal'])} with volumes averaged at the nodes"
     )
 
 
@@ -167,7 +181,7 @@ def cost_came_out() -> str:
     """Sentence for the overview."""
     (data,) = load("stability_cost")
     over = ", ".join(f"{r['model']} {r['time_over_off']:.2f}" for r in data["rows"])
-    return f"run time over that without: {over}"
+    return f"run time with `robust` divided by run time without it: {over}"
 
 
 PARTS = {"stability": stability}

@@ -10,7 +10,7 @@ def tests() -> str:
     for r in found["rows"]:
         order = "" if r["order"] is None else f"{r['order']:.2f}"
         file, name = r["test"].split("::")
-        off = f"{r['difference']:.1e}" + (f" (the mesh's bar {r['bar']:.1e})" if "bar" in r else "")
+        off = f"{r['difference']:.1e}" + (f" (error bar of the mesh {r['bar']:.1e})" if "bar" in r else "")
         cells = (r["benchmark"], r["source"], off, _allowed(r["allowed"]), order)
         rows.append("| " + " | ".join(cells) + f" | `{file.removeprefix('tests/')}` `{name.split('[')[0]}` |")
     return "\n".join(rows)
@@ -19,7 +19,7 @@ def tests() -> str:
 def meshes() -> str:
     """Table of Cook, Land and the cantilever on each mesh."""
     (known,) = load("known_answers")
-    rows = ["| body | tetrahedra | ours | known | difference | run |", "|---" * 6 + "|"]
+    rows = ["| body | tetrahedra | liverjax | known value | difference | run time |", "|---" * 6 + "|"]
 
     def row(body: str, r: dict, ours: float, known: str, exact: float) -> None:
         off = f"{100 * (ours / exact - 1):+.2g} %"
@@ -28,15 +28,23 @@ def meshes() -> str:
     for r in known["cook"]:
         row("Cook's membrane, rise", r, r["rise_mm"], "14.74 mm, Miehe 1994", 14.74)
     for r in known["land"]:
-        row("Land's beam, end", r, r["end_mm"], "4.0-4.2 mm, Land et al. 2015 (against 4.1)", 4.1)
+        row("Land's beam, end", r, r["end_mm"], "4.0-4.2 mm, Land et al. 2015 (difference from 4.1)", 4.1)
     for r in known["cantilever"]:
         if r["mazier_y_m"] is None:
             continue
         theirs = -1e3 * r["mazier_y_m"]
         body = "silicone cantilever" + (", volumes at the nodes" if r["volumetric"] == "nodal" else "")
-        row(body, r, -1e3 * r["tip_m"][0], f"{theirs:.1f} mm, Mazier et al. 2021 on as many; measured 116", theirs)
+        row(
+            body,
+            r,
+            -1e3 * r["tip_m"][0],
+            f"{theirs:.1f} mm, Mazier et al. 2021 with as many elements; measured 116 mm",
+            theirs,
+        )
     for r in known.get("cantilever, quadratic", []):
-        said = f"{-1e3 * (r['tip_m'][0] + r['change_m']):.4g} mm with its own estimate; measured 116"
+        said = (
+            f"{-1e3 * (r['tip_m'][0] + r['change_m']):.4g} mm, the same with the estimated error added; measured 116 mm"
+        )
         row(
             "silicone cantilever, quadratic mixed",
             r,
@@ -47,7 +55,10 @@ def meshes() -> str:
     land = known["land"]
     ratio = (land[-1]["cells"] / land[-2]["cells"]) ** 2
     limit = land[-1]["end_mm"] + (land[-1]["end_mm"] - land[-2]["end_mm"]) / (ratio - 1)
-    rows += ["", f"Extrapolated at second order from its two finest meshes Land's beam ends at {limit:.2f} mm."]
+    rows += [
+        "",
+        f"Second-order extrapolation from the two finest meshes gives {limit:.2f} mm for the end of Land's beam.",
+    ]
     return "\n".join(rows)
 
 

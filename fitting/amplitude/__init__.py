@@ -1,1 +1,1 @@
-"""Strain sweeps: moduli that change with the strain amplitude, and the hyperelastic law that explains them."""
+"""Fit hyperelastic laws to strain sweeps, which are measured moduli as a function of the strain amplitude."""

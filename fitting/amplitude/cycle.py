@@ -1,11 +1,12 @@
-"""One steady cycle of large shear: storage and loss modulus of the first harmonic, and the size of the third harmonic.
+"""One steady cycle of large shear: complex modulus of the first harmonic, and relative amplitude of the third harmonic.
 
-The sample is incompressible and isotropic, with a strain energy function W. The second Piola-Kirchhoff stress S from W
-relaxes in a way that does not depend on the strain (chapter, section 4.2). In simple shear with the amount g(t) = a
-sin(wt), the shear stress is S12 + g S22, whatever the pressure is. S is a sum of harmonics of w. The memory of the
-material multiplies harmonic n by m(nw) = G*(nw)/G0. In torsion between plates, every ring of the sample is in simple
-shear, with an amount that depends on the radius (a universal deformation: Rivlin 1949). So the torque is a sum over
-rings. A rheometer converts this torque into moduli as if the sample were linear.
+The sample is incompressible and isotropic, with a strain energy function W. W gives the instantaneous second
+Piola-Kirchhoff stress S. The relaxation of S does not depend on the strain (chapter, section 4.2). In simple shear with
+the amount g(t) = a sin(wt), the shear stress is S12 + g S22, independently of the pressure. S is a sum of harmonics of
+w. Relaxation multiplies harmonic n by the modulus ratio m(nw) = G*(nw)/G0, with the complex modulus G* and the
+instantaneous modulus G0. In torsion between plates, every ring of the sample is in simple shear, with an amount of
+shear that depends on the radius (a universal deformation: Rivlin 1949). So the torque is a sum over rings. A rheometer
+converts this torque into moduli as if the sample were linear.
 """
 
 from typing import NamedTuple
@@ -18,29 +19,30 @@ from liverjax.laws.base import Law
 from liverjax.laws.terms.stretch_terms import stress_at_constant
 from liverjax.tensors.matrices import pack, unpack
 
-#: INSTANTS: number of instants in a cycle; harmonics of the stress above the 15th are left out. RINGS: number of rings
+#: INSTANTS: number of instants in a cycle; harmonics of the stress above the 15th are neglected. RINGS: number of rings
 #: between the plates (Gauss points).
 INSTANTS, RINGS = 32, 8
-#: Number of shears at which the law is evaluated. S12/g and S22 are even functions of g, so polynomials in g^2
-#: interpolate them.
+#: Number of amounts of shear g at which the law is evaluated. S12/g and S22 are even functions of g, so they are
+#: interpolated by polynomials in g^2.
 ASKED = 24
 
 
 class Reading(NamedTuple):
-    """Matrices that convert stresses at `ASKED` shears to the readings of a rheometer. They are the same for every
-    law."""
+    """Matrices that convert stresses at `ASKED` amounts of shear to the moduli that a rheometer reports. The matrices
+    are the same for every law."""
 
-    shears: np.ndarray  # (K,) above 0
-    F: jax.Array  # (K, 3, 3)
-    harmonics: jax.Array  # (M, 2, A, 2, K) complex; axes: memories, harmonic 1 or 3, amplitudes, S12/g or S22, shears
+    shears: np.ndarray  # (K,) amounts of shear, above 0
+    F: jax.Array  # (K, 3, 3) deformation gradients
+    harmonics: jax.Array  # (M, 2, A, 2, K) complex; M sets of modulus ratios, harmonic 1 or 3, A strain amplitudes
 
 
 def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel") -> Reading:
-    """Return the matrices for cycles with these strain amplitudes at the rim.
+    """Compute the matrices for cycles with given strain amplitudes at the rim.
 
     Args:
         strains: amplitudes (A,) at the rim.
-        memories: m(nw) for n = 0 to `INSTANTS` / 2, complex (M, n). The reading of the rheometer is linear in m.
+        memories: M sets of modulus ratios m(nw) for n = 0 to `INSTANTS` / 2, complex (M, n). The reported moduli are
+            linear in m.
         plates: "parallel", or "cone" (cone and plate, where the strain is the same everywhere).
     """
     rho, weights = _radii_and_weights(plates)
@@ -62,17 +64,17 @@ def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel")
 
 
 def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return radii divided by the radius of the rim, and the weights of the moduli at these radii."""
+    """Return radii of rings divided by the radius of the rim, and the weights of the moduli of these rings."""
     if plates == "cone":
         return np.ones(1), np.ones(1)
     x, w = np.polynomial.legendre.leggauss(RINGS)
     rho = 0.5 * (1 + x)
-    return rho, 0.5 * w * 4 * rho**3  # contribution of each ring to 2 M / (pi R^3) / (strain at the rim)
+    return rho, 0.5 * w * 4 * rho**3  # share of each ring in 2 M / (pi R^3) / (strain at the rim)
 
 
 def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the values (..., K) of the Lagrange polynomials for Chebyshev nodes (K,) (barycentric form; Berrut,
-    Trefethen 2004)."""
+    """Return the values (..., K) at the points `at` of the Lagrange polynomials for Chebyshev nodes (K,) (barycentric
+    form; Berrut, Trefethen 2004)."""
     k = np.arange(len(nodes))
     w = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / len(nodes))
     off = at[..., None] - nodes
@@ -83,13 +85,13 @@ def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the complex modulus (A,) [Pa] of the first harmonic, and the amplitude (A,) of the third harmonic divided
-    by that of the first.
+    """Return the complex modulus (A,) [Pa] of the first harmonic, and the amplitude (A,) of the third harmonic of the
+    torque divided by the amplitude of the first.
 
     Args:
         law: law of the instantaneous stress. Its volumetric energy is not used.
         r: the result of `reading`.
-        shares: factors (M,) by which the memories are multiplied before they are added.
+        shares: factors (M,) of the M sets of modulus ratios. The ratios m are the sum of the sets times these factors.
     """
     S = _instantaneous_stress(law, r.F)
     asked = jnp.stack([S[:, 0, 1] / r.shears, S[:, 1, 1]])
@@ -98,8 +100,8 @@ def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array,
 
 
 def _instantaneous_stress(law: Law, F: jax.Array) -> jax.Array:
-    """Return the second Piola-Kirchhoff stress (K, 3, 3) [Pa] of the isochoric energy. F is a constant: derivatives
-    with respect to F do not exist."""
+    """Return the second Piola-Kirchhoff stress (K, 3, 3) [Pa] of the isochoric energy. F must be constant, because the
+    function has no derivatives with respect to F."""
     split = law.isochoric_part()
     if split is not None and split.stretch_energy is not None:
         return pack(stress_at_constant(split, unpack(F)))

@@ -1,4 +1,4 @@
-"""Fit hyperelastic laws to strain sweeps, by least squares on the first harmonic, from many starting points."""
+"""Fit hyperelastic laws to the first harmonic of strain sweeps, by least squares from many starting points."""
 
 import json
 import time
@@ -21,19 +21,19 @@ from fitting.readers.frequency_sweep import smooth_curve
 from liverjax.core.errors import InputError
 from liverjax.laws import Law
 
-#: If the loss tangent changes by more than this part over the sweep, the relaxation depends on the strain.
+#: If the loss tangent changes by more than this fraction over the sweep, the relaxation depends on the strain.
 CHANGED = 0.2
 
 
 class Memory(NamedTuple):
-    """Factor m(nw) for each harmonic n, from a Prony series. Without a series, the factor is 1 + i (loss tangent), with
-    the same loss tangent for all harmonics."""
+    """Modulus ratio m(nw) = G*(nw)/G0 for each harmonic n (see `cycle`), from a Prony series. Without a series, the
+    ratio is 1 + i (loss tangent), with the same loss tangent for all harmonics n > 0."""
 
     series: Maxwell | None = None
 
     def of(self, omega: float) -> np.ndarray:
-        """Return m(nw) (1, n) of the series. Without a series, return (2, n): m is the first row plus the loss tangent
-        times the second row."""
+        """Return the modulus ratios m(nw) (1, n) of the series at the angular frequency w = `omega` [rad/s]. Without a
+        series, return (2, n): m is the first row plus the loss tangent times the second row."""
         n = np.arange(cycle.INSTANTS // 2 + 1)
         if self.series is None:
             return np.array([np.ones(len(n)), np.where(n == 0, 0, 1j)])
@@ -42,12 +42,12 @@ class Memory(NamedTuple):
 
 
 class StrainFit(NamedTuple):
-    """A law and its prediction of the sweep."""
+    """A fitted law, and the moduli that it predicts for the sweep."""
 
     law: LawFit
     storage: np.ndarray  # (n,) [Pa]
     loss: np.ndarray  # (n,) [Pa]
-    third: np.ndarray  # (n,) amplitude of the third harmonic of the torque over the first
+    third: np.ndarray  # (n,) amplitude of the third harmonic of the torque, divided by that of the first
 
 
 def memory_from(path: Path) -> Memory:
@@ -68,14 +68,14 @@ def memory_from(path: Path) -> Memory:
     return Memory(model)
 
 
-#: A series covers the angular frequency omega under two conditions: omega times the longest relaxation time is at least
-#: the first value, and omega times the shortest one is at most the second value.
+#: A series covers the angular frequency omega if two conditions are fulfilled: omega times the longest relaxation time
+#: is at least the first value, and omega times the shortest relaxation time is at most the second value.
 KNOWN = (0.5, 2.0)
 
 
 def outside_series(memory: Memory, omega: float) -> str | None:
-    """Return a warning if the relaxation times of the series do not cover the angular frequency omega [rad/s],
-    otherwise None."""
+    """Return a warning if the relaxation times of the series do not cover the angular frequency omega [rad/s];
+    otherwise return None."""
     if memory.series is None:
         return None
     times = np.asarray(memory.series.relaxation_times)
@@ -92,19 +92,19 @@ def outside_series(memory: Memory, omega: float) -> str | None:
 
 
 def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: str) -> StrainFit:
-    """Minimise the sum of the squared relative misfits of G* at all amplitudes, and return the best result of many
+    """Minimise the sum of the squared relative residuals of G* at all amplitudes. Return the best result of many
     starting points.
 
-    Without a Prony series, the loss tangent is one more parameter of the fit, and the modulus is valid only at this
-    frequency.
+    Without a Prony series, the loss tangent is an additional parameter of the fit, and the fitted modulus is valid only
+    at the frequency of the sweep.
     """
     own = candidate if memory.series is not None else with_loss_tangent(candidate)
     memories = memory.of(sweep.angular_frequency)
     r = cycle.reading(sweep.strain, memories, plates)
     measured = sweep.storage + 1j * sweep.loss
     scale = float(np.abs(measured[0]) / np.abs(memories[0, 1]))
-    # If each residual were divided by its measured modulus, points that are low by chance would have the largest
-    # weight.
+    # Residuals are divided by a smooth curve. If they were divided by the measured moduli, points that are low by
+    # chance would have the largest weight.
     sizes = smooth_curve(sweep.strain, np.abs(measured)) * np.exp(1j * np.angle(measured))
 
     def model(u: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -122,7 +122,7 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
     compiled = time.perf_counter()
     found = jax.block_until_ready(program(points))
     times = (time.perf_counter() - compiled, compiled - begin)
-    # G' and G'' of one sweep are one test, and their residuals are already relative.
+    # G' and G'' of one sweep belong to one test, and their residuals are already relative.
     law = assessed(own, _as_curves(sweep), found, scale, times, of_tests=False)
     best = found.u[int(np.nanargmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
     G, third = (np.asarray(v) for v in model(best))
@@ -130,7 +130,7 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
 
 
 def with_loss_tangent(candidate: Candidate) -> Candidate:
-    """Return the candidate with one more parameter, the tangent of the loss angle."""
+    """Return the candidate law with one more parameter, the loss tangent."""
 
     def values(u: jax.Array, scale: object) -> jax.Array:
         return jnp.concatenate([candidate.values(u[:-1], scale), u[-1:]])
@@ -147,14 +147,15 @@ def with_loss_tangent(candidate: Candidate) -> Candidate:
 
 
 def _as_curves(sweep: StrainSweep) -> list[Curve]:
-    """Return the two moduli as curves over the shear at the rim, for the warnings of a fit."""
+    """Return storage and loss modulus as two curves over the amount of shear at the rim. They are needed for the
+    warnings about a fit."""
     F = np.tile(np.eye(3), (len(sweep.strain), 1, 1))
     F[:, 0, 1] = sweep.strain
     return [Curve(name, "simple_shear", F, (0, 1), G) for name, G in (("G'", sweep.storage), ("G''", sweep.loss))]
 
 
 def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
-    """Return warnings about the fits for the user. The best fit must come first in `fits`."""
+    """Return warnings for the user about the fits. The best fit must be the first in `fits`."""
     best = fits[0]
     told = list(best.law.warnings)
     tangents = sweep.loss / sweep.storage
@@ -162,9 +163,9 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
     shape = [n for n, unit in zip(best.law.names, best.law.units, strict=True) if unit == "1" and n != "loss_tangent"]
     if "loss_tangent" in best.law.names and shape:
         told.append(
-            "without --model, the constant part of the stress has the modulus of this frequency too. "
-            f"{' and '.join(shape)} may be off by several per cent, which no standard error contains: give the "
-            "fit.json of a frequency sweep"
+            "without --model, also the constant part of the stress is computed with the modulus at this frequency. "
+            f"{' and '.join(shape)} may be off by several per cent, which the standard errors do not contain: give "
+            "--model with the fit.json of a frequency sweep"
         )
     if abs(change) > CHANGED:
         told.append(
@@ -175,7 +176,7 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
         told.append("the law misses the moduli by more than 5 % on average: it does not describe this sweep")
     if sweep.storage[-1] < 0.8 * sweep.storage[0]:
         told.append(
-            "the storage modulus falls with strain. The same happens if tissue slips, yields or tears. Then a "
-            "hyperelastic law only describes the curve"
+            "the storage modulus decreases with strain. The same happens if tissue slips, yields or tears. In this "
+            "case, a hyperelastic law describes the curve but not its cause"
         )
     return [*told, *tied_laws([f.law for f in fits], "sweep")]

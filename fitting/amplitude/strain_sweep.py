@@ -1,4 +1,4 @@
-"""Read a strain sweep from a file: moduli over the strain amplitude, at one frequency."""
+"""Read a strain sweep from a file: moduli at several strain amplitudes and one frequency."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,14 +11,14 @@ from fitting.readers.tables.text_tables import text_of
 from liverjax.core.errors import InputError
 
 FEWEST_POINTS, LARGEST_STRAIN, LARGEST_WITHOUT_UNIT = 4, 10.0, 2.0
-#: If a column in percent has no strain above this value [1], its values may in fact be fractions.
+#: If no strain of a column in percent is above this value [1], the values may in fact be fractions.
 SMALLEST_LARGEST = 0.01
 #: If the temperature changes by more than this value [K], the table contains several sweeps.
 LARGEST_DRIFT = 2.0
 
 
 class StrainSweep(NamedTuple):
-    """Moduli of the first harmonic at growing strain."""
+    """Moduli of the first harmonic, sorted by strain."""
 
     strain: np.ndarray  # (n,) amplitude at the rim [1]
     storage: np.ndarray  # (n,) [Pa]
@@ -29,17 +29,17 @@ class StrainSweep(NamedTuple):
 
 
 def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | None = None) -> StrainSweep:
-    """Read a strain sweep from text, CSV or a workbook with frequency, storage modulus, loss modulus and strain
-    amplitude.
+    """Read a strain sweep from a text file, a CSV file or a workbook. The columns are frequency, storage modulus, loss
+    modulus and strain amplitude.
 
     Args:
         path: path of the file. The name of its strain column is strain, with the unit % or 1.
-        table: name of one of several tables, or a part of the name.
-        max_strain: maximum strain [1]; points of larger strain are left out.
+        table: name of the table, or a part of its name, if the file has several tables.
+        max_strain: maximum strain [1]; points with a larger strain are ignored.
 
     Raises:
-        InputError: no table has a strain, the moduli are tensile moduli, there are several frequencies or temperatures,
-            or there are too few points.
+        InputError: no table has a column of strains; the moduli are tensile moduli; there are several frequencies or
+            temperatures; there are too few points.
     """
     found = [t for t in tables_of(str(path), text_of(path, "a strain sweep").splitlines()) if "strain" in t.raw]
     if not found:
@@ -61,11 +61,11 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     good = np.all([np.isfinite(column) & (column > 0) for column in (strain, omega, *G)], axis=0)
     kept = good & (strain <= (np.inf if max_strain is None else max_strain))
     if not good.all():
-        notes.append(f"{(~good).sum()} points without a positive strain, frequency or modulus are left out")
+        notes.append(f"{(~good).sum()} points without a positive strain, frequency or modulus are ignored")
     if good.sum() > kept.sum():
-        notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are left out as requested")
+        notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are ignored as requested")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:
-        raise InputError(f"{path}: {kept.sum()} points of strain are left: give {FEWEST_POINTS} or more")
+        raise InputError(f"{path}: {kept.sum()} points of strain are left: give {FEWEST_POINTS} points or more")
     if np.ptp(omega[kept]) > 0.01 * omega[kept].mean():
         low, high = omega[kept].min() / 2 / np.pi, omega[kept].max() / 2 / np.pi
         raise InputError(
@@ -96,7 +96,7 @@ def _refuse_several_temperatures(path: Path, temperature: np.ndarray | None, kep
 
 
 def _of_unit(path: Path, unit: str, largest: float) -> list[str]:
-    """Return a note if the unit of the strains is missing or may be wrong. Raises `InputError` for strains that are too
+    """Return a note if the unit of the strains is missing or may be wrong. Raise `InputError` if strains are too
     large."""
     if largest > (LARGEST_STRAIN if unit else LARGEST_WITHOUT_UNIT):
         raise InputError(

@@ -39,14 +39,14 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def _with_finite_stress(fits: "list[LawFit]") -> "list[LawFit]":
-    """Return the fits whose law has a finite stress on the curves. A warning names the other laws. Raises `InputError`
-    if no law is left."""
+    """Return the fits whose law has a finite stress on the curves. The program warns about the other laws. Raises
+    `InputError` if no law remains."""
     wrong = [f.label for f in fits if not np.isfinite(f.mean_relative_error)]
     told = f"{', '.join(wrong)}: the stress is not finite on these curves: check the law with python -m liverjax check"
     if len(wrong) == len(fits):
         raise InputError(told)
     if wrong:
-        print(f"warning: {told}; it is left out", file=sys.stderr)
+        print(f"warning: {told}; such laws are ignored", file=sys.stderr)
     return [f for f in fits if f.label not in wrong]
 
 
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
         notes.append(f"--unit {options.unit} changes nothing: the stress columns name their unit")
     if options.law == "all":
         left = [n for n in laws.LAWS if not hyperelastic.incompressible_form(n)]
-        notes.append(f"left out, because they are not an isochoric energy plus U(J): {', '.join(left)}")
+        notes.append(f"not fitted, because they are not an isochoric energy plus U(J): {', '.join(left)}")
     for note in [*notes, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)
     stress_stretch.initial_modulus(found)

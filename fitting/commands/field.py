@@ -83,7 +83,7 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
     for name in names:
         numbers_at(problem.scenes[0], name)
         if names.count(name) > 1:
-            raise InputError(f"--parameters names {name} twice: leave one out")
+            raise InputError(f"--parameters names {name} twice: remove one")
     writable(options.out, ("field.json",))
     bar, told = cost_bar("iterations")
     with bar:
@@ -102,7 +102,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     if given:
         print(
             f"note: {given} of {mesh.number_of_elements} elements keep the {options.name} of their [[region]]: the map "
-            "has no value there; to map these elements too, leave it out of the region",
+            "has no value there; to map these elements too, remove this parameter from the region",
             file=sys.stderr,
         )
     writable(options.out, ("field.json", "field.vtu", "field.h5", "field.png", "progress.h5"))

@@ -8,7 +8,7 @@ from fitting.commands.exit_codes import EXIT_CODES
 from liverjax.core.errors import InputError
 
 COLUMNS = """The file has columns of depth (or displacement, indentation) and force (or load) with their units, e.g.
-depth_um,force_mN. Points after the deepest one are left out. """
+depth_um,force_mN. Points after the deepest one are ignored. """
 
 
 def parser(prog: str) -> argparse.ArgumentParser:

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from fitting.readers.time_tests import TimeTest
 
 COLUMNS = """The file has a column of time and one of these: relaxation_modulus_Pa (creep: creep_compliance_1/Pa);
-strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. With two columns, the model follows
-the measured load, including the ramp. Torque and force need the size of the sample. """
+strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. With two columns, the measured load
+is imposed on the model, including the ramp. Torque and force need the size of the sample. """
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
@@ -42,7 +42,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="S",
         help="duration [s] of the rise of the load, if no row shows it (until the first row under load); 0: a step",
     )
-    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out responses before this")
+    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="ignore responses before this time")
     command.add_argument("--radius", type=float, metavar="M", help="radius of the sample [m], for torque and force")
     command.add_argument("--height", type=float, metavar="M", help="height of the sample [m], for torque and force")
     shared_options.add_cards_and_samples(command)
@@ -60,9 +60,7 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
     for name in ("radius", "height", "ramp", "min_time"):
         if getattr(options, name) or (name == "ramp" and options.ramp is not None):
             option = f"--{name.replace('_', '-')}"
-            raise InputError(
-                f"{option} belongs in the file {options.file} that describes the test: leave the option out"
-            )
+            raise InputError(f"{option} belongs in the file {options.file} that describes the test: remove the option")
     test = read_described(options.file)
     if test.kind != options.kind:
         raise InputError(
@@ -73,7 +71,7 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
 
 
 def _said_of_rows(test: "TimeTest") -> list[str]:
-    """Return notes: if only some rows of a long record are fitted, and on the time before the first response."""
+    """Return a note if only some rows of a long record are fitted, and a note on the time before the first response."""
     from fitting.fits.time_tests import thinned
 
     number, every, told = len(thinned(test)), int(test.used.sum()), []
@@ -105,9 +103,9 @@ def run(options: argparse.Namespace) -> int:
             raise InputError(f"--{name} {value:g} cannot be a sample's {name} in metres: give e.g. --{name} 0.004")
     shared_options.check_samples(options.samples)
     if options.modes != "auto" and options.model != "prony":
-        raise InputError(f"--modes works with --model prony only: leave it out for --model {options.model}")
+        raise InputError(f"--modes works with --model prony only: remove it for --model {options.model}")
     if options.samples is not None and options.model == "spectrum":
-        raise InputError("--samples works with models of a few parameters only; leave it out for --model spectrum")
+        raise InputError("--samples works with models of a few parameters only; remove it for --model spectrum")
     out = options.out
     sample = reader.Sample(options.radius, options.height)
     if options.file.suffix.lower() == ".toml":

@@ -64,7 +64,7 @@ def write_cards(out: Path, model: "Maxwell") -> None:
 
 def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
     """Read a sweep without the points at which the instrument dominates. With --max-frequency, only the limits of the
-    band and the raw columns (`without_inertia`) decide which points are left out."""
+    band and the raw columns (`without_inertia`) decide which points are ignored."""
     from fitting.readers import rheometer
 
     try:

@@ -52,8 +52,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
         help="further tests of the same material (relaxation, creep, sweep, shear waves): one Prony series for all",
     )
     command.add_argument("--table", metavar="NAME", help="which of several tables: its number, name or a part of it")
-    command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above this frequency")
-    command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below this frequency")
+    command.add_argument("--max-frequency", type=float, metavar="HZ", help="ignore the points above this frequency")
+    command.add_argument("--min-frequency", type=float, metavar="HZ", help="ignore the points below this frequency")
     shared_options.add_modes(command)
     command.add_argument(
         "--model",
@@ -135,7 +135,7 @@ def _add_outputs(command: argparse.ArgumentParser) -> None:
         metavar="TEST",
         help="tests that are not fitted, but predicted by the fit for comparison",
     )
-    command.add_argument("--profile", action="store_true", help="also compute 95 %% intervals by profile likelihood")
+    command.add_argument("--profile", action="store_true", help="also compute 95 %% profile-likelihood intervals")
     shared_options.add_cards_and_samples(command)
     command.add_argument("--report", action="store_true", help="also write a page with pictures, report.pdf")
     command.add_argument(
@@ -203,7 +203,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _master(options: argparse.Namespace) -> tuple["Sweep", dict, str]:
-    """Write and print the master curve of the files. Return its sweep, its part of fit.json, and the printed table."""
+    """Write and print the master curve of the files. Return its sweep, its entry of fit.json, and the printed table."""
     from fitting.master import master_curve, master_report, temperature_sweeps
     from fitting.readers import rheometer
 
@@ -272,15 +272,15 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps per cycle, e.g. 50")
     if options.model in ("fractional", "spectrum") and options.modes != "auto":
         raise InputError(
-            f"--modes {options.modes} works with --model prony only: leave it out for --model {options.model}"
+            f"--modes {options.modes} works with --model prony only: remove it for --model {options.model}"
         )
     if options.profile and options.model != "prony":
-        raise InputError(f"--profile works with --model prony only; leave it out for --model {options.model}")
+        raise InputError(f"--profile works with --model prony only; remove it for --model {options.model}")
     _note_idle(options)
     shared_options.refuse_copies([*options.sweep, *options.others])
     shared_options.check_samples(options.samples)
     if options.samples and options.model == "spectrum":
-        raise InputError("--samples works with models of a few parameters only; leave it out for --model spectrum")
+        raise InputError("--samples works with models of a few parameters only; remove it for --model spectrum")
     laws.find(options.law)
 
 
@@ -314,7 +314,7 @@ def _check_friction(options: argparse.Namespace) -> None:
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(f"--friction-error is fitted with the Prony modes of one sample: leave out {name}")
+            raise InputError(f"--friction-error is fitted with the Prony modes of one sample: remove {name}")
 
 
 def _check_precompression(options: argparse.Namespace) -> None:
@@ -326,11 +326,11 @@ def _check_precompression(options: argparse.Namespace) -> None:
     compression.check_strain(options.precompression)
     for name, asked in (("--with", bool(options.others)), (f"{len(options.sweep)} samples", len(options.sweep) > 1)):
         if asked:
-            raise InputError(f"--precompression works for one sample only: leave out {name}, or --precompression")
+            raise InputError(f"--precompression works for one sample only: remove {name}, or --precompression")
     for name, asked in (("--profile", options.profile), ("--samples", options.samples is not None)):
         if asked:
             raise InputError(
-                f"{name} is computed for a sample that is not compressed: leave out {name}, or --precompression"
+                f"{name} is computed for a sample that is not compressed: remove {name}, or --precompression"
             )
     if options.model != "prony" and options.method != "closed-form":
         raise InputError(
@@ -352,19 +352,19 @@ def _check_master(options: argparse.Namespace) -> None:
         ("--precompression", options.precompression != 0),
     ):
         if asked:
-            raise InputError(f"--master uses the sweeps at all temperatures of the files: leave out {name}")
+            raise InputError(f"--master uses the sweeps at all temperatures of the files: remove {name}")
 
 
 def _check_samples(options: argparse.Namespace) -> None:
     """Raise an error for options that need a single sweep."""
     for name, asked, instead in (
-        ("--method torsion", options.method == "torsion", "leave it out, or give one file"),
-        ("--profile", options.profile, "leave it out, or give one file"),
-        ("--samples", options.samples is not None, "leave it out, or give one file"),
-        ("--report", options.report, "leave it out, or give one file"),
-        ("--predict", bool(options.predict), "leave it out, or give one file"),
-        ("--gap-error", options.gap_error is not None, "leave it out, or give one file"),
-        ("--density", options.density is not None, "leave it out, or give one file"),
+        ("--method torsion", options.method == "torsion", "remove it, or give one file"),
+        ("--profile", options.profile, "remove it, or give one file"),
+        ("--samples", options.samples is not None, "remove it, or give one file"),
+        ("--report", options.report, "remove it, or give one file"),
+        ("--predict", bool(options.predict), "remove it, or give one file"),
+        ("--gap-error", options.gap_error is not None, "remove it, or give one file"),
+        ("--density", options.density is not None, "remove it, or give one file"),
     ):
         if asked:
             raise InputError(f"{name} is for one sample only, and {len(options.sweep)} files are given: {instead}")
@@ -382,7 +382,7 @@ def _check_together(options: argparse.Namespace) -> None:
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(f"--with fits modes or springpots to one sample in closed form: leave out {name}")
+            raise InputError(f"--with fits modes or springpots to one sample in closed form: remove {name}")
 
 
 def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":

@@ -64,7 +64,7 @@ def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "M
     """Read a file as a described test in a rig, as shear waves, as another sweep, or as a relaxation or creep test.
 
     Another sweep is cut to the band that the user gives. As in the first sweep, points at which the instrument
-    dominates are left out. If `whole`, the sweep is only predicted, so it is not cut.
+    dominates are ignored. If `whole` is true, the sweep is only predicted, so it is not cut.
     """
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion

@@ -50,7 +50,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--noise", type=float, metavar="M", help="standard deviation of one component (default: from data)"
     )
     command.add_argument("--density", type=float, default=DENSITY, metavar="KG_M3", help=f"default {DENSITY:g}")
-    command.add_argument("--stride", type=int, metavar="N", help="take means of N x N x N voxels (default: as needed)")
+    command.add_argument("--stride", type=int, metavar="N", help="use means of N x N x N voxels (default: as needed)")
     command.add_argument("--no-map", action="store_true", help="fit only the whole organ and the regions")
     command.add_argument(
         "--length", type=float, metavar="M", help="correlation length of the map [m] (default 4 voxels)"
@@ -159,7 +159,7 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
     if parts > 1:
         print(
             f"note: the organ is divided into {parts} parts. Forces are not balanced where parts meet, so errors are "
-            "larger than without parts",
+            "larger than without this division",
             file=sys.stderr,
         )
     for note in (*elastography.notes_on_gaps(coarse), *elastography.notes_on_layers(coarse)):
@@ -175,7 +175,9 @@ def _check_waves(options: argparse.Namespace) -> None:
             example = {"length": "0.004", "noise": "2e-7"}[name]
             raise InputError(f"--{name} {value:g} must be above 0: give a length in metres, e.g. {example}")
     if not 100 <= options.density <= 25000:
-        raise InputError(f"--density {options.density:g} cannot be an organ's in kg/m^3: give e.g. --density 1060")
+        raise InputError(
+            f"--density {options.density:g} cannot be the density of an organ in kg/m^3: give e.g. --density 1060"
+        )
     if options.stride is not None and options.stride < 1:
         raise InputError(f"--stride {options.stride} is the number of voxels in a mean: give 1 or more")
     if options.samples < 0:

@@ -1,1 +1,1 @@
-"""The fits: sweeps, curves, several tests, stiffness maps, parameters of scenes."""
+"""Fits of sweeps, curves, several tests, stiffness maps and parameters of scenes."""

@@ -3,12 +3,13 @@
 The parameter of an element is the value in the scene times exp(m). Here m is the mean over the element of a nodal field
 (V,) with the prior of `fitting.methods.prior`. The unknown is the whitened field z, whose entries are independent with
 variance 1 in the prior. A Gauss-Newton method in a trust region (Steihaug 1983) minimises chi^2/2 + |z|^2/2. J is the
-derivative of the residuals with respect to z. The Hessian I + J^T J is never assembled: each product with it needs a
-linearised run and its transpose. No eigenvalue of this Hessian is below 1. The norm of the gradient is therefore an
-upper bound of the distance to the minimum, in standard deviations of the map. The prior's standard deviation of m sets
-the weight of the regularisation. This standard deviation is increased until chi^2 is as low as the number of measured
-components (discrepancy principle; Morozov 1966), or until chi^2 no longer falls. The uncertainty comes from the same
-Hessian. Lanczos iterations find the largest eigenvalues of J^T J (Bui-Thanh et al. 2013).
+derivative of the residuals with respect to z. The Hessian I + J^T J is never assembled: each product of the Hessian
+with a vector needs one linearised run and one transposed run. No eigenvalue of this Hessian is below 1. The norm of the
+gradient is therefore an upper bound of the distance to the minimum, in standard deviations of the map. The prior's
+standard deviation of m sets the weight of the regularisation. This standard deviation is increased until chi^2 is as
+low as the number of measured components (discrepancy principle; Morozov 1966), or until chi^2 no longer falls. The
+uncertainty comes from the same Hessian. Lanczos iterations find the largest eigenvalues of J^T J (Bui-Thanh et al.
+2013).
 """
 
 import re
@@ -50,9 +51,9 @@ class Field(NamedTuple):
 
     name: str
     log_factor: np.ndarray  # m (V,)
-    modulus: np.ndarray  # modulus of the elements (E,); NaN where a region has a law without it
-    sd: np.ndarray  # standard deviation of m at the nodes (V,), with the data
-    prior_sd: np.ndarray  # the same without data
+    modulus: np.ndarray  # modulus of the elements (E,); NaN in regions whose law has no such parameter
+    sd: np.ndarray  # standard deviation (V,) of m at the nodes, from data and prior
+    prior_sd: np.ndarray  # standard deviation (V,) of m at the nodes, from the prior alone
     mesh_bias: np.ndarray | None  # error of m (V,) due to the meshes, to be subtracted from m; None: unknown
     deviation: float  # chosen standard deviation of the prior
     length: float  # correlation length [m]
@@ -60,7 +61,7 @@ class Field(NamedTuple):
     components: int
     reached: bool  # whether chi^2 came down to the number of components
     distance: float  # distance to the minimum: length of the next Gauss-Newton step, in standard deviations
-    history: list[dict]  # one row per deviation: chi2, iterations, evaluations, seconds
+    history: list[dict]  # one entry for each deviation of the prior: chi2, iterations, evaluations, seconds
     eigenvalues: np.ndarray  # of J^T J in whitened z: the data determine the directions with eigenvalues above 1
     codes: tuple[int, ...]
     seconds: float
@@ -93,8 +94,8 @@ def start_of(problem: Problem, name: str) -> jax.Array:
 
 
 def given_by_regions(problem: Problem, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether a [[region]] sets the parameter of each element (E,) in all scenes, and its values (E,) in the
-    first scene. Values that no region sets are NaN."""
+    """Return whether a [[region]] sets the parameter of each element (E,) in all scenes. Also return the values (E,)
+    that the regions of the first scene set; other values are NaN."""
     E = problem.scenes[0].mesh.number_of_elements
     each = [set_by_regions(scene.region, name, E) for scene in problem.scenes]
     return np.all([own for own, _ in each], axis=0), each[0][1]
@@ -167,8 +168,8 @@ class _LinearRuns(NamedTuple):
 
 
 def _without_addresses(structure: object) -> str:
-    """Return the structure of scenes as a text without memory addresses, which is the same in every process. It
-    contains the types of all objects, and the settings that are not numbers."""
+    """Return a string that describes the structure of scenes. It has no memory addresses, so it is the same in every
+    process. The string contains the types of all objects, and the settings that are not numbers."""
     return re.sub(r" at 0x[0-9a-f]+", "", str(structure))
 
 
@@ -239,8 +240,8 @@ class _Search:
                 refuse_other(self.file, f.attrs, self.marks)
                 self.z, self.k = f["z"][:], int(f["k"][()])
                 self.history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
-        except (OSError, KeyError):  # not HDF5, or from another program
-            raise InputError(f"{self.file} belongs to another fit: leave out --resume, or give another --out") from None
+        except (OSError, KeyError):  # not an HDF5 file, or a file of another program
+            raise InputError(f"{self.file} belongs to another fit: remove --resume, or give another --out") from None
 
 
 _HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "seconds")
@@ -269,7 +270,7 @@ def estimate(
 
     Args:
         problem: scenes with one mesh, and the measurements.
-        name: dotted name of a positive parameter of the law. The field begins at its value in the scenes.
+        name: dotted name of a positive parameter of the law. The search begins at the value in the scenes.
         length: correlation length of the prior [m].
         options: settings of the search, see `MapOptions`.
         changes: fields of `options` by their names, for example ``max_iterations=40``.
@@ -320,7 +321,7 @@ def estimate(
 
 def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
     """Try larger and larger standard deviations of the prior until chi^2 is as low as the number of components. Each
-    search begins at the field of the search before."""
+    search begins at the result of the previous search."""
     while True:
         # If the program was stopped after this search had finished, the history already has its row.
         finished = len(search.history) > search.k and search.history[search.k]["iterations"] < max_iterations
@@ -336,7 +337,7 @@ def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
 
 
 def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
-    """Find the minimum for the present standard deviation of the prior, and return a row of the history."""
+    """Find the minimum for the present standard deviation of the prior, and return an entry of the history."""
     begin, before = time.perf_counter(), search.evaluations
     found = scipy.optimize.minimize(
         lambda z: search.at(z).cost,
@@ -364,7 +365,8 @@ def _measured_directions(here: _LinearRuns, n: int, modes: int) -> tuple[np.ndar
 
 
 def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return (I + J^T J)^-1 g (V,), with a relative tolerance of 1 %. This is enough for estimates of first order."""
+    """Return (I + J^T J)^-1 g (V,), with a relative tolerance of 1 %. This is accurate enough for first-order
+    estimates."""
     n, shrink = len(g), values / (1 + values)
 
     def solved(z: np.ndarray) -> np.ndarray:
@@ -425,10 +427,10 @@ def bias_sentence(found: Field) -> str | None:
     largest = np.abs(found.mesh_bias)[beyond].max()
     if largest > LARGEST_BIAS:
         return (
-            f"the mesh error moves the map by a third or more ({largest:.0%}), which is too much to correct: refine "
+            f"the mesh error changes the map by a third or more ({largest:.0%}), which is too much to correct: refine "
             "the mesh"
         )
     return (
-        f"the mesh error moves the map by up to {largest:.0%}, and by more than the standard deviation at "
+        f"the mesh error changes the map by up to {largest:.0%}, and by more than the standard deviation at "
         f"{beyond.mean():.0%} of the nodes: subtract mesh_bias from the logarithm of the map, or refine the mesh"
     )

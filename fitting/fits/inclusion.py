@@ -32,8 +32,8 @@ def edge_width(mesh: TetMesh) -> float:
 
 
 def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> jax.Array:
-    """Return the part of each element (E,) that lies inside the sphere: 1 inside, 0 outside, smooth between. The part
-    is a mean over points in the element."""
+    """Return the fraction of each element (E,) that lies inside the sphere: 1 inside, 0 outside, smooth in between. The
+    fraction is a mean over points in the element."""
     corners = mesh.points[mesh.tetrahedra]
     L = np.full((4, 1), 0.25) if mesh.order == 1 else basis(mesh.order).L
     points = jnp.einsum("kq,eki->qei", L, corners)

@@ -1,5 +1,5 @@
-"""Errors of the instrument that are common to all points of a fit (inertia, friction, gap), each with a prior. Also the
-fit of a compressed sample.
+"""Errors of the instrument that are common to all points of a fit (inertia, friction, gap), each with a prior. This
+module also contains the fit of a compressed sample.
 
 The instrument subtracts the torque of its inertia I; the modulus is the torque per angle, divided by the constant K of
 the geometry. If the true inertia is I (1 + delta), G' is too small by delta I omega^2 / K. Without a prior, this term
@@ -49,14 +49,15 @@ class Nuisance(NamedTuple):
         return "friction_off_by_N_m_s" if self.name == "friction" else "inertia_off_by"
 
     def told(self, deviations: float) -> str:
-        """Return the size of this error as text, for a sentence."""
+        """Return the size of this error with its unit, as a string for a warning."""
         value = self.unit * deviations
         return _cent(value) if self.name == "inertia" else f"{value:.2g} N m s"
 
     def compared(self, deviations: float) -> str:
-        """Return the comparison of the true quantity with the subtracted quantity, as text for a sentence."""
+        """Return text for a warning: by how much the true friction or inertia is larger or smaller than the value that
+        the instrument subtracted."""
         return (
-            f"{self.told(abs(deviations))} {'larger' if deviations > 0 else 'smaller'} than the value that it "
+            f"{self.told(abs(deviations))} {'larger' if deviations > 0 else 'smaller'} than the value that was "
             "subtracted"
         )
 
@@ -142,13 +143,14 @@ def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]
     if not errors.found:
         each = " and ".join(n.name for n in known)
         return [
-            f"the error of the instrument's {each} was not found together with the modes. The moduli are not corrected "
-            "for this error, and the errors of the parameters do not contain it: leave out the frequencies at which "
-            "the instrument carries most of the torque (--max-frequency), or give another number of --modes"
+            f"the error of the instrument's {each} was not found together with the modes. The moduli are not "
+            "corrected for this error, and the errors of the parameters do not contain it: use --max-frequency to "
+            "exclude the frequencies at which the instrument carries most of the torque, or give another number of "
+            "--modes"
         ]
     for k in np.flatnonzero(~errors.steady):
         n = known[k]
-        there = "too few points are left to check it"
+        there = "too few points remain to check this error"
         if errors.part is not None:
             there = f"the error is then {n.told(errors.part[k])}"
         out.append(
@@ -164,7 +166,7 @@ def _cent(value: float) -> str:
 
 
 def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[str, object]:
-    """Return the part `instrument` of fit.json."""
+    """Return the entry `instrument` of fit.json."""
     out: dict[str, object] = {}
     errors = np.sqrt(np.diag(found.covariance))
     for k, n in enumerate(known):
@@ -225,12 +227,13 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
 
 
 def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:
-    """Return the fit of the modes to other moduli. It begins at the present values of the modes."""
+    """Fit the modes to the corrected moduli of `sweep`. The search begins at the values of the modes in `fit`."""
     return viscoelastic.modes_from(sweep, fit.solution.u[None], fit.kind)._replace(details=fit.details)
 
 
 def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return the step, halved until all corrected moduli are positive. Returns 0 if no part of the step is possible.
+    """Return the step, halved until all moduli corrected with `values` + step are positive. Returns zeros if no part of
+    the step is possible.
 
     The modes can fit a part of a large error, so the first step may be far too long.
     """
@@ -256,7 +259,8 @@ def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: 
 
 
 def with_gap_error(fit: Fit, relative: float) -> Fit:
-    """Return the fit with the error of the gap. This error is common to all moduli; ratios and times do not have it."""
+    """Return the fit with the error of the gap. This error is common to all moduli. It does not change ratios and
+    times."""
     modes = fit.modes
     first = np.concatenate([fit.uncertainty.values[:1], np.zeros(2 * modes)])
     own = fit.parameters
@@ -336,7 +340,7 @@ def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, 
 
 
 def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) -> dict[str, object]:
-    """Return the part `precompression` of fit.json, for a fit in closed form or through the simulation."""
+    """Return the entry `precompression` of fit.json, for a fit in closed form or through the simulation."""
     law, strain = laws.typical(simulation.law), simulation.precompression
     G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"
     factors, kept = compression.shares(law, strain), compression.incompressible(law, strain)

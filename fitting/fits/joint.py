@@ -39,12 +39,12 @@ class Test(NamedTuple):
     predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
     measured: np.ndarray  # (n,)
     sd: np.ndarray  # (n,) standard deviation of its noise
-    mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) effect of an infinitely fine mesh; None: no mesh
+    mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) change on an infinitely fine mesh; None: no mesh
 
 
 def sweep(data: Sweep) -> Test:
-    """Return a frequency sweep that is predicted in closed form. Its noise comes from the file, or otherwise from the
-    misfit of the best Prony modes."""
+    """Return the test for a frequency sweep that is predicted in closed form. Its noise comes from the file, or
+    otherwise from the misfit of the best Prony modes."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
@@ -54,8 +54,8 @@ def sweep(data: Sweep) -> Test:
 
 
 def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.Drive = torsion.Drive()) -> Test:
-    """Return a frequency sweep that the torsion simulation predicts, with fixed or free height, at torque amplitudes [N
-    m]."""
+    """Return the test for a frequency sweep that the torsion simulation predicts, with fixed or free height, at torque
+    amplitudes [N m]."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):

@@ -55,9 +55,9 @@ class Posterior(NamedTuple):
     draws: np.ndarray  # (chains, N, K)
     r_hat: np.ndarray  # (K,)
     chains: Chains  # the same draws in the coordinates of the fit, with details of the sampling
-    prior: str  # in words
+    prior: str  # description of the prior in words
     seconds: float
-    simulated: dict[str, float] | None = None  # number of simulated draws, and their largest difference
+    simulated: dict[str, float] | None = None  # number of simulated draws, and largest error of log density
     times: tuple[float, float] | None = None  # ends [s] of the prior of relaxation times
 
     def warnings(self) -> list[str]:
@@ -233,7 +233,7 @@ class Springpots(NamedTuple):
         return np.where(self._moduli, moduli, scipy.special.logit(rng.random((count, parameters))))
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Names of the reported parameters."""
+        """Return the names of the reported parameters."""
         return self.model.names
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
@@ -250,7 +250,7 @@ class WithInstrument(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The prior in words."""
+        """Description of the prior in words."""
         each = [f"error of the {n.name} normal around 0 with a deviation of {n.told(1.0)}" for n in self.errors]
         return "; ".join([self.modes.words, *each])
 
@@ -299,8 +299,8 @@ def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
 
 
 def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:
-    """Return the draws with the error of the gap, if the fit has this error. It multiplies all moduli of a draw by one
-    factor. The factor is log-normal, so that no modulus is negative."""
+    """Return the draws with the error of the gap, if the fit has this error. The error multiplies all moduli of a draw
+    by one factor. The factor is log-normal, so that no modulus is negative."""
     relative, kind = fit.details.get("gap_error"), fit.kind
     if not relative:
         return found
@@ -358,10 +358,10 @@ SIMULATED, DIFFERENT = 12, 0.1
 def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a fit of Prony modes through the torsion simulation.
 
-    The density is computed with the linear rig: the same test for small strain, which needs no simulation in time. For
-    each frequency, a complex factor corrects the linear rig so that both agree at the minimum. Then some draws are
-    simulated in full. `Posterior.simulated` has the largest difference between the simulated and the approximate log
-    likelihood of these draws. It shows how good the approximation is.
+    The density is computed with the linear rig: the same test for small strain, which needs no time steps. For each
+    frequency, a complex factor corrects the linear rig so that both agree at the minimum. Then some draws are simulated
+    in full. `Posterior.simulated` has the largest difference between the simulated and the approximate log likelihood
+    of these draws. It shows how good the approximation is.
     """
     data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
     rig, law, omega, _, measured, _ = data
@@ -387,7 +387,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
         partial(simulated_rheometer.with_jacobian, simulation=simulation, kind=fit.kind), modes[0], data, short=True
     )
     exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in modes])
-    exact += own.residuals(some) - residuals(modes)  # changes by the errors of the instrument
+    exact += own.residuals(some) - residuals(modes)  # adds the effect of the errors of the instrument
     likelihood = log_likelihood(np.sum(exact**2, axis=-1), exact.shape[-1], own.deviations_given)
     apart = float(np.max(np.abs(likelihood - own.log_likelihood(some))))
     checked = {"draws": float(SIMULATED), "largest_difference": apart}

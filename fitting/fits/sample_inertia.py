@@ -1,4 +1,5 @@
-"""Inertia of a cylinder in oscillating torsion, in closed form: how it changes the modulus that a rheometer measures.
+"""Inertia of a cylinder in oscillating torsion, in closed form. This inertia changes the modulus that a rheometer
+measures.
 
 Shear waves run along the axis, with the wave number k = omega sqrt(rho/G*) for the density rho. The torque at the
 turning plate, divided by the angle of this plate, gives G* k h cot(k h) in place of G*, for the height h (Schrag 1977,
@@ -14,7 +15,7 @@ from liverjax.core.errors import InputError
 #: The inertia is subtracted only up to this |k h|. At pi/2 the sample alone is in resonance, and its measured storage
 #: modulus is 0. At pi, its measured modulus is infinite.
 MOST = 2.5
-#: A note gives the relative change of the modulus due to inertia if this change is larger.
+#: If inertia changes the modulus by more than this fraction, a note gives the change.
 WORTH_A_NOTE = 0.001
 
 
@@ -71,7 +72,7 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
     if lost.size:
         raise InputError(
             f"{sweep.source or 'sweep'}: at {hertz[lost[0]]:.3g} Hz the inertia of the sample is larger than its "
-            "modulus: leave out such frequencies with --max-frequency, or check --density and --height"
+            "modulus: exclude such frequencies with --max-frequency, or check --density and --height"
         )
     change = np.abs(G / seen - 1)
     k, notes = int(change.argmax()), sweep.notes

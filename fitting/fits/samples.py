@@ -216,7 +216,7 @@ def _strangers(found: Samples, name: str) -> list[tuple[int, float, float, float
 
 def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[str]:
     """Return a warning if some samples have a modulus far above or below the others. This check also works for few
-    samples, where no test is possible."""
+    samples, where no statistical test is possible."""
     order = np.argsort(logs)
     gaps = np.diff(logs[order])
     if not len(gaps) or gaps.max() < np.log(_OTHER_UNIT):
@@ -235,8 +235,8 @@ def _place(name: str) -> int:
 
 
 def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
-    """Return Prony modes with the means of the population. Modes without a mean are left out. Other parameters without
-    a mean get the median."""
+    """Return Prony modes with the means of the population. Modes without a mean are not included. Other parameters
+    without a mean get the median."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}

@@ -72,9 +72,9 @@ def fit(
         problem: scenes and data.
         unknowns: u, and the functions from u to the parameters of the scenes and to the reported parameters.
         max_iterations, progress: see `levenberg_marquardt_host`.
-        mesh_error: estimate the error due to the meshes, and the change of each parameter that it causes (`mesh_bias`).
-            A warning is given if a parameter changes by more than its standard error. The estimate needs one more run,
-            and one linear solve per step.
+        mesh_error: whether to estimate the error due to the meshes, and the change of each parameter that it causes
+            (`mesh_bias`). A warning is given if a parameter changes by more than its standard error. The estimate needs
+            one more run, and one linear solve per step.
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
     start, values_of, natural_of, names = unknowns

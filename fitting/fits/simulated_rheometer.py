@@ -1,7 +1,7 @@
 """Identify a generalised Maxwell model through the simulated rheometer: the torsion of a sample between its plates.
 
-The recursion is the update of the viscous memory from time step to time step. The rig is the machine with its sample.
-The linear rig is the same test for small strain, whose moduli are known without a mesh.
+The recursion is the update of the history variables of viscosity from time step to time step. The rig is the machine
+with its sample. The linear rig is the same test for small strain, whose moduli are known without a mesh.
 """
 
 import time
@@ -70,7 +70,8 @@ class Simulation(NamedTuple):
 
 
 #: Up to this strain at the rim, the derivatives are computed with the linear rig. The relative error of the derivatives
-#: is below the strain. With inertia, this error is the error of the mesh in the inertial part.
+#: is below the strain. With inertia, the error of the derivatives also contains the effect of the mesh on the inertial
+#: forces.
 LINEAR_STRAIN = 1e-2
 
 
@@ -116,7 +117,7 @@ def with_jacobian(
 
     The derivatives are those of the linear rig. If the strain is large, or if a compressed sample has inertia, the
     simulation is differentiated instead. With the derivatives of the linear rig, Gauss-Newton finds the same minimum in
-    a small part of the time (experiments/benchmarks/torsion_speed.py).
+    a small fraction of the time (experiments/benchmarks/torsion_speed.py).
     """
     if not simulation.is_linear:
 
@@ -159,7 +160,7 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
         return torsion.make_rig(simulation.radius, height, cell, density=simulation.density)
     if simulation.part != "all":
         raise InputError(
-            f"a precompression of {simulation.precompression:g} needs a sample whose whole stress relaxes: leave out "
+            f"a precompression of {simulation.precompression:g} needs a sample whose whole stress relaxes: remove "
             f"part {simulation.part!r}"
         )
     tall = height / (1 - simulation.precompression)
@@ -190,7 +191,7 @@ def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
 OF_THE_DATA = (
     "modes would follow",
     "about as well as",
-    "would follow the data more closely",
+    "would fit the data more closely",
     "no finite instantaneous",
     "that relaxes",
     "Kramers-Kronig",
@@ -199,7 +200,7 @@ OF_THE_DATA = (
     SHARED,
     "poses as",
     SHORT,
-    "a solid follows the data as well",
+    "a solid fits the data as well",
 )
 KEPT = (
     "conversion",
@@ -260,7 +261,7 @@ def through_torsion(
             return found, simulated_residuals(found.u, data, simulation, kind)[1]
 
         (found, m), compiling, running = timed(minimised, u0, *data)
-    if isinstance(start.solution.u, np.ndarray):  # all later steps run on the host, like the closed form
+    if isinstance(start.solution.u, np.ndarray):  # all later steps use NumPy, like the closed form
         found = Solution(*(np.asarray(field) for field in found))
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
     worst = int(np.asarray(m.statistics.status).max())
@@ -278,8 +279,8 @@ def through_torsion(
 
 
 def _as_told_before(fit: Fit, start: Fit) -> Fit:
-    """Return the fit through the simulation with the errors of gap and instrument of the closed-form fit `start`.
-    Warnings and details of `start` are added if they concern the data."""
+    """Add to the simulated fit the errors of the gap and of the instrument, taken from the closed-form fit `start`.
+    Warnings and details of `start` are added too if they concern the data."""
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
     fit = _with_shared_errors(fit._replace(details=fit.details | of_the_model), start)
@@ -324,15 +325,15 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
 
 
 def _of_no_mesh(law: laws.Law, prony: Prony, omega: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
-    """Return complex moduli (n,) [Pa] without a mesh, first with the recursion, then in continuous time."""
+    """Return the complex moduli (n,) [Pa] without a mesh, for the recursion and for continuous time."""
     return torsion.linear_moduli(law, prony, omega, steps), torsion.linear_moduli(law, prony, omega, None)
 
 
 def _of_held(
     rig: torsion.Rig, material: tuple[laws.Law, Prony], omega: jax.Array, simulation: Simulation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return complex moduli (n,) [Pa] of a compressed sample, first with the recursion, then in continuous time. Both
-    are corrected by the estimated error of the meshes in `_without_mesh`.
+    """Return complex moduli (n,) [Pa] of a compressed sample, for the recursion and for continuous time. Both are
+    corrected by the estimated error of the meshes in `_without_mesh`.
     """
     law, prony = material
     of, moduli = jax.jit(torsion.held)(rig, law), jax.jit(torsion.held_moduli, static_argnums=4)
@@ -397,19 +398,25 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
         if abs(d) > e and abs(d) > 1e-6 * abs(v):
             cause, remedy = _cause(closed, simulated, k)
             out.append(
-                f"{name}: {cause} it by {100 * d / v:.2g} %, more than its standard error ({100 * e / v:.2g} %); "
-                f"{remedy}"
+                f"{name}: {cause} this parameter by {100 * d / v:.2g} %, more than its standard error "
+                f"({100 * e / v:.2g} %); {remedy}"
             )
     return out
 
 
 def _cause(closed: Fit, simulated: Fit, k: int) -> tuple[str, str]:
-    """Return what changes parameter k in the simulation, with the verb, and the remedy."""
+    """Return the cause of the change of parameter k, with a verb ("… changes"), and the remedy."""
     if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):  # closed: no inertia
-        return "the sample's inertia and the discretisation move", "raise --steps to see which of them it is"
+        return (
+            "the sample's inertia and the discretisation change",
+            "raise --steps to see which of the two is the cause",
+        )
     if simulated.details.get("precompression_strain"):
-        return "the glued plates, which prevent the sample from widening, move", "for smooth plates use closed-form"
+        return (
+            "the glued plates, which prevent the sample from widening, change",
+            "for smooth plates use --method closed-form",
+        )
     of_mesh, of_steps = simulated.uncertainty.mesh_bias, simulated.uncertainty.time_step_bias
     if of_mesh is not None and of_steps is not None and abs(of_mesh[k]) > abs(of_steps[k]):
-        return "the mesh of the simulation moves", "trust the closed form"
-    return "the simulation's discretisation moves", "raise --steps or trust the closed form"
+        return "the mesh of the simulation changes", "use the closed form"
+    return "the simulation's discretisation changes", "raise --steps, or use the closed form"

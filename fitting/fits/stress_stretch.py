@@ -57,8 +57,9 @@ class LawFit(NamedTuple):
     limits: dict[str, str]  # parameters that went to 0 or infinity
 
 
-#: The stresses of each test may be wrong by a factor that the residuals do not show. Such factors are reported if they
-#: change a parameter by more than _HIDDEN standard errors and by more than a part _MOVED of its value.
+#: The stresses of a test may all be multiplied by a wrong factor that the residuals do not show. Such factors are
+#: reported if they change a parameter by more than _HIDDEN standard errors and by more than the fraction _MOVED of its
+#: value.
 _HIDDEN, _MOVED = 2.0, 0.05
 #: A parameter ran into a limit of its law if two conditions hold. It ended above or below its typical size by more than
 #: the factor RUNAWAY, and its error is at least FREE times its value. The second condition is needed because typical
@@ -97,7 +98,7 @@ def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawF
     sizes = np.repeat([c.scale for c in curves], np.diff(at))
     measured = jnp.asarray(np.concatenate([c.stress for c in curves]) / sizes)
     rows = jnp.arange(F.shape[0])
-    inside = np.setdiff1d(np.arange(1, F.shape[0]), at)  # points whose neighbour before is on the same curve
+    inside = np.setdiff1d(np.arange(1, F.shape[0]), at)  # points whose previous point is on the same curve
     driven = np.concatenate([c.driven for c in curves])
     works = np.repeat([c.rises for c in curves], np.diff(at))[inside]
     rising = jnp.asarray(np.where(works, np.sign(driven[inside] - driven[inside - 1]), 0.0))
@@ -190,12 +191,13 @@ def _of_other_minima(
     return of_other_minima(candidate.names, candidate.law, values, every, np.concatenate([c.F for c in curves]))
 
 
-#: First words of the warning about factors of the tests.
+#: First words of the warning about factors that multiply the stress of each test.
 OWN_FACTORS = "the stress of each test seems to have an individual factor"
 
 
 def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: int) -> list[str]:
-    """Return warnings about noise that is correlated between the n points of the tests."""
+    """Return warnings about correlated noise of the n points, and about factors that multiply the stress of each
+    test."""
     told = []
     if alike is not None:
         told.append(
@@ -205,8 +207,8 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
         )
     if factors is not None and factors.shown:
         told.append(
-            f"{OWN_FACTORS}, which scatters by {100 * factors.deviation:.2g} %, for example due to another sample or a "
-            f"wrong size of the sample. The standard errors contain such factors of {tests} tests"
+            f"{OWN_FACTORS}, which scatters by {100 * factors.deviation:.2g} %, for example due to another sample or "
+            f"a wrong size of the sample. The standard errors contain such factors, estimated from {tests} tests"
         )
     return told
 
@@ -214,8 +216,8 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
 def _of_hidden_factors(
     factors: FactorNoise | None, names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
-    """Return a warning about factors of the tests that the residuals do not show, because the parameters compensate
-    them."""
+    """Return a warning about factors that multiply the stress of each test. The residuals do not show these factors,
+    because the parameters compensate them."""
     if factors is None or factors.shown:
         return []
     much = (factors.moves > _HIDDEN * errors) & (factors.moves > _MOVED * np.abs(values))
@@ -224,9 +226,9 @@ def _of_hidden_factors(
     worst = int(np.argmax(np.where(much, factors.moves / np.maximum(errors, 1e-300), 0.0)))
     return [
         "the stress of each test may be wrong by an individual factor, for example due to another sample or a wrong "
-        f"size of the sample. The residuals hardly show such factors, but factors of {100 * factors.hidden:.2g} % move "
-        f"{names[worst]} by about {factors.moves[worst]:.2g}, and {values[worst]:.4g} ± {errors[worst]:.2g} does not "
-        "contain this change. Measure all tests on one sample, or one test on several samples"
+        f"size of the sample. The residuals hardly show such factors, but factors of {100 * factors.hidden:.2g} % "
+        f"change {names[worst]} by about {factors.moves[worst]:.2g}, and {values[worst]:.4g} ± {errors[worst]:.2g} "
+        "does not contain this change. Measure all tests on one sample, or one test on several samples"
     ]
 
 
@@ -238,15 +240,15 @@ def _errors_of_law(
     of_tests: bool,
 ) -> tuple[np.ndarray, np.ndarray, Alike | None, FactorNoise | None]:
     """Return errors and correlation of the parameters, the noise that is correlated between neighbouring points, and
-    the factors of the tests. Each error is the largest one for several kinds of noise.
+    the factors that multiply the stress of each test. Each error is the largest one for several kinds of noise.
 
     Args:
         curves: the fitted curves.
         residuals: derivatives J (n, p), misfit (n,) and its standard deviation.
         slope: derivatives (P, p) of the parameters with respect to the unknowns.
         half: square root of the covariance, for equal and independent noise.
-        of_tests: see `assessed`. If False, neither factors of tests nor noise that grows with the stress are
-            considered.
+        of_tests: see `assessed`. If False, the fit considers neither factors that multiply a test nor noise that grows
+            with the stress.
     """
     J, misfit, noise = residuals
     errors, correlation = errors_and_correlation(half)
@@ -326,7 +328,7 @@ def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scal
     return ends
 
 
-#: A warning is given if the stress at rest exceeds this part of the root mean square of the curve.
+#: A warning is given if the stress at rest exceeds this fraction of the root mean square of the curve.
 _PRELOAD = 0.05
 
 
@@ -349,14 +351,14 @@ def loaded_at_rest(curves: list[Curve]) -> list[str]:
 
 
 def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
-    """Return a warning for each curve that no law follows."""
+    """Return a warning for each curve that no law fits."""
     told = []
     for curve in curves:
         best = min(fits, key=lambda f: f.curve_errors[curve.label])
         error = best.curve_errors[curve.label]
         if not error < HOPELESS:
             told.append(
-                f"{curve.label}: no law follows this curve. The nearest law ({best.label}) misses the curve by "
+                f"{curve.label}: no law fits this curve. The nearest law ({best.label}) misses the curve by "
                 f"{100 * error:.0f} % of the stress: check unit, signs and axes, or fit this curve alone"
             )
     return told
@@ -367,7 +369,7 @@ TIE = 4.0
 
 
 def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
-    """Return a warning if other laws follow the `data` ("sweep", "curves") as well as the best law. The best law comes
+    """Return a warning if other laws fit the `data` ("sweep", "curves") as well as the best law. The best law comes
     first in `fits`."""
     best = fits[0]
     others = [f for f in fits[1:] if f.aicc - best.aicc < TIE]
@@ -376,7 +378,7 @@ def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
     which = ", ".join(f.label for f in others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
     moduli = [f.shear_modulus for f in (best, *others)]
     return [
-        f"{which} follow the {data} as well as {best.label} does (AICc within {TIE:g}), with G0 from {min(moduli):.4g} "
+        f"{which} fit the {data} as well as {best.label} does (AICc within {TIE:g}), with G0 from {min(moduli):.4g} "
         f"to {max(moduli):.4g} Pa. The {data} cannot decide between these laws, which differ beyond the measured "
         "strains"
     ]

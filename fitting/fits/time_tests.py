@@ -25,7 +25,7 @@ from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: STILL: the load changes if two successive rows differ by more than this part of its maximum. MOST_LOADS: maximum
+#: STILL: the load changes if two successive rows differ by more than this fraction of its maximum. MOST_LOADS: maximum
 #: number of loads that are treated separately.
 STILL, MOST_LOADS = 0.01, 10
 #: Maximum number of measured values that are fitted. From a longer record, values at about equal steps of log time are
@@ -99,7 +99,7 @@ def thinned(test: TimeTest) -> np.ndarray:
     if len(rows) <= MOST:
         return rows
     begins = _begins_of_loads(test)
-    # A row at the starting time of a load belongs to the load before.
+    # A row at the starting time of a load belongs to the previous load.
     of_load = np.searchsorted(begins, test.time[rows]) - 1
     picked: list[np.ndarray] = []
     left = MOST
@@ -181,7 +181,7 @@ def _chosen_model(tried: list[TimeFit], test: TimeTest) -> TimeFit:
 
 
 def criterion(fit: TimeFit) -> float:
-    """Return the Bayesian information criterion, as in `viscoelastic.information_criterion`."""
+    """Return the Bayesian information criterion (see `viscoelastic.information_criterion`)."""
     m, free = len(fit.measured), len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
     return float(m * np.log(max(2 * float(fit.solution.cost) / m, 1e-300)) + free * np.log(m))
 
@@ -282,7 +282,7 @@ def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
 
 def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return matrix and right-hand side of a linear least-squares problem with relative residuals. The unknowns are the
-    equilibrium modulus and the strengths of modes with these times."""
+    equilibrium modulus and the strengths of modes with the relaxation `times` [s]."""
     modulus, at = apparent(test)
     A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
     return A / modulus[:, None], np.ones(len(at))
@@ -334,7 +334,8 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     return chosen._replace(warnings=tuple(out), details=details, **seconds)
 
 
-#: Key in `TimeFit.details`: modulus [Pa] of an elastic material that explains the test as well, with standard error.
+#: Key in `TimeFit.details`: modulus [Pa], with standard error, of an elastic material that explains the test equally
+#: well.
 ELASTIC = "elastic"
 
 
@@ -358,7 +359,8 @@ def _without_relaxation(test: TimeTest, chosen: TimeFit) -> dict[str, float] | N
 def _told_of_elastic(elastic: dict[str, float]) -> str:
     return (
         "the test shows no relaxation: an elastic material of {shear_modulus:.4g} ± {standard_error:.2g} Pa explains "
-        "it as well. This modulus is both G0 and the equilibrium modulus; ratios and relaxation times have no meaning"
+        "the test equally well. This modulus is both G0 and the equilibrium modulus; ratios and relaxation times have "
+        "no meaning"
     ).format(**elastic)
 
 

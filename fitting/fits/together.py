@@ -52,7 +52,7 @@ class Share(NamedTuple):
     name: str  # sweep, dispersion, relaxation or creep
     source: str
     points: int  # number of measured values
-    noise: float  # in the common fit, divided by the scales; given standard deviations are not reduced
+    noise: float  # noise in the common fit, divided by the scales; given standard deviations are not reduced
     alone: float  # the same noise from a fit to this test alone
     misfit: float  # relative misfit of the common fit
     misfit_alone: float  # relative misfit of the fit to this test alone
@@ -70,13 +70,13 @@ class Together(NamedTuple):
     uncertainty: Estimate
     converged: bool
     shares: list[Share]
-    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], velocities then attenuations, or the response
+    fitted: list[np.ndarray]  # predictions of each test: G' then G'' [Pa], velocities then attenuations, or response
     tried: list[Content]
     warnings: tuple[str, ...]
     run_time: float
     compile_time: float
     parameters: Estimate | None = None  # parameters of another model; None: the modes are the parameters
-    details: Content | None = None  # of the model
+    details: Content | None = None  # details of the model
 
     @property
     def modes(self) -> int:
@@ -345,7 +345,7 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     )
 
 
-#: The rise of a load matters if it takes longer than this part of a relaxation time.
+#: A rise of the load matters if it lasts longer than this fraction of a relaxation time.
 _SHORT = 0.2
 
 
@@ -359,8 +359,8 @@ def _of_rises(chosen: Together) -> list[str]:
             continue
         out.append(
             f"no row of {test.source} shows how the load changed between {test.time[row - 1]:.4g} and "
-            f"{test.time[row]:.4g} s, and a straight change is assumed. If the change was a step, G0 and the short "
-            "relaxation times are wrong: give more rows there"
+            f"{test.time[row]:.4g} s, so a linear change is assumed. If the change was a step, G0 and the short "
+            "relaxation times are wrong: add the rows measured during the change to the file"
         )
     return out
 
@@ -369,7 +369,8 @@ def disagreements(shares: list[Share]) -> list[str]:
     """Return a warning for each test whose misfit is much larger in the common fit than in a fit to this test alone."""
     return [
         f"the tests do not agree: the misfit of {s.source or s.name} is {100 * s.misfit:.2g} % in the common fit, but "
-        f"only {100 * s.misfit_alone:.2g} % in a fit to this test alone. Look for another temperature, strain or sample"
+        f"only {100 * s.misfit_alone:.2g} % in a fit to this test alone: check whether this test was made at another "
+        "temperature or strain, or on another sample"
         for s in shares
         if s.noise > APART * s.alone and s.misfit > 0.01
     ]
@@ -417,8 +418,8 @@ def _residuals_alone(fit: Together, k: int) -> np.ndarray:
     """Return the residuals of all tests, divided by their scales, from a fit to test k alone. The residuals of the
     other tests are 0.
 
-    This fit has as many modes as the common fit, or more if additional modes follow the test better. If tests
-    contradict each other, their common fit may have too few modes.
+    This fit has as many modes as the common fit, or more if additional modes fit the test better. If tests contradict
+    each other, their common fit may have too few modes.
     """
     parts = [reported_numbers(t) for t in fit.tests]
     # Infinite standard deviations exclude a test.

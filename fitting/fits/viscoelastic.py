@@ -78,7 +78,7 @@ def timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
     return result, middle - begin, time.perf_counter() - middle
 
 
-@lru_cache(maxsize=16)  # fits of several samples, or of parts of a band, use the same program
+@lru_cache(maxsize=16)  # fits of several samples, or of parts of a band, use the same compiled program
 def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
     arguments = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
     return jax.jit(function).lower(*arguments).compile()
@@ -225,7 +225,7 @@ FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
 
 
 def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> tuple[str, ...]:
-    """Return a warning with the worst point, if the model does not follow the data."""
+    """Return a warning with the worst point, if the model does not fit the data."""
     # If errors of the phase angle cause the scatter of the loss modulus, small loss moduli have large relative errors.
     # So their errors are divided by |G*|.
     size = np.hypot(sweep.storage, sweep.loss) if sweep.sd_estimated else sweep.loss
@@ -252,7 +252,7 @@ def number_of_parameters(fit: Fit) -> float:
 
 def mean_square(fit: Fit) -> float:
     """Return the mean square of the residuals of the data, with a lower bound at roundoff. Below this bound, exact fits
-    differ only by chance."""
+    differ only by roundoff."""
     m = 2 * len(fit.storage)
     return max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, ZERO)
 
@@ -306,7 +306,7 @@ def choose_modes(
         if failures == 2:
             break
     if chosen is None:
-        raise InputError(f"{sweep.source or 'sweep'}: no number of modes could be fitted ({broken[1]}): check the data")
+        raise InputError(f"{sweep.source or 'sweep'}: every fit failed (with 1 mode: {broken[1]}): check the data")
     table = [
         {
             "modes": f.modes,

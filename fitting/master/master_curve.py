@@ -1,4 +1,4 @@
-"""The master curve of sweeps at several temperatures: its points, and laws for the shift factors."""
+"""Compute the master curve of sweeps at several temperatures, and fit laws to its shift factors."""
 
 from typing import NamedTuple
 
@@ -14,16 +14,16 @@ from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: A warning is given if the distance of a sweep from the common curve exceeds both FAR_OFF and SCATTERS times the
-#: scatter of the points. Another is given if the error of a shift factor exceeds LOOSE [decades].
+#: The program warns if the distance of a sweep from the common curve exceeds both FAR_OFF and SCATTERS times the
+#: scatter of the points. It also warns if the standard error of a shift factor exceeds LOOSE [decades].
 FAR_OFF, SCATTERS, LOOSE = 0.05, 2.0, 0.3
 #: The spline alone may cause relative distances from the curve up to this value.
 SMOOTH = 1e-3
-#: Factors of the moduli (vertical shifts) are reported if chance improves the match as much with a probability below
-#: this.
+#: Factors that multiply the moduli (vertical shifts) are reported if the probability of the same improvement by chance
+#: is below this.
 CHANCE = 1e-3
-#: Factors of the moduli are reported only if they reduce the distance of the sweeps from one curve below this part of
-#: its value.
+#: These factors are reported only if they reduce the distance of the sweeps from one curve below this fraction of the
+#: distance without them.
 BETTER = 0.8
 
 
@@ -37,12 +37,13 @@ class MasterCurve(NamedTuple):
 
 
 def master_curve(data: AtTemperatures, reference: float | None, vertical: bool = False) -> MasterCurve:
-    """Shift all sweeps to one temperature.
+    """Shift all sweeps to one reference temperature, and return the master curve.
 
     Args:
-        data: two or more sweeps.
+        data: sweeps at two or more temperatures.
         reference: reference temperature [K]; None: the middle temperature. The nearest measured temperature is used.
-        vertical: also find factors of the moduli. This is not possible if the file gives the shift factors.
+        vertical: whether factors that multiply the moduli are found too. This is not possible if the file gives the
+            shift factors.
     """
     T = data.temperatures
     place = len(T) // 2 if reference is None else int(np.argmin(np.abs(T - reference)))
@@ -66,8 +67,8 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
     notes = [*whole.notes, *_sentences(found, _scatter_of_points(data.sweeps)), *untold]
     if vertical and found.given:
         notes.append(
-            "--vertical finds no factors of the moduli here, because the file gives the factors of the frequencies: "
-            "remove its column shift_factor to find both kinds of factors"
+            "--vertical finds no factors of the moduli, because the file gives the factors of the frequencies: remove "
+            "its column shift_factor to find both kinds of factors"
         )
     return MasterCurve(whole._replace(notes=tuple(notes)), parts, found, laws)
 
@@ -88,7 +89,7 @@ def _scatter_of_points(sweeps: list[Sweep]) -> float:
 
 
 def _sentences(found: Shifts, noise: float) -> list[str]:
-    """Return notes on the shifts, and warnings if superposition is not valid. `noise`: relative scatter of the
+    """Return notes about the shifts, and warnings if superposition is not valid. `noise`: relative scatter of the
     points."""
     T = celsius(found.temperatures)
     out = [
@@ -100,8 +101,8 @@ def _sentences(found: Shifts, noise: float) -> list[str]:
         listed = ", ".join(f"{T[k]:.4g} °C {100 * found.misfit[k]:.2g} %" for k in far[:4])
         more = f" and {len(far) - 4} more" if len(far) > 4 else ""
         out.append(
-            f"superposition is not valid at all temperatures (distance from the common curve: {listed}{more}): leave "
-            "these temperatures out, or try --vertical"
+            f"superposition is not valid at all temperatures (distance from the common curve: {listed}{more}): "
+            "remove these temperatures, or try --vertical"
         )
     loose = [k for k in range(len(T)) if found.log_a_errors[k] > LOOSE]
     if loose:
@@ -111,10 +112,10 @@ def _sentences(found: Shifts, noise: float) -> list[str]:
 
 
 def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
-    """Return a note if the sweeps match much better when their moduli have factors too (F-test)."""
+    """Return a note if the sweeps match much better when their moduli are also multiplied by factors (F-test)."""
     try:
         other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
-        # Both fits use the same distance of knots, which is small enough for each of them.
+        # Both fits use the same distance between knots. It is small enough for each of them.
         knots = min(found.knots, other.knots)
         alone, both = (
             shifts.found(sweeps, found.temperatures, found.reference, vertical, (knots,)) for vertical in (False, True)
@@ -143,7 +144,7 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
 
 
 def shift_numbers(found: MasterCurve) -> Content:
-    """Return the part `shift` of the details in fit.json."""
+    """Return the entry `shift` of fit.json, with the factors, their standard errors and the laws."""
     s = found.shifts
     return {
         "reference_temperature_C": float(celsius(s.temperatures[s.reference])),

@@ -13,7 +13,7 @@ HEAD = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa"
 
 
 def write_master_curve(out: Path, found: MasterCurve) -> None:
-    """Write both tables and the figure."""
+    """Write shift_factors.csv, master_curve.csv and shift.png to the folder `out`."""
     out.mkdir(parents=True, exist_ok=True)
     s = found.shifts
     rows = [celsius(s.temperatures), 10**s.log_a, s.log_a_errors, 10**s.log_b, s.log_b_errors, s.misfit]
@@ -26,7 +26,7 @@ def write_master_curve(out: Path, found: MasterCurve) -> None:
 
 
 def shift_table(found: MasterCurve) -> str:
-    """Return a table of the factors for each temperature, followed by lines with the laws."""
+    """Return a text table with the shift factors at each temperature, followed by one line for each law."""
     s, moved = found.shifts, bool(np.any(found.shifts.log_b))
     lines = [
         f"{'temperature':>12s} {'log10 a_T':>18s}{'log10 b_T':>18s}" if moved else f"{'temperature':>12s} log10 a_T"
@@ -43,8 +43,7 @@ def shift_table(found: MasterCurve) -> str:
 
 
 def shift_figure(found: MasterCurve) -> Any:
-    """Draw the master curve, coloured by temperature, on the left, and the shift factors with their laws on the
-    right."""
+    """Draw two plots. Left: the master curve, coloured by temperature. Right: the shift factors with their laws."""
     plt, s = pyplot(), found.shifts
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained", width_ratios=(6, 4))
     colours = plt.get_cmap("coolwarm")(np.linspace(0, 1, len(found.parts)))

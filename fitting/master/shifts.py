@@ -1,10 +1,10 @@
-"""Time-temperature superposition: shift factors that bring sweeps at several temperatures onto one smooth curve.
+"""Time-temperature superposition: find shift factors that move sweeps at several temperatures onto one smooth curve.
 
 The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
 a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency. The curve and all factors are fitted
 together by least squares. So no model of the material is needed, and every factor has a standard error. The distance
 between the knots of the spline is chosen from the data. A curve that follows the noise would be steeper than the true
-curve. The errors of the factors depend on the slope of the curve and would then be too small. Source: Ferry (1980),
+curve. Then the errors of the factors, which depend on the slope of the curve, would be too small. Source: Ferry (1980),
 Viscoelastic properties of polymers, chapter 11.
 """
 
@@ -19,19 +19,20 @@ from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
 #: KNOTS: distances between two knots [decades] that are tried. SMOOTH: weight of the penalty on third differences of
-#: the spline coefficients, which is needed for knots without data.
+#: the spline coefficients. The penalty is needed for knots without data.
 KNOTS, SMOOTH = (0.4, 0.6, 0.9, 1.35, 2.0, 3.0), 1e-3
 #: LONGEST: maximum step of a factor in one iteration [decades]. The iteration ends if all steps are below CONVERGED.
 LONGEST, CONVERGED = 0.3, 1e-6
-#: For the first estimate of a shift. OVERLAP: part of a sweep that must overlap its neighbour. REACH: shifts that are
-#: tried [decades].
+#: These are used for the first estimate of a shift. OVERLAP: fraction of a sweep that must overlap with the
+#: neighbouring sweep. REACH: shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
 #: Two sweeps match if their mean square distance, divided by the variance of their noise, is at most this value.
 WITHIN = 2.0
 
 
 class Shifts(NamedTuple):
-    """Factors of every sweep, in the order of the temperatures, and the misfit of the superposition."""
+    """Shift factors of each sweep, in the order of the temperatures, and distances of the sweeps from the common
+    curve."""
 
     temperatures: np.ndarray  # (K,) [K], ascending
     reference: int  # index of the sweep that is not shifted
@@ -40,8 +41,8 @@ class Shifts(NamedTuple):
     log_b: np.ndarray  # (K,) log10 of b_T; 0 without vertical shifts
     log_b_errors: np.ndarray
     misfit: np.ndarray  # (K,) relative root mean square distance of each sweep from the curve
-    covariance: np.ndarray  # (K, K) of `log_a`; neighbours are matched to each other, so their errors are correlated
-    knots: float  # decades between two knots of the curve
+    covariance: np.ndarray  # (K, K) of `log_a`; errors of neighbouring sweeps are correlated
+    knots: float  # distance between two knots of the curve [decades]
     given: bool = False
 
     @property
@@ -64,11 +65,11 @@ def found(
         sweeps: K sweeps.
         temperatures: (K,) [K], ascending.
         reference: index of the sweep that is not shifted.
-        vertical: whether factors b_T of the moduli are fitted too.
+        vertical: whether factors b_T that multiply the moduli are fitted too.
         tried: distances between two knots of the curve [decades] to try.
 
     Raises:
-        InputError: a sweep does not match its neighbour at any shift.
+        InputError: two neighbouring sweeps do not match at any shift, or do not overlap after the best shifts.
     """
     columns = _in_decades(sweeps)
     first = _first_shifts(columns, temperatures, reference), np.zeros(len(sweeps))
@@ -83,7 +84,7 @@ def found(
 
 
 def _in_decades(sweeps: Sequence[Sweep]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return log10 of the frequencies [rad/s], of G' and of G'' [Pa] for every sweep."""
+    """Return for each sweep the logarithms log10 of the angular frequencies [rad/s], of G' [Pa] and of G'' [Pa]."""
     return [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
 
 
@@ -94,7 +95,7 @@ def sum_of_squares(sweeps: Sequence[Sweep], shifts: Shifts) -> float:
 
 def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
     """Return the result with the lowest corrected information criterion. If the data determine none of the curves,
-    return the result with the coarsest curve. `factors`: number of fitted factors.
+    return the result with the largest distance between knots. `factors`: number of fitted factors.
     """
     data = 2 * sum(len(s.storage) for s in sweeps)
 
@@ -115,7 +116,7 @@ def _at_knots(
     free: np.ndarray,
     knots: float,
 ) -> Shifts:
-    """Fit the factors for a curve with a given distance between its knots.
+    """Fit the factors for a curve with a given distance between knots.
 
     Args:
         sweeps: K sweeps.
@@ -144,8 +145,8 @@ def _at_knots(
 
 
 def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, log_a: np.ndarray) -> Shifts:
-    """Return the result for given factors without errors. `log_a`: log10 of a_T (K,). The other arguments are the same
-    as for `found`."""
+    """Return `Shifts` for given factors, whose standard errors are 0. `log_a`: log10 of a_T (K,). The other arguments
+    are the same as for `found`."""
     none, exact = np.zeros(len(sweeps)), np.zeros((len(sweeps),) * 2)
     every = [
         Shifts(temperatures, reference, log_a, none, none, none, misfit, exact, knots, given=True)
@@ -156,8 +157,8 @@ def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: i
 
 
 def _gap(columns: list, log_a: np.ndarray) -> list[int] | None:
-    """Find a gap between the shifted sweeps, across which only the smoothness of the curve would determine their
-    distance. Returns the sweeps on both sides, or None if there is no gap."""
+    """Find a gap in frequency between the shifted sweeps, because the data do not determine a shift across a gap.
+    Return the indices of the sweeps on both sides of the gap, or None if there is no gap."""
     ends = [(c[0][0] + a, c[0][-1] + a) for c, a in zip(columns, log_a, strict=True)]
     order = sorted(range(len(ends)), key=lambda k: ends[k][0])
     last = order[0]
@@ -172,7 +173,7 @@ def _refuse_gap(columns: list, shifts: Shifts) -> None:
     T, other = sorted(celsius(shifts.temperatures[_gap(columns, shifts.log_a) or [0, 1]]))
     raise InputError(
         f"the sweeps at {T:.4g} and {other:.4g} °C do not overlap after the best shifts, so the data do not determine "
-        "the shift between them: measure between these temperatures or at more frequencies, or give the factors "
+        "the shift between them: measure at a temperature between them or at more frequencies, or give the factors "
         "in a column shift_factor"
     )
 
@@ -191,15 +192,15 @@ def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.n
 
 
 def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, knots: float) -> int:
-    """Return the number of spline coefficients of the curve of G' for shifted sweeps. The curve of G'' has the same
-    number."""
+    """Return the number of spline coefficients of the curve of G' for shifted sweeps. The curve of G'' has as many
+    coefficients."""
     x = np.concatenate([np.log10(s.angular_frequency) + a for s, a in zip(sweeps, log_a, strict=True)])
     return _basis(x, knots)[0].shape[1]
 
 
 def _basis(x: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return values and derivatives (n, C) of the C cubic B-splines at x (n,). Neighbouring knots are at most `apart`
-    from each other."""
+    """Return the values (n, C) and derivatives (n, C) of C cubic B-splines at x (n,). The distance between neighbouring
+    knots is at most `apart`."""
     low, high = x.min() - 1e-6, x.max() + 1e-6
     count = max(2, int(np.ceil((high - low) / apart)) + 1)
     inner = np.linspace(low, high, count)
@@ -220,8 +221,8 @@ def _smoothness(size: int) -> np.ndarray:
 
 
 def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrix and right-hand side of a Gauss-Newton step for log a (K), log b (K) and the coefficients of both
-    curves."""
+    """Return matrix and right-hand side of a Gauss-Newton step for the unknowns log a (K), log b (K) and coefficients
+    of both curves."""
     K, counts = len(columns), [len(c[0]) for c in columns]
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     own = np.repeat(np.eye(K), counts, axis=0)
@@ -236,19 +237,19 @@ def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: 
         right.append(y - B @ c)
     smooth = np.kron(np.eye(2), _smoothness(size))
     A = np.vstack([*rows, np.hstack([np.zeros((len(smooth), 2 * K)), smooth])])
-    return A, np.concatenate([*right, np.zeros(len(smooth))])  # the coefficients are already at their minimum
+    return A, np.concatenate([*right, np.zeros(len(smooth))])  # for the coefficients the cost is already at its minimum
 
 
 def _covariance(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
-    """Return the covariance of all unknowns. The first `data` rows of A and b belong to the data; the other rows keep
-    the curve smooth."""
+    """Return the covariance of all unknowns. The first `data` rows of A and b belong to the data; the other rows are
+    the penalty that keeps the curve smooth."""
     inverse = np.linalg.pinv(A)[:, :data]
     return inverse @ inverse.T * np.sum(b[:data] ** 2) / max(1, data - A.shape[1])
 
 
 def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:
-    """Return starting values of the shifts (K,) [decades]: each sweep is matched to its neighbour, beginning at the
-    reference."""
+    """Return starting values of the shifts (K,) [decades]. Each sweep is matched to the neighbouring sweep, beginning
+    at the reference."""
     log_a = np.zeros(len(columns))
     for way in (range(reference + 1, len(columns)), range(reference - 1, -1, -1)):
         before = reference
@@ -257,7 +258,7 @@ def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np
             if s is None:
                 raise InputError(
                     f"the sweeps at {celsius(temperatures[before]):.4g} and {celsius(temperatures[k]):.4g} °C do not "
-                    "match at any shift of frequency: leave out the temperatures on one side of this gap, or give "
+                    "match at any shift of frequency: remove the temperatures on one side of this gap, or give "
                     "the factors in a column shift_factor"
                 )
             log_a[k], before = log_a[before] + s, k
@@ -265,10 +266,11 @@ def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np
 
 
 def _over(fixed: tuple, moving: tuple) -> float | None:
-    """Return the shift [decades] at which one sweep is nearest to its neighbour. Returns None if no shift matches.
+    """Return the shift [decades] of the sweep `moving` at which it is nearest to the neighbouring sweep `fixed`. Return
+    None if the sweeps match at no shift.
 
-    Among all shifts that match within the noise, the shift with the longest overlap is used: at a wrong shift, a few
-    points may match by chance.
+    If the sweeps match within the noise at several shifts, the shift with the longest overlap is used, because a few
+    points may match by chance at a wrong shift.
     """
     best, where = (np.inf, 0), None
     noise = WITHIN * sum(_variance(c) for c in (fixed, moving))
@@ -281,10 +283,10 @@ def _over(fixed: tuple, moving: tuple) -> float | None:
         score = max(float(np.mean(np.square(apart))), noise), -int(inside.sum())
         if score < best:
             best, where = score, float(s)
-    return where if best[0] < 0.25 else None  # sweeps half a decade apart do not match
+    return where if best[0] < 0.25 else None  # sweeps with a distance of half a decade do not match
 
 
 def _variance(columns: tuple) -> float:
-    """Return the mean variance of the noise of log10 G' and log10 G''. It is 0 if there are too few points."""
+    """Return the mean noise variance of log10 G' and log10 G''. It is 0 if there are too few points."""
     each = [scatter(*merged(10.0 ** columns[0], 10.0 ** columns[j])) / np.log(10) for j in (1, 2)]
     return float(np.mean(np.square(each))) if np.all(np.isfinite(each)) else 0.0

@@ -1,6 +1,7 @@
 """Laws for the dependence of the shift factors a_T on temperature: WLF and Arrhenius, with standard errors.
 
-WLF: log10 a_T = -C1 (T - T0) / (C2 + T - T0). Arrhenius: ln a_T = E / R (1 / T - 1 / T0). Temperatures are in kelvin.
+WLF: log10 a_T = -C1 (T - T0) / (C2 + T - T0), with constants C1 and C2. Arrhenius: ln a_T = E / R (1 / T - 1 / T0),
+with the activation energy E and the gas constant R. T0 is the reference temperature. All temperatures are in kelvin.
 Source: Williams, Landel and Ferry (1955), J. Am. Chem. Soc. 77.
 """
 
@@ -12,22 +13,22 @@ import scipy.optimize
 
 from fitting.master.shifts import Shifts
 
-#: GAS: molar gas constant [J / (mol K)]. LEAST: lower bound of the error of a shift factor [decades].
+#: GAS: molar gas constant [J / (mol K)]. LEAST: lower bound for the standard error of a shift factor [decades].
 GAS, LEAST = 8.314462618, 0.01
 
 
 class TemperatureLaw(NamedTuple):
-    """A fitted law, and the distance of the shift factors from this law."""
+    """A fitted law with its parameters, and the distance of the shift factors from the law."""
 
     name: str
-    numbers: dict[str, tuple[float, float]]  # name with unit -> value and standard error
+    numbers: dict[str, tuple[float, float]]  # name with unit of each parameter -> value and standard error
     apart: float  # root mean square distance [decades]
-    at: Callable[[np.ndarray], np.ndarray]  # temperatures [K] -> log10 a_T
+    at: Callable[[np.ndarray], np.ndarray]  # function: temperatures [K] -> log10 a_T
 
 
 def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
-    """Fit the laws for which there are enough temperatures, and return them with the best fit first. Fewer than three
-    temperatures determine no law."""
+    """Fit the laws for which there are enough temperatures, and return the laws, best fit first. With fewer than three
+    temperatures no law can be fitted."""
     T = shifts.temperatures
     T0 = T[shifts.reference]
     if len(T) < 3:
@@ -40,8 +41,8 @@ def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
 
 
 def _whitening(shifts: Shifts) -> np.ndarray:
-    """Return the whitening matrix W, with W^T W = C^-1. C is the covariance of all factors except the reference, to
-    which a variance from `LEAST` is added."""
+    """Return the whitening matrix W, with W^T W = C^-1. C is the covariance of all log shift factors except the
+    reference, plus the variance from `LEAST`."""
     free = np.arange(len(shifts.log_a)) != shifts.reference
     least = LEAST if shifts.given else 0.1 * LEAST
     C = shifts.covariance[np.ix_(free, free)] + least**2 * np.eye(free.sum())
@@ -49,8 +50,8 @@ def _whitening(shifts: Shifts) -> np.ndarray:
 
 
 def _noise(off: np.ndarray, numbers: int, given: bool) -> float:
-    """Return the factor by which the covariance is multiplied, from the whitened residuals `off`. It is at least 1 if
-    the shift factors were fitted and not given."""
+    """Return the factor by which the covariance is multiplied, computed from the whitened residuals `off`. The factor
+    is at least 1, unless the shift factors were given."""
     found = float(off @ off) / max(1, len(off) - numbers)
     return found if given else max(1.0, found)
 
@@ -69,8 +70,8 @@ def _arrhenius(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw:
 
 
 def _wlf(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw | None:
-    """Fit the WLF law. Returns None if the factors curve in the opposite direction, because the law then has no finite
-    parameters."""
+    """Fit the WLF law. Return None if the curvature of the factors has the opposite sign, because then the law has no
+    finite parameters."""
     W = _whitening(shifts)
 
     # C2 must stay above T0 minus the lowest temperature, because the law has a pole at T0 - C2.

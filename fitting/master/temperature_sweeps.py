@@ -1,4 +1,4 @@
-"""Sweeps of one material at several temperatures, from one file or several."""
+"""Read sweeps of one material at several temperatures from one or several files."""
 
 import re
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ from fitting.readers.rheometer import REPEATED, SORTED, read_all_sweeps
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
-#: Temperatures closer than this [K] count as one temperature, because an instrument keeps its temperature within some
-#: tenths.
+#: Temperatures that differ by less than this [K] are regarded as one temperature, because the temperature of an
+#: instrument varies by some tenths of a kelvin.
 SAME = 1.0
 
 
@@ -22,13 +22,13 @@ class AtTemperatures(NamedTuple):
 
     sweeps: list[Sweep]
     temperatures: np.ndarray  # (K,) [K], ascending
-    shift_factors: np.ndarray | None  # (K,) a_T; None: the files do not give them
+    shift_factors: np.ndarray | None  # (K,) a_T; None: the files give no shift factors
 
 
 def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
-    """Read every sweep of the files. Sweeps at one temperature are joined.
+    """Read all sweeps of the files, and join the sweeps at the same temperature.
 
-    The temperature is in a column (`temperature_C`, or `Temperature` with its unit), or in the name of the table. A
+    The temperature must be in a column (`temperature_C`, or `Temperature` with its unit) or in the name of the table. A
     column `shift_factor` may contain factors that are already known.
 
     Raises:
@@ -47,7 +47,7 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
             groups.append([part])
     if len(groups) < 2:
         raise InputError(
-            f"{paths[0]}: --master needs sweeps at two or more temperatures, these are all at "
+            f"{paths[0]}: --master needs sweeps at two or more temperatures, but all sweeps are at "
             f"{celsius(parts[0][0]):.4g} °C: give a file with several tables, or several files"
         )
     factors = np.array([float(np.exp(np.mean([np.log(p[1]) for p in g]))) for g in groups])
@@ -71,12 +71,13 @@ def joined(sweeps: Sequence[Sweep]) -> Sweep:
 
 
 def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, float, Sweep]]:
-    """Return temperature [K], shift factor (NaN: unknown) and points for each temperature in a table."""
+    """Return (temperature [K], shift factor, points of the sweep) for each temperature in a table. The shift factor is
+    NaN if it is unknown."""
     raw = sweep.raw or {}
     if "temperature" in raw:
         T = raw["temperature"]
     else:
-        # A hyphen after a letter or a digit separates words ("Sweep-25C"): it is not a minus sign.
+        # A hyphen after a letter or a digit separates words ("Sweep-25C"). There it is not a minus sign.
         stated = re.search(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
         if stated is None:
             raise InputError(

@@ -120,7 +120,7 @@ def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> 
     return np.max(errors, axis=0), float(correlations[largest][0, 1]), alike
 
 
-#: _FREE: part of the approach in which contact has not begun, even if the base line has a tilt. _FEWEST: minimum number
+#: _FREE: fraction of the approach that lies before contact, even if the base line has a tilt. _FEWEST: minimum number
 #: of points there.
 _FREE, _FEWEST = 0.7, 8
 #: A tilt is used only if |tilt| / standard error exceeds _SEEN in a fit of the approach alone and _CLEAR in the fit of

@@ -22,9 +22,9 @@ class Estimate(NamedTuple):
     root: np.ndarray  # (P, k) square root of the covariance; huge in directions that the data do not determine
     standard_errors: np.ndarray
     correlation: np.ndarray
-    chi2: float  # sum of the squares of residual / given scale
+    chi2: float  # sum of squares of the residuals, each divided by its given scale
     components: int  # number of measured values
-    noise: float  # standard deviation of the data / given scales: 1, or estimated from the residuals
+    noise: float  # standard deviation of the data, divided by the given scales: 1, or estimated from the residuals
     freedom: float  # components minus the (effective) number of unknowns
     iterations: int
     converged: bool
@@ -33,7 +33,7 @@ class Estimate(NamedTuple):
     mesh_bias: np.ndarray | None = None  # (P,) error of the values due to the mesh; None: unknown
     time_step_bias: np.ndarray | None = None  # (P,) error of the values due to the time steps
     shared: np.ndarray | None = None  # (P, s) columns of `root`: errors common to all points (gap, instrument)
-    mesh_over_noise: float | None = None  # root mean square of the mesh error in the data / noise
+    mesh_over_noise: float | None = None  # root mean square of the mesh error, divided by the noise
 
     @property
     def covariance(self) -> np.ndarray:
@@ -203,11 +203,14 @@ def bias_sentences(estimate: Estimate) -> list[str]:
     if len(lost):
         names = ", ".join(estimate.names[k] for k in lost)
         return [
-            f"the mesh moves {names} by a third or more, so the data do not determine these parameters with this mesh: "
-            "refine the mesh"
+            f"the error of the mesh changes {names} by a third or more, so the data do not determine these parameters "
+            "with this mesh: refine the mesh"
         ]
     more = np.flatnonzero(np.abs(bias) > estimate.standard_errors)
     if not len(more):
         return []
     each = ", ".join(f"{estimate.names[k]} by {bias[k]:.2g}" for k in more)
-    return [f"the mesh moves {each}, which is more than the standard error: subtract mesh_bias, or refine the mesh"]
+    return [
+        f"the error of the mesh changes fitted values by more than their standard errors ({each}): subtract mesh_bias, "
+        "or refine the mesh"
+    ]

@@ -53,9 +53,10 @@ def weighed(model: Maxwell, relaxing: float, equilibrium: float) -> Maxwell:
 def natural(u: Array) -> Maxwell:
     """Return the model from unconstrained parameters u (2N + 1,).
 
-    In this order, u contains log G0, the logs of ratio / equilibrium part (N,) and the log of the longest time. The
-    last entries are the logs of the differences between neighbouring log times (N - 1,). The softmax makes every ratio
-    positive and the sum of the ratios smaller than 1. The positive differences make the times descend.
+    u contains, in this order: log G0; the logs of the ratios, each divided by the equilibrium part 1 - sum g (N,); the
+    log of the longest time. The last entries are the logs of the differences between neighbouring log times (N - 1,).
+    The softmax makes every ratio positive and the sum of the ratios smaller than 1. The positive differences make the
+    times descend.
     """
     n = (u.shape[-1] - 1) // 2
     return Maxwell(
@@ -103,8 +104,8 @@ def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array
 
 
 def natural_fluid(u: Array) -> Maxwell:
-    """Return the model without an equilibrium modulus from u (2N,). It is computed as in `natural`, but the last mode
-    replaces the equilibrium part."""
+    """Return the model without an equilibrium modulus from u (2N,). The computation is the same as in `natural`, but
+    the last mode replaces the equilibrium part."""
     n = u.shape[-1] // 2
     return Maxwell(arrays_of(u).exp(u[..., 0]), _softmax_shares(u[..., 1:n]), _times_of_gaps(u[..., n:]))
 
@@ -116,14 +117,15 @@ def fluid_residuals(u: Array, omega: Array, storage: Array, loss: Array, scales:
 
 
 def fluid_of(u: np.ndarray) -> np.ndarray:
-    """Convert u of `natural` (2N + 1,) to u of `natural_fluid` (2N,): the equilibrium part is left out."""
+    """Convert u of `natural` (2N + 1,) to u of `natural_fluid` (2N,). The equilibrium part is removed."""
     n = (len(u) - 1) // 2
     ratios = natural(u).ratios
     return np.concatenate([u[:1], np.log(ratios[:-1] / ratios[-1]), u[n + 1 :]])
 
 
 def largest_number_of_modes(sweep: Sweep) -> int:
-    """The largest N for which the 2N + 1 parameters are fewer than the 2n moduli at n different frequencies."""
+    """Return the largest number N of modes whose 2N + 1 parameters are fewer than the 2n moduli at n different
+    frequencies."""
     return len(np.unique(sweep.angular_frequency)) - 1
 
 

@@ -5,11 +5,11 @@ omega tau, the moduli of each term fulfil
 
     0 <= dG'/d ln(omega) <= G''      and      |dG''/d ln(omega)| <= G''
 
-because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). If data violate these bounds by more than their scatter, not only the
-material determines them. At high frequencies, the inertia of the instrument violates the bounds: it adds a term to G'
-that grows as omega^2. This is called the mark of the instrument. At low frequencies, the transient at the start of the
-test may violate the bounds. The distance between the data and the best spectrum of any shape tests the whole band. This
-distance tests the Kramers-Kronig relation together with non-negative dissipation.
+because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). If the data violate these bounds by more than their scatter, the material
+alone does not determine the data. At high frequencies, the inertia of the instrument violates the bounds: it adds a
+term to G' that grows as omega^2. This is called the mark of the instrument. At low frequencies, the transient at the
+start of the test may violate the bounds. The distance between the data and the best spectrum of any shape tests the
+whole band. This distance tests the Kramers-Kronig relation together with non-negative dissipation.
 """
 
 import math
@@ -27,7 +27,8 @@ SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
 #: A warning is given if the relative distance of the best spectrum from the data exceeds FAR and FAR_RATIO times the
 #: scatter.
 FAR, FAR_RATIO = 0.01, 5.0
-#: If the signs of the residuals are less probable than this by chance, the misfit is called structured.
+#: If random noise gives such signs of the residuals with a probability below this value, the misfit is called
+#: structured.
 CHANCE = 0.005
 
 
@@ -78,9 +79,9 @@ def without_instrument(sweep: Sweep) -> Sweep:
         return sweep
     low, high = (omega / (2 * np.pi) for omega in (here.angular_frequency[-1], sweep.angular_frequency[-1]))
     note = (
-        f"{lost.sum()} of {len(lost)} points above {low:.4g} Hz {'is' if lost.sum() == 1 else 'are'} left out: {told}, "
-        "which is the mark of the instrument. Its inertia adds a term that grows as frequency^2; no material that "
-        f"relaxes shows this. --max-frequency {_rounded_up(high):.4g} keeps all points"
+        f"{lost.sum()} of {len(lost)} points above {low:.4g} Hz {'is' if lost.sum() == 1 else 'are'} ignored. Reason: "
+        f"{told}, which is the mark of the instrument. Its inertia adds a term that grows as frequency^2; no material "
+        f"that relaxes shows this. --max-frequency {_rounded_up(high):.4g} keeps all points"
     )
     grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
     grey = grey if sweep.grey is None else np.concatenate([sweep.grey, grey])
@@ -101,15 +102,18 @@ def onset_of(sweep: Sweep) -> tuple[float, str] | None:
 
 
 def _noise_of_loss(sweep: Sweep, same: float) -> np.ndarray:
-    """Return the relative noise of G'' at every frequency. It is `same`, or larger if the phase scatters and G'' is
-    small."""
+    """Return the relative noise of G'' at every frequency.
+
+    `same` is the relative noise of G'' if it is the same at all frequencies. If the sweep has standard deviations that
+    were estimated from its scatter (`sd_estimated`), the larger of `same` and `loss_sd` / G'' is returned.
+    """
     if sweep.sd_estimated and sweep.loss_sd is not None:
         return np.maximum(same, sweep.loss_sd / sweep.loss)
     return np.full(len(np.unique(sweep.angular_frequency)), same)
 
 
 def _breach(omega, storage, loss, noise) -> str:
-    """Return a text with the bound that two neighbouring points violate, or an empty text."""
+    """Return a string with the bound that two neighbouring points violate, or an empty string."""
     step = math.log(omega[1] / omega[0])
     # Upper bound of the rise of G': between the points, G'' is largest if it changes as fast as its own bound allows.
     most = step * min(max(loss) * math.exp(step / 2), math.inf)
@@ -130,9 +134,9 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
     if found.onset is not None:
         hertz, bound = found.onset / (2 * np.pi), next(why for low, _, why in found.breaches if low == found.onset)
         out.append(
-            f"above {hertz:.3g} Hz the storage modulus changes as in no material that relaxes "
-            f"({bound}): the mark of the instrument. Its inertia adds a term that grows as frequency^2. "
-            f"No model describes these points: leave them out with --max-frequency {_rounded_up(hertz):.4g}"
+            f"above {hertz:.3g} Hz the storage modulus changes as in no material that relaxes ({bound}): the mark of "
+            "the instrument. Its inertia adds a term that grows as frequency^2. No model describes these points: "
+            f"exclude them with --max-frequency {_rounded_up(hertz):.4g}"
         )
     inner = [b for b in found.breaches if found.onset is None or b[0] < found.onset]
     if inner:
@@ -159,7 +163,7 @@ def _rounded_up(hertz: float) -> float:
     return math.ceil(hertz / unit) * unit
 
 
-#: _ONE_SIDED: if so many equal signs are less probable than this by chance, nearly all residuals have one sign.
+#: _ONE_SIDED: if random signs agree so often with a probability below this value, nearly all residuals have one sign.
 #: _OUTLIERS: residuals of the rarer sign are outliers if their mean size exceeds this many times the mean size of the
 #: others.
 _ONE_SIDED, _OUTLIERS = 1e-4, 3.0
@@ -168,7 +172,8 @@ _ONE_SIDED, _OUTLIERS = 1e-4, 3.0
 def runs_probability(residuals: np.ndarray) -> tuple[int, float]:
     """Return the number of runs (groups of consecutive residuals with equal sign) and the probability of at most this
     number in random order (Wald and Wolfowitz 1940). If nearly all residuals (n,) have one sign, their order gives no
-    information. Then the second result is the probability of so many equal signs, unless a few outliers cause them.
+    information. Then the second result is the probability that at least so many of n random signs are equal (two-sided
+    sign test). If the residuals of the rarer sign are outliers, the result of the runs test is kept.
     """
     residuals = np.asarray(residuals)[np.asarray(residuals) != 0]
     up = residuals > 0
@@ -188,14 +193,14 @@ def runs_probability(residuals: np.ndarray) -> tuple[int, float]:
 
 
 def _log_splits(n: int, parts: np.ndarray | int) -> np.ndarray:
-    """Return the logarithm of the number of ways to divide n ordered points into `parts` runs, C(n - 1, parts - 1). It
-    is -inf if there is no way."""
+    """Return the logarithm of the number of ways to divide n ordered points into `parts` runs, C(n - 1, parts - 1). The
+    result is -inf if there is no way."""
     top, low = n - 1, np.asarray(parts) - 1
     log = scipy.special.gammaln
     return np.where(low <= top, log(n) - log(low + 1) - log(np.maximum(top - low, 0) + 1), -np.inf)
 
 
-#: Part of the warning about a structured misfit. Other modules replace this text if the errors contain the misfit.
+#: Words of the warning about a structured misfit. Other modules replace these words if the errors contain the misfit.
 NOT_CONTAINED = "the standard errors do not contain it"
 
 

@@ -1,5 +1,5 @@
 """Nonlinear least squares: Levenberg-Marquardt, compiled or in NumPy, and BFGS of jax.scipy. The same code works with
-JAX and NumPy arrays. Leading axes of the arrays may hold many fits, which then run at once.
+JAX and NumPy arrays. Leading axes of the arrays may contain many fits, which then run at the same time.
 """
 
 from collections.abc import Callable
@@ -184,11 +184,11 @@ def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iteratio
 
 
 def _best_minimum(evaluate: Evaluate, starts: np.ndarray, data: tuple, max_iterations: int) -> Solution:
-    """Return the point with the lowest cost that is reached from the starting points (S, P). All are iterated at
-    once."""
+    """Return the point with the lowest cost that is reached from the starting points (S, P). All searches run at the
+    same time."""
     going: np.ndarray = np.arange(len(starts))
     s: Any = None
-    with np.errstate(all="ignore"):  # a trial that overflows is a bad one
+    with np.errstate(all="ignore"):  # a trial point that overflows is rejected
         while s is None or len(going):
             r, J = evaluate(starts if s is None else s.trial[going], *data)
             if s is None:  # copies, because `begin` uses one array for several fields
@@ -217,7 +217,7 @@ def levenberg_marquardt_host(
     """
     trial: jax.Array = start
     s: Any = None
-    with np.errstate(all="ignore"):  # a trial that overflows is a bad one
+    with np.errstate(all="ignore"):  # a trial point that overflows is rejected
         while s is None or not (bool(s.converged) or bool(s.stuck) or int(s.iterations) >= max_iterations):
             r, J = (np.asarray(value) for value in evaluate(trial))
             s = begin(np.asarray(start), len(r), damping=1e-8) if s is None else s
@@ -231,8 +231,8 @@ def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol
     """Minimise |residuals(u, *data)|^2 / 2 by BFGS of `jax.scipy.optimize`. `gtol` is the tolerance for the gradient of
     the cost.
 
-    The line search of BFGS often ends at roundoff before gtol is reached. So convergence is judged as in
-    Levenberg-Marquardt, by the decrease of the cost that a least-squares step would still give.
+    The line search of BFGS often ends at roundoff before gtol is reached. So convergence is judged in the same way as
+    for Levenberg-Marquardt: by the decrease of the cost that a least-squares step would still give.
     """
 
     def cost(u):

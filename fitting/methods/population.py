@@ -28,8 +28,8 @@ EVEN = 0.8
 #: If the mean variance of the errors, divided by the variance between samples, exceeds this value, the estimated
 #: variance between samples is not reliable.
 UNSURE = 0.25
-#: If a sample does not determine its value, and the value is below this part of the mean, the sample is not part of the
-#: population.
+#: If a sample does not determine its value, and the value is below this fraction of the mean, the sample is not part of
+#: the population.
 BELOW = 1e-3
 
 

@@ -53,11 +53,11 @@ def to_whitened(p: Prior, g: np.ndarray) -> np.ndarray:
 
 def variances(p: Prior, modes: np.ndarray, kept: np.ndarray, chunk: int = 512) -> tuple[np.ndarray, np.ndarray]:
     """Return the variances (V,) of the field without and with the data. Along the directions `modes`, the data reduce
-    the variance to the part `kept`.
+    the variance to the fraction `kept`.
 
     Args:
         modes: orthonormal directions of z (V, k).
-        kept: part of the variance that is left in each direction.
+        kept: fraction (k,) of the variance that remains in each direction.
     """
     n = len(p.root_mass)
     before = np.zeros(n)

@@ -36,7 +36,7 @@ class Fractional(NamedTuple):
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Callable[[Array, float], Array]  # (all six entries of u, reference [rad/s]) -> (P,)
-    formula: Callable[..., np.ndarray]  # (i omega, values) -> G* [Pa], as in the literature
+    formula: Callable[..., np.ndarray]  # (i omega, values) -> G* [Pa], written as in the literature
 
     @property
     def solid(self) -> bool:
@@ -90,7 +90,7 @@ def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwe
     """Return many Prony modes that represent the relaxation spectrum of the model, for responses in the time domain.
 
     The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converges
-    exponentially. An equilibrium modulus and one fast mode replace the slower and the faster times. They are chosen so
+    exponentially. An equilibrium modulus and one fast mode replace the slower and the faster times. Both are chosen so
     that G* is exact at one small and one large real s.
 
     Args:
@@ -101,7 +101,7 @@ def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwe
     xp = arrays_of(u, times)
     step = xp.log(times[0] / times[1])
     H = step * moduli(u, switches, 1 / (times * reference), np.pi)[1] / np.pi
-    ends = xp.stack([1e3 / times[0], 1e-2 / times[-1]])  # slower times act as a spring there, faster as a dashpot
+    ends = xp.stack([1e3 / times[0], 1e-2 / times[-1]])  # there, slower times act as springs, faster as dashpots
     fast = times[-1] / 3
 
     x = xp.outer(ends, times)
@@ -178,7 +178,7 @@ FRACTIONAL = (
         _zener,
         lambda s, e, m, tau, a: e + m * (s * tau) ** a / (1 + (s * tau) ** a),
     ),
-    # Two springpots in series, a fluid. The springpot with the larger exponent deforms most at low frequencies.
+    # Two springpots in series form a fluid. The springpot with the larger exponent deforms most at low frequencies.
     _case(
         "fractional_maxwell",
         (2, 3, 4, 5),
@@ -186,7 +186,7 @@ FRACTIONAL = (
         _maxwell,
         lambda s, v, a, w, b: 1 / (1 / (v * s**a) + 1 / (w * s**b)),
     ),
-    # Two springpots in parallel, a fluid. The springpot with the larger exponent dominates at high frequencies.
+    # Two springpots in parallel form a fluid. The springpot with the larger exponent dominates at high frequencies.
     _case(
         "fractional_parallel",
         (0, 1, 2, 3),

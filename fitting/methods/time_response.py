@@ -10,9 +10,9 @@ give the retardation modes, with rates r_k >= 0 and weights (q_k . b)^2 (Gross 1
 theories of viscoelasticity). For a fluid, one rate is 0, because a fluid flows without limit.
 
 Fits compute the same responses in NumPy, with analytical derivatives (`residuals_with_jacobian`), so that nothing is
-compiled. The recursion (the update of the viscous memory from step to step) is differentiated in every step. The
-derivatives of the retardation modes are the first-order changes of eigenvalues and eigenvectors of S. If all relaxation
-times are different, all eigenvalues of S are different.
+compiled. The recursion (the update of the history variables of viscosity from step to step) is differentiated in every
+step. The derivatives of the retardation modes are the first-order changes of eigenvalues and eigenvectors of S. If all
+relaxation times are different, all eigenvalues of S are different.
 """
 
 from collections.abc import Callable
@@ -157,8 +157,8 @@ def _driven_strain(at: Slopes, time: np.ndarray, stress: np.ndarray, rows: np.nd
 def _memory_of_modes(
     rates: np.ndarray, dt: np.ndarray, start: float, step: np.ndarray, ramp: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the memory h (n, …, N) of each mode and its derivative dh/drate. The recursion is h_(j+1) = e^-x h_j +
-    phi_1(x) step_j + phi_2(x) ramp_j, with x = rate dt_j."""
+    """Return the history variable h (n, …, N) of each mode and its derivative dh/drate. The recursion is h_(j+1) = e^-x
+    h_j + phi_1(x) step_j + phi_2(x) ramp_j, with x = rate dt_j."""
     intervals = (-1, *(1,) * rates.ndim)
     dt, step, ramp = (a.reshape(intervals) for a in (dt, step, ramp))
     x = dt * rates

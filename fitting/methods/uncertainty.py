@@ -149,15 +149,16 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
 
 
 def _farther(end: float | None, center: float, half: float) -> float | None:
-    """Return the end of an interval, moved outwards for one more independent error with the half width `half`."""
+    """Return the end of an interval around `center`, moved outwards because of one more independent error. `half`: half
+    width of the interval of this error alone."""
     if end is None or half == 0:
         return end
     return float(center + np.copysign(np.hypot(end - center, half), end - center))
 
 
 def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
-    """Return the first position along x at which `rise` passes 0, by linear interpolation. Returns None if there is
-    none."""
+    """Return the first position along x at which `rise` passes 0, by linear interpolation. Returns None if `rise` does
+    not pass 0."""
     above = np.flatnonzero(rise > 0)
     if not len(above) or above[0] == 0:
         return None
@@ -266,7 +267,8 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
         out.append(
             f"the points scatter by {100 * sweep.point_scatter:.2g} %, but the deviations in the file are "
             f"{100 * sweep.relative_deviation:.2g} %. If these are the spread between samples, the errors of ratios "
-            "and times are too large, and the fit of this curve says little. Then give one file per sample, to fit each"
+            "and times are too large, and the fit of this curve is not reliable. Then give one file per sample, to "
+            "fit each"
         )
     elif sweep.noise_given and u.noise > 1.5:
         out.append(

@@ -1,1 +1,1 @@
-"""Readers of measured files: sweeps, stress-stretch curves, displacements, and others."""
+"""Read files of measurements: sweeps, stress-stretch curves, displacements, and others."""

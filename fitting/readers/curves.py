@@ -26,19 +26,19 @@ class Curve(NamedTuple):
     component: tuple[int, int]  # which component of the nominal stress was measured
     stress: np.ndarray  # (n,) [Pa]
     returns: int = 0  # how often the rows reverse and repeat a range of deformations
-    sample: str = ""  # the same text for all components of one test; if empty, `label` is used
+    sample: str = ""  # the same string for all components of one test; if empty, `label` is used
 
     @property
     def driven(self) -> np.ndarray:
-        """The component (n,) of F on which the measured stress does work. If it is constant, the shear or the stretch
-        that varies."""
+        """Component (n,) of F on which the measured stress does work. If this component is constant, the shear F12 if
+        it varies, otherwise the stretch F11."""
         own, shear = self.F[:, *self.component], self.F[:, 0, 1]
         return own if np.ptp(own) > 0 else shear if np.ptp(shear) > 0 else self.F[:, 0, 0]
 
     @property
     def rises(self) -> bool:
-        """Whether the stress of a stable material must rise with `driven`. This holds if the stress does work only on
-        this component."""
+        """Whether the stress of a stable material must rise with `driven`. False in a general test, and if the
+        component of F that belongs to the measured stress is constant."""
         return self.test != "general" and np.ptp(self.F[:, *self.component]) > 0
 
     @property
@@ -48,7 +48,7 @@ class Curve(NamedTuple):
 
 
 def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[str]]:
-    """Read the curves of CSV files. Return them with notes for the user.
+    """Read the stress-stretch curves of CSV files. Return the curves, and notes for the user.
 
     A file has one of two forms. In both, `#` begins a comment. In the first form, the columns are F11 … F33 and P11 …
     P33 (deformation gradient and nominal stress). Here a stress that is zero in all rows counts as not measured. In the
@@ -64,7 +64,7 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
     for file in files:
         rows = _rows_of_curves(file)
         rows, left_out = _measured_rows(rows)
-        notes += [f"{file.name}: rows without a stress are left out: {left_out}"] if left_out else []
+        notes += [f"{file.name}: rows without a stress are ignored: {left_out}"] if left_out else []
         spreads = [name for name in rows[0] if _SPREAD.search(name)]
         if spreads:
             notes.append(
@@ -78,9 +78,9 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
     for curve in (c for c in curves if c.returns):
         times = "once" if curve.returns == 1 else f"{curve.returns} times"
         notes.append(
-            f"{curve.label}: its rows turn back {times} (unloading, cycles or several samples). All are fitted as one "
-            "curve, and the errors do not contain the differences between them: keep one of them, or give each a "
-            "separate file"
+            f"{curve.label}: the deformation reverses {times} (unloading, cycles or several samples). All rows are "
+            "fitted as one curve, and the errors do not contain the differences between its parts: keep one part, or "
+            "write each part into a separate file"
         )
     seen: dict[str, int] = {}
     for k, curve in enumerate(curves):
@@ -115,7 +115,8 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
 
 
 def _measured_rows(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
-    """Return the rows with a measured nominal stress, and the number of other rows. If no row has one, return all."""
+    """Return the rows with a measured nominal stress, and the number of other rows. If none has
+    one, return all rows and 0."""
     name = next((key for key in rows[0] if key.startswith("nominal_stress")), None)
     kept = rows if name is None else [row for row in rows if row[name].lower() not in EMPTY]
     return (kept, len(rows) - len(kept)) if kept else (rows, 0)
@@ -155,7 +156,7 @@ def _names_curves(headings: list[str]) -> bool:
 
 
 def _with_point(cell: str, between: str, sign: str | None) -> str:
-    """Return a number in Python's notation. Any other text is returned unchanged."""
+    """Return a number in Python's notation. Any other string is returned unchanged."""
     value = to_number(cell, between, sign) if cell else None
     return cell if value is None else repr(value)
 
@@ -173,7 +174,7 @@ def _column(file: Path, rows: list[dict], name: str, default: float | None = Non
             where = f"{file}, data row {row['row']}"
             raise InputError(f"{where}: {name} = {text[:40]!r} is not a number: give one") from None
         if not np.isfinite(values[-1]):
-            raise InputError(f"{file}, data row {row['row']}: {name} = {text} is not finite: leave the row out")
+            raise InputError(f"{file}, data row {row['row']}: {name} = {text} is not finite: remove the row")
     return np.array(values)
 
 
@@ -308,7 +309,7 @@ def _stretch_of_shear(row: dict[str, str]) -> float:
 
 
 def _stretches_of_shear(rows: list[dict[str, str]]) -> dict[float, str]:
-    """Return for each stretch in the rows of sheared samples the rounded stretch of its sample, as text."""
+    """Map each stretch in the rows of sheared samples to the rounded stretch of the sample (a string)."""
     own = {_stretch_of_shear(row) for row in rows if row["test"] == "simple_shear"}
     values = np.array(sorted(v for v in own if np.isfinite(v)))
     parts = np.split(values, np.flatnonzero(np.diff(values) >= SAME_STRETCH) + 1)
@@ -335,12 +336,12 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
     return Curve(label, test, F[order], component, stress[order], _returns(driven, F.reshape(len(F), 9)))
 
 
-#: A curve turns back if it goes back by more than this fraction of its range.
+#: The deformation of a test reverses if it goes back by more than this fraction of its range.
 _TURN = 0.05
 
 
 def _returns(driven: np.ndarray, F: np.ndarray) -> int:
-    """Return how often the rows turn back and repeat earlier deformations.
+    """Return how often the deformation reverses and the rows repeat earlier deformations.
 
     Args:
         driven: (n,) the component of the deformation that the test changes.
@@ -359,7 +360,7 @@ def _returns(driven: np.ndarray, F: np.ndarray) -> int:
             turns += [low] if rises is False else []
             rises, high = True, k
     parts = [np.arange(a + (a > 0), b + 1) for a, b in zip(turns, [*turns[1:], len(driven) - 1], strict=True)]
-    # A jump back to the start is not a separate part. The extreme value of each part is left out, so that one wrong
+    # A jump back to the start is not a separate part. The extreme values of each part are ignored, so that one wrong
     # value does not make a range.
     parts = [rows[np.argsort(driven[rows], kind="stable")][1:-1] for rows in parts if len(rows) >= 3]
     return sum(_same_again(driven, F, before, after) for before, after in itertools.pairwise(parts))

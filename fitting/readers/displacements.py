@@ -53,8 +53,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
         unit: unit of all lengths in the file, one of `liverjax.mesh.tetrahedra.UNITS`.
 
     Raises:
-        InputError: the file cannot be read, a column is unknown or missing, a value is not finite, a node or point is
-            not in the mesh, the scene has no step at a time, or the noise is not given.
+        InputError: an unreadable file, a wrong column or value, a node or point outside the mesh, no noise.
     """
     path = Path(path)
     if unit not in UNITS:
@@ -81,7 +80,9 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     elif noise is not None:
         sd = np.full(n, noise)
     else:
-        raise InputError(f"{path}: no column sd: add one, or give the noise's standard deviation in metres by --noise")
+        raise InputError(
+            f"{path}: no column sd: add one, or give the noise's standard deviation in metres with --noise"
+        )
     if not (np.all(np.isfinite(sd)) and np.all(sd > 0)):
         raise InputError(f"{path}: sd must be positive and finite: give the noise's standard deviation")
     if "node" in table:
@@ -163,7 +164,7 @@ def _rows_of_numbers(path: Path, names: list[str], rows: list[list[str]], betwee
             value = to_number(cell, between, sign)
             if value is None:
                 raise InputError(
-                    f"{path}: row {k + 1}: {names[j]} = {cell!r} is no number: correct it, or leave it empty"
+                    f"{path}: row {k + 1}: {names[j]} = {cell!r} is not a number: correct it, or leave it empty"
                 )
             values[k, j] = value
     return values
@@ -186,7 +187,8 @@ def _measured_at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[
     if np.any(outside > _FAR):
         bad = int(np.argmax(outside))
         raise InputError(
-            f"{path}: the point {points[bad].tolist()} m is {outside[bad]:.3g} elements off the mesh: is --unit right?"
+            f"{path}: the point {points[bad].tolist()} m is {outside[bad]:.3g} element sizes away from "
+            "the mesh: is --unit right?"
         )
     off = int(np.sum(outside > _OUTSIDE))
     if off > _MOST_OUTSIDE * len(points):
@@ -202,7 +204,7 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.
 
     Returns the nodes (n, 4) of this element, the barycentric coordinates (n, 4) of the point, and the distance (n,)
     from point to element in element sizes. For quadratic elements, the first two are the nodes (n, 10) and the values
-    (n, 10) of their shape functions. The function runs on the host.
+    (n, 10) of their shape functions. The function runs on the CPU, outside compiled programs.
     """
     X, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     candidates = min(candidates, len(tets))
@@ -226,7 +228,7 @@ def _steps(path: Path, scene: Scene, time: np.ndarray | None, n: int) -> np.ndar
     if time is None:
         return np.full(n, last, np.int32)
     if scene.solve.dt is None:
-        raise InputError(f"{path} has a column time, but [solve] of the scene has no dt: add one or leave time out")
+        raise InputError(f"{path} has a column time, but [solve] of the scene has no dt: add dt, or remove the column")
     dt = float(scene.solve.dt)
     step = np.round(time / dt) - 1
     off = ~(np.isfinite(time) & (step >= 0) & (step <= last) & (np.abs(time / dt - 1 - step) < 0.01))

@@ -33,7 +33,7 @@ class Sweep(NamedTuple):
     )
     friction: np.ndarray | None = None  # (n,) [Pa] change of G'' by one standard deviation of the bearing's friction
     friction_error: float = 0.0  # standard deviation of the bearing's friction [N m s]
-    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out because the instrument dominates
+    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] ignored points, at which the instrument dominates
     sd_estimated: bool = False  # the deviations are only weights, from the scatter of the points
     sd_before: bool = False  # the deviations are only weights, from the moduli before a correction
 
@@ -93,7 +93,9 @@ def check_sweep(sweep: Sweep) -> None:
             raise InputError(f"{name}: {key} has shape {values.shape}: give one number per frequency, here {first}")
         wrong = np.flatnonzero(~(np.isfinite(values) & (values > 0)))
         if wrong.size:
-            raise InputError(f"{name}: {key}[{wrong[0]}] = {values[wrong[0]]:g} must be above 0: correct or remove it")
+            raise InputError(
+                f"{name}: {key}[{wrong[0]}] = {values[wrong[0]]:g} must be above 0: correct or remove this value"
+            )
     if (sweep.storage_sd is None) != (sweep.loss_sd is None):
         raise InputError(f"{name}: only one of storage_sd and loss_sd is given: give both, or neither")
     if np.any(np.diff(sweep.angular_frequency) < 0):
@@ -106,8 +108,8 @@ NEIGHBOURS = (4, 5, 6)
 
 
 def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
-    """Return the robust relative standard deviation of the points about a smooth curve: the smallest value for several
-    polynomials.
+    """Return the robust relative standard deviation of the points about a smooth curve: the smallest of the values
+    for several polynomials.
 
     Four neighbours are compared with a parabola, five with a cubic, six with a quartic. If there are few points per
     decade, the curvature of the material adds to the distance from the parabola: 1 % at six points per decade.
@@ -158,7 +160,7 @@ def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return _curve_of_bytes(np.asarray(x, float).tobytes(), np.asarray(y, float).tobytes())
 
 
-@lru_cache(maxsize=64)  # a fit asks for the weights of the same sweep again and again
+@lru_cache(maxsize=64)  # a fit uses the weights of the same sweep many times
 def _curve_of_bytes(*columns: bytes) -> np.ndarray:
     """Compute `smooth_curve` from the bytes of its columns."""
     from scipy.interpolate import make_smoothing_spline
@@ -177,7 +179,7 @@ def _curve_of_bytes(*columns: bytes) -> np.ndarray:
 
 
 def _cells_along(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the means of points (n,) in cells along x, in ascending order, and the number of points in each cell.
+    """Return the mean x, the mean y and the number of the points (n,) in each cell along x, in ascending order.
     Neighbouring points on the two sides of a cell border are merged."""
     near = max(_NEAR, float(np.ptp(x)) / _MOST)
     cell = np.round(x / near)
@@ -214,7 +216,7 @@ def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) ->
     return _smooth_of_bytes(*(np.asarray(v, float).tobytes() for v in (omega, modulus, sd)))
 
 
-@lru_cache(maxsize=64)  # a fit asks for the weights of the same sweep again and again
+@lru_cache(maxsize=64)  # a fit uses the weights of the same sweep many times
 def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     """Compute `smooth_deviations` from the bytes of its columns."""
     omega, modulus, sd = (np.frombuffer(column) for column in columns)
@@ -240,10 +242,10 @@ def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
-    """Return the points from `low` to `high` [Hz]. A note reports how many points are left out.
+    """Return the sweep with only the points from `low` to `high` [Hz]. A note reports how many points are ignored.
 
     Raises:
-        InputError: fewer than `FEWEST` frequencies are left.
+        InputError: fewer than `FEWEST` frequencies remain.
     """
     hertz = sweep.angular_frequency / (2 * np.pi)
     kept = np.ones(len(hertz), bool)
@@ -257,18 +259,18 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
         return sweep
     if len(np.unique(hertz[kept])) < FEWEST:
         raise InputError(
-            f"{sweep.source or 'sweep'}: --min-frequency and --max-frequency leave {kept.sum()} of {len(kept)} points "
-            f"(the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz): leave {FEWEST} or more"
+            f"{sweep.source or 'sweep'}: --min-frequency and --max-frequency keep only {kept.sum()} of {len(kept)} "
+            f"points (the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz): keep {FEWEST} frequencies or more"
         )
     ends = " and ".join(
         f"{word} {limit:g} Hz" for word, limit in (("below", low), ("above", high)) if limit is not None
     )
-    note = f"{(~kept).sum()} of {len(kept)} points {ends} are left out as requested"
+    note = f"{(~kept).sum()} of {len(kept)} points {ends} are ignored as requested"
     return some(sweep, kept)._replace(notes=(*sweep.notes, note))
 
 
 def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
-    """Return the points where `kept` (n,) is true."""
+    """Return the sweep with only the points where `kept` (n,) is true."""
     names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd", "inertia", "friction")
     columns: Content = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
     raw = None if sweep.raw is None else {q: v[kept] for q, v in sweep.raw.items()}
@@ -276,18 +278,18 @@ def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
 
 
 def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> Sweep:
-    """Return the sweep with the effect of bearing friction. `error` [N m s] is the standard deviation of the friction
-    of the instrument's bearing; `radius` and `height` of the sample are in m."""
+    """Return the sweep with its fields `friction` and `friction_error`. `error` [N m s] is the standard deviation of
+    the friction of the instrument's bearing; `radius` and `height` of the sample are in m."""
     geometry = np.pi * radius**4 / (2 * height)
     return sweep._replace(friction=error * sweep.angular_frequency / geometry, friction_error=error)
 
 
 def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
-    """Return the points whose modulus exceeds the uncertainty of the instrument's inertia. The other points become
-    `grey`.
+    """Return the sweep with only the points whose modulus exceeds the uncertainty of the instrument's inertia. The
+    other points become `grey`.
 
-    The inertia is found from the raw phase. Without it, raw torque and angle are needed, and the torque of the sample
-    or its `radius` and `height` [m].
+    The inertia is found from raw torque and raw angle, with the torque of the sample or its `radius` and `height` [m].
+    If these columns do not show the inertia, it is found from the raw phase.
     """
     raw = sweep.raw
     if not raw or not set(raw_torque.COLUMNS) & set(raw):
@@ -299,11 +301,11 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     if found is None and "phase" in raw:
         found = raw_torque.share_by_phase(omega, G, {"phase": -raw["phase"]})
         if found is not None:
-            sign = "the raw phases fit the moduli with the other sign (lags of the angle): their sign is changed"
+            sign = "the raw phases agree with the moduli only after a change of sign (they are lags of the angle)"
             sweep = sweep._replace(notes=(*sweep.notes, sign))
     if found is None:
         if {"torque", "angle"} <= set(raw) and geometry is None:
-            size = "raw torque and angle could show the inertia of the instrument: give --radius and --height for it"
+            size = "the inertia of the instrument can be computed from raw torque and angle: give --radius and --height"
             return sweep._replace(notes=(*sweep.notes, size))
         return sweep
     sweep = sweep._replace(inertia=found.modulus)
@@ -328,13 +330,12 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
         return sweep._replace(notes=(*sweep.notes, note))
     if len(np.unique(sweep.angular_frequency[~lost])) < FEWEST:
         raise InputError(
-            f"{sweep.source}: {note}: nearly all points show the instrument, not the sample; measure at lower "
-            "frequencies"
+            f"{sweep.source}: {note}: the instrument dominates at nearly all points; measure at lower frequencies"
         )
     lowest = sweep.angular_frequency[lost].min() / (2 * np.pi)
-    share = f"{100 * raw_torque.UNCERTAINTY:g} % of the torque of the inertia (the uncertainty)"
+    share = f"the uncertainty of the torque of the inertia ({100 * raw_torque.UNCERTAINTY:g} % of that torque)"
     left = (
-        f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are left out: the sample's torque is below {share}"
+        f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are ignored: the sample's torque is below {share}"
     )
     grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
     return some(sweep, ~lost)._replace(notes=(*sweep.notes, note, left), grey=grey)

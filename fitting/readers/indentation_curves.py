@@ -9,7 +9,7 @@ import numpy as np
 from fitting.readers.noise_of_series import noise_of_series
 from fitting.readers.tables.text_tables import (
     decimal_sign,
-    find_delimiter,
+    delimiter_of_header,
     means_nothing,
     split_cells,
     text_of,
@@ -47,8 +47,8 @@ class IndentationCurve(NamedTuple):
 
 
 def read_indentation(path: str | Path) -> IndentationCurve:
-    """Read the loading part of a curve. It ends at the deepest point, or at an earlier hold of depth or force. If the
-    file has several loadings, the first is read.
+    """Read the loading part of a curve. This part ends at the deepest point, or at an earlier hold of depth or force.
+    If the file has several loadings, the first is read.
 
     Args:
         path: a workbook, or text with a header that names depth (or displacement, indentation) and force (or load) with
@@ -61,7 +61,7 @@ def read_indentation(path: str | Path) -> IndentationCurve:
     head = next((k for k, line in enumerate(lines) if len(_depth_and_force(lines, k)) == 2), None)
     if head is None:
         raise InputError(f"{path}: no header names depth and force with units; write depth_mm,force_mN above the rows")
-    found, delimiter = _depth_and_force(lines, head), find_delimiter(lines[head])
+    found, delimiter = _depth_and_force(lines, head), _delimiter_of(lines, head)
     columns, notes = _in_si_units(str(path), lines, head, delimiter, found)
     notes = [*_told_of_others(lines, head, found), *notes]
     depth, force = columns["depth"], columns["force"]
@@ -74,10 +74,12 @@ def read_indentation(path: str | Path) -> IndentationCurve:
     if last < _FEWEST or np.ptp(depth[:last]) == 0:
         falls = len(depth) >= _FEWEST and np.argmax(depth) < len(depth) / 10 and depth[-1] < depth[0]
         pulls = len(force) >= _FEWEST and np.mean(force) < 0 and np.argmin(force) > len(force) / 2
-        remedy = "the depth falls during loading, so change its sign" if falls else "give more of them"
+        remedy = "the depth falls during loading, so change its sign" if falls else "give more loading points"
         remedy = "the force falls while the depth grows, so change its sign" if pulls and not falls else remedy
         remedy = "the force is the same in all rows; is this the right column?" if np.ptp(force) == 0 else remedy
-        raise InputError(f"{path}: {last} loading points; a fit needs {_FEWEST} or more, at different depths: {remedy}")
+        raise InputError(
+            f"{path}: the loading has {last} points; a fit needs {_FEWEST} or more, at different depths: {remedy}"
+        )
     depth, force = depth[:last], force[:last]
     offset = _offset(force)
     if offset:
@@ -97,16 +99,16 @@ def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str
         notes.append("the file has several loadings: the first is fitted")
     held = max(_points_of_hold(v[:last]) for v in (depth, force))
     if held:
-        notes.append(f"{held} points are left out, because depth or force is constant at the end of the loading")
+        notes.append(f"{held} points are ignored, because depth or force is constant at the end of the loading")
         last -= held
     elif last < number:
-        notes.append(f"{number - last} points after the deepest one are left out")
+        notes.append(f"{number - last} points after the deepest one are ignored")
     return last, notes
 
 
 def _offset(force: np.ndarray) -> float:
-    """Return the mean force [N] of the first points if the indenter does not touch yet: the next points have the same
-    mean.
+    """Return the mean force [N] of the first points if the indenter does not touch the sample there. This is assumed if
+    the next points have the same mean force.
 
     Returns 0 otherwise, and also if the noise could hide a rise of the force, or if noise alone explains this mean.
     """
@@ -121,7 +123,7 @@ def _points_of_hold(values: np.ndarray) -> int:
     """Return the number of points at the end at which depth or force stays at its largest value; 0 if it still rises.
 
     Because of noise, a rising quantity comes near its largest value long before the end. So these points are a hold
-    only if the rise within them is below half of the rise before them, by more than noise explains.
+    only if the rise within them is below half of the rise before them, by more than expected from noise.
     """
     reached = int(np.argmax(values >= np.max(values) - _margin(values))) + 1
     held = len(values) - reached
@@ -136,7 +138,7 @@ def _points_of_hold(values: np.ndarray) -> int:
 
 
 def _both_sides(values: np.ndarray, reached: int, half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last 2 `half` values before the index `reached`, and the last 2 `half` values of all."""
+    """Return the last 2 * half values before index `reached`, and the last 2 * half values of the whole array."""
     return values[reached - 2 * half : reached], values[len(values) - 2 * half :]
 
 
@@ -156,8 +158,26 @@ class _PlacedColumn(NamedTuple):
 
 def _depth_and_force(lines: list[str], head: int) -> dict[str, _PlacedColumn]:
     """Return the column of each quantity that line `head` names. The unit is in the heading or in the line below."""
-    cells = split_cells(lines[head], find_delimiter(lines[head]))
-    below = split_cells(lines[head + 1], find_delimiter(lines[head])) if head + 1 < len(lines) else []
+    return _in_columns(*_header_and_below(lines, head, _delimiter_of(lines, head)))
+
+
+def _delimiter_of(lines: list[str], head: int) -> str:
+    """Return the delimiter of line `head` that gives depth and force, or else the most frequent one."""
+    below = lines[head + 1] if head + 1 < len(lines) else ""
+
+    def complete(cells: list[str]) -> bool:
+        return any(len(_in_columns(cells, split_cells(below, sign))) == 2 for sign in "\t;,")
+
+    return delimiter_of_header(lines[head], complete)
+
+
+def _header_and_below(lines: list[str], head: int, delimiter: str) -> tuple[list[str], list[str]]:
+    """Return the cells of line `head` and of the line below, which may contain units."""
+    below = split_cells(lines[head + 1], delimiter) if head + 1 < len(lines) else []
+    return split_cells(lines[head], delimiter), below
+
+
+def _in_columns(cells: list[str], below: list[str]) -> dict[str, _PlacedColumn]:
     found = {}
     for quantity in _WORDS:
         places = _places(cells, below, quantity)
@@ -183,8 +203,7 @@ def _places(cells: list[str], below: list[str], quantity: str) -> list[_PlacedCo
 
 def _told_of_others(lines: list[str], head: int, found: dict[str, _PlacedColumn]) -> list[str]:
     """Return a note for each quantity that has several columns."""
-    cells = split_cells(lines[head], find_delimiter(lines[head]))
-    below = split_cells(lines[head + 1], find_delimiter(lines[head])) if head + 1 < len(lines) else []
+    cells, below = _header_and_below(lines, head, _delimiter_of(lines, head))
     notes = []
     for quantity, place in found.items():
         others = [each.name for each in _places(cells, below, quantity) if each != place]
@@ -196,7 +215,7 @@ def _told_of_others(lines: list[str], head: int, found: dict[str, _PlacedColumn]
 def _in_si_units(
     path: str, lines: list[str], head: int, delimiter: str, found: dict[str, _PlacedColumn]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the columns in SI units, and a note on rows that are left out because of an empty cell."""
+    """Return the columns in SI units, and a note on rows that are ignored because of an empty cell."""
     numbered = [(k, line) for k, line in enumerate(lines[head + 1 :], head + 2) if line.strip(f"{delimiter} \t")]
     rows = [(k, split_cells(line, delimiter)) for k, line in numbered if not line.lstrip().startswith("#")]
     if rows and means_nothing(rows[0][1][p.column] for p in found.values() if p.column < len(rows[0][1])):
@@ -215,5 +234,5 @@ def _in_si_units(
     table = np.array(kept, float).reshape(-1, len(found)) * [p.factor for p in found.values()]
     if np.any(np.abs(table) > _LARGEST):
         raise InputError(f"{path}: {np.abs(table).max():g} is beyond any measurement: correct the unit or the row")
-    notes = [f"{empty} of {len(rows)} rows are left out: a cell in them is empty"] if empty else []
+    notes = [f"{empty} of {len(rows)} rows are ignored: a cell in them is empty"] if empty else []
     return dict(zip(found, table.T, strict=True)), notes

@@ -1,5 +1,5 @@
-"""Compute the effect of the instrument's inertia on a sweep. The raw columns (torque, angle, phase) of some exports
-show this effect.
+"""Compute the effect of the instrument's inertia on a sweep from the raw columns (torque, angle, phase) that some
+exports contain.
 
 Raw torque M and angle theta obey M e^(i phase) = (K G* - I omega^2) theta. K is the geometry factor. I is the inertia
 of the instrument, whose effect the software has already subtracted from the moduli. I omega^2 / K [Pa] is the
@@ -100,7 +100,7 @@ def _plain_unit(unit: str) -> str:
 
 
 def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry: float | None) -> SampleShare | None:
-    """Return the inertia that the instrument subtracted. Returns None if the columns do not show it.
+    """Return the inertia that the instrument subtracted. Returns None if the columns do not determine the inertia.
 
     Args:
         omega: (n,) [rad/s].
@@ -133,7 +133,7 @@ COLUMNS = ("torque", "angle", "phase", "sample_torque")
 
 
 def with_raw_columns(raw: dict[str, np.ndarray]) -> np.ndarray:
-    """Return for each point (n,) whether all raw columns of the instrument have a value, and no cell is empty."""
+    """Return for each point (n,) whether all raw columns of the instrument have a value."""
     return np.all([np.isfinite(raw[q]) for q in COLUMNS if q in raw], axis=0)
 
 

@@ -34,7 +34,7 @@ SMALLEST, LARGEST = 1e-30, 1e30
 def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     """Read a frequency sweep.
 
-    A point is left out if a modulus or the frequency is not finite, not positive, or outside of `SMALLEST` to
+    A point is ignored if a modulus or the frequency is not finite, not positive, or outside of `SMALLEST` to
     `LARGEST`. A note names these points.
 
     Args:
@@ -83,17 +83,17 @@ def _usable(path: str, table: Table, values: dict[int, np.ndarray]) -> tuple[np.
         raise InputError(f"{path}: {told}{more}; {remedy}")
     told = "; ".join(told for told, _ in faults[:8]) + (f"; and {len(faults) - 8} more" if len(faults) > 8 else "")
     verb = "is" if len(faults) == 1 else "are"
-    return good, [f"{len(faults)} of {len(good)} points {verb} left out as unusable: {told}"]
+    return good, [f"{len(faults)} of {len(good)} points {verb} ignored as unusable: {told}"]
 
 
 def _below_zero(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -> list[str]:
-    """Return a note if several points are left out because their loss modulus is not above zero."""
+    """Return a note if several points are ignored because their loss modulus is not above zero."""
     column, loss = next((first[q] for q in ("loss", "tangent", "phase") if q in first), (None, np.ones(len(good))))
     count = int(np.sum(~good & (loss <= 0)))
     if column is None or count < 2:
         return []
     return [
-        f"{count} points are left out because {column.name} is not above zero there. The remaining points are too high "
+        f"{count} points are ignored because {column.name} is not above zero there. The remaining points are too high "
         "on average: if noise is the cause, average repeated sweeps before you fit"
     ]
 
@@ -103,7 +103,7 @@ FAR_APART = 100.0
 
 
 def _unlike_units(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -> list[str]:
-    """Return a note if G' and G'' differ by more than `FAR_APART` only because their columns have different units."""
+    """Return a note if G' and G'' differ by a factor above `FAR_APART` only because of the units of their columns."""
     if not {"storage", "loss"} <= set(first):
         return []
     (one, storage), (other, loss) = first["storage"], first["loss"]
@@ -135,13 +135,13 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     values = {q: v[good] for q, (_, v) in first.items()}
     omega = values["frequency"]
     if len(np.unique(omega)) < 2:
-        raise InputError(f"{path}: it has {len(np.unique(omega))} frequency; give at least two different ones")
+        raise InputError(f"{path}: the file has {len(np.unique(omega))} frequency; give at least two different ones")
     values = storage_and_loss(values, notes)
     beside = [(c, written[good]) for c, written in table.beside]
     notes += _contradictions(path, beside, values | {"frequency": omega}, bool(stretched))
     if ("storage_sd" in values) != ("loss_sd" in values):
         raise InputError(
-            f"{path}: only one of storage_modulus_sd_Pa and loss_modulus_sd_Pa is there; give both or none"
+            f"{path}: only one of storage_modulus_sd_Pa and loss_modulus_sd_Pa is in the file; give both or none"
         )
     order = np.argsort(omega, kind="stable")
     if not np.array_equal(order, np.arange(len(omega))):
@@ -156,7 +156,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
 
 #: Note on a file whose lines were not sorted by frequency.
 SORTED = "the frequencies were not in ascending order and have been sorted"
-#: Note on frequencies that occur in several lines. The number of repeated lines comes before this text.
+#: Note on frequencies that occur in several lines. The number of repeated lines comes before this string.
 REPEATED = (
     "frequencies are repeated; each line counts as a separate measurement, unless the noise of lines with the same "
     "frequency is correlated"

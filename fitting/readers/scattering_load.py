@@ -9,8 +9,8 @@ QUIET = 1e-3
 
 
 def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np.ndarray, list[str]]:
-    """Return the imposed strain or stress without scatter, and notes. The mean replaces a constant part, and a straight
-    line replaces a linear ramp.
+    """Return the imposed strain or stress without scatter, and notes. Their mean replaces the values of a constant
+    load, and a fitted straight line replaces the values of a linear ramp.
 
     The model treats the change between two readings as a real step. So it would treat the scatter of a sensor as
     motion.
@@ -38,7 +38,7 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
         if straight is not None:
             begin, end, held = straight
             return held, [
-                f"{told}: a straight ramp from {begin:.3g} to {end:.3g} s and then a constant load are used; the "
+                f"{told}: a linear ramp from {begin:.3g} to {end:.3g} s and then a constant load are used; the "
                 "standard errors do not contain the uncertainty of these times"
             ]
         told = f"{told}, and each reading of the ramp counts as a step, which makes G0 too small (smooth the ramp)"
@@ -58,8 +58,8 @@ _OF_HOLD = 500
 def _straight_ramp(
     time: np.ndarray, driven: np.ndarray, places: tuple[int, int, float], noise: float
 ) -> tuple[float, float, np.ndarray] | None:
-    """Return start and end [s] of a linear ramp, and the load (n,) of rest, ramp and hold without scatter. Returns None
-    if the ramp is not linear.
+    """Return start and end [s] of a linear ramp, and the load (n,) before, during and after the ramp without scatter.
+    Returns None if the ramp is not linear.
 
     `places`: index of the first row under load, index of the first row of the hold, load at rest.
     """
@@ -86,7 +86,7 @@ def _straight_ramp(
     ends = np.linspace(time[rest], time[min(first + max(3, (first - rest) // 4), len(time) - 1)], 400)
     near = ends[int(np.argmin([np.sum((line_from(time[0], end, 0.0) - driven) ** 2) for end in ends]))]
     free = scipy.optimize.minimize(misfit, [time[max(rest - 1, 0)], time[first]], method="Nelder-Mead").x
-    # First try: the ramp begins with load 0 at the first row. Second try: with the load at rest, at a fitted time.
+    # First try: a ramp from load 0 at the first row. Second try: a ramp from the load at rest, at a fitted time.
     for begin, end, level in ((time[0], near, 0.0), (free[0], free[1], low)):
         line = line_from(begin, end, level)
         off = (line - driven) / noise

@@ -11,8 +11,8 @@ _SCATTERS, _MORE, _BY_CHANCE = 0.03, 3.0, 9.0
 #: Minimum number of points, and of points per decade. With fewer points, the curvature of the material would look like
 #: scatter.
 _FEWEST, _PER_DECADE = 8, 5.0
-#: Noise proportional to G'' is assumed only if its log-likelihood is higher by more than this, because such noise in
-#: G'' alone is rare.
+#: Noise proportional to G'' is assumed only if its log-likelihood exceeds that of noise proportional to |G*| by more
+#: than this value. The reason: it is rare that only G'' has noise proportional to its own size.
 _BETTER = 8.0
 #: Number of neighbouring points per polynomial in the comparison of the two kinds of noise.
 _NEIGHBOURS = 5
@@ -23,7 +23,7 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
     G''. Otherwise return the sweep unchanged.
 
     The error of G'' is the phase error [rad] times G'. If the residuals were divided by G'', points that are low by
-    chance would have the largest weight. Where G'' << G', a fit would then follow the noise.
+    chance would have the largest weight. Where G'' << G', the model would then fit the noise.
     """
     omega, size = sweep.angular_frequency, np.hypot(sweep.storage, sweep.loss)
     if sweep.storage_sd is not None or len(np.unique(omega)) < max(len(omega), _FEWEST):
@@ -47,6 +47,6 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
 
 
 def _likelier_in_proportion(x: np.ndarray, sine: np.ndarray) -> float:
-    """Return the log-likelihood ratio of two kinds of noise: proportional to `sine` (n,), and of constant size."""
+    """Return the log-likelihood of noise proportional to `sine` (n,), minus the log-likelihood of constant noise."""
     equal, growing = (np.mean(distances_from_polynomials(x, y, _NEIGHBOURS) ** 2) for y in (sine, np.log(sine)))
     return float(0.5 * len(x) * np.log(equal / max(growing, 1e-300)) - np.sum(np.log(sine)))

@@ -36,6 +36,7 @@ class TimeTest(NamedTuple):
     constant_noise: bool = False  # whether the noise of all responses has the same size
     rise: str = BETWEEN_ROWS  # how the load changed where no row shows it
     described: bool = False  # whether a TOML description names the file
+    offset_error: float = 0.0  # standard error of the subtracted offset of the sensor, in the unit of the response
 
     @property
     def scales(self) -> np.ndarray:
@@ -209,7 +210,7 @@ def from_rest(
             shown = f"the load rose between {time[rows[0] - 1]:.4g} and {time[rows[0]]:.4g} s"
         elif loaded:
             shown = "the rows begin under load, and only 0 (a step at 0 s) is possible there"
-        raise InputError(f"{names[0]}: {names[1]} {ramp:g} cannot be right, since {shown}: leave it out")
+        raise InputError(f"{names[0]}: {names[1]} {ramp:g} cannot be right, since {shown}: remove it")
     if ramp is not None:
         time, driven, answer = _rows_before_jumps(rows, ramp, time, driven, answer)
     if not time[0] > 0:
@@ -312,7 +313,7 @@ def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: 
     names = ("stress", "strain", "creep") if kind == "relaxation" else ("strain", "stress", "relaxation")
     return [
         f"the {names[0]} is constant and the {names[1]} changes, as in a {names[2]} test: use python -m fitting "
-        f"{names[2]}. This command takes the {names[1]} as exact, although it has noise"
+        f"{names[2]}. This command assumes that the {names[1]} has no noise"
     ]
 
 
@@ -370,7 +371,7 @@ def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, 
             last = t[int(np.argmax(v[: int(np.argmax(fallen > allowed)) + 1]))]
             raise InputError(
                 f"{path}: the compliance falls from {last:.3g} s on. If the stress was removed, give strain and stress "
-                "in two columns, or end the rows there. If the strain oscillates after loading, leave these rows out "
+                "in two columns, or end the rows there. If the strain oscillates after loading, exclude these rows "
                 "(--min-time)"
             )
         return []
@@ -378,7 +379,7 @@ def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, 
     if not ramp and v[peak] - v[: peak + 1].min() > allowed:
         raise InputError(
             f"{path}: the modulus rises until {t[peak]:.3g} s, but after a step of strain it can only fall. If the "
-            f"strain rose until then, give --ramp {t[peak]:.3g}; otherwise leave out the earlier rows (--min-time "
+            f"strain rose until then, give --ramp {t[peak]:.3g}; otherwise exclude the earlier rows (--min-time "
             f"{t[peak]:.3g})"
         )
     if ramp and t[0] < 0.3 * ramp and v[0] > 0.7 * size:
@@ -412,7 +413,7 @@ def _ringing(time: np.ndarray, stress: np.ndarray, strain: np.ndarray, start: fl
         return []
     return [
         f"the strain falls by {100 * falls[worst] / v.max():.2g} % until {t[worst]:.3g} s under a constant stress, and "
-        "rises again. This is an oscillation of the instrument's inertia, not creep: leave these rows out (--min-time)"
+        "rises again. This is an oscillation of the instrument's inertia, not creep: exclude these rows (--min-time)"
     ]
 
 
@@ -438,21 +439,24 @@ def _as_shear(path, form, columns, sample):
 RESTING, OFFSET = 3, 0.003
 
 
-def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
-    """Return the responses and a note. If the mean before the load clearly exceeds its error, this mean is subtracted
-    from all responses."""
+def _without_offset(test: TimeTest) -> tuple[np.ndarray, float, list[str]]:
+    """Return the responses, the standard error of the subtracted offset, and a note.
+
+    If the mean before the load clearly exceeds its error, this mean is subtracted from all responses.
+    """
     rest = np.isfinite(test.answer) & (test.time < test.begun) & ~((test.time == 0) & (test.answer == 0))
     count, size = int(rest.sum()), float(np.nanmax(np.abs(test.answer)))
     if count < RESTING:
-        return test.answer, _of_one_row_at_rest(test, size)
+        return test.answer, 0.0, _of_one_row_at_rest(test, size)
     mean, error = float(np.mean(test.answer[rest])), float(np.std(test.answer[rest], ddof=1)) / np.sqrt(count)
     if not abs(mean) > max(3 * error, OFFSET * size):
-        return test.answer, []
+        return test.answer, 0.0, []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
-    return test.answer - mean, [
+    told = (
         f"the {what} of the {count} rows before the load is {mean:.3g}{unit} on average, "
         f"{100 * abs(mean) / size:.2g} % of the largest: this offset of the sensor is subtracted from all rows"
-    ]
+    )
+    return test.answer - mean, error, [told]
 
 
 def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
@@ -477,12 +481,12 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         word = "strain" if test.kind == "relaxation" else "stress"
         raise InputError(f"{test.source}: the {word} is zero throughout; give a {test.kind} test with a load")
     sign = np.sign(test.driven[np.argmax(np.abs(test.driven))])
-    driven, (answer, told) = sign * test.driven, _without_offset(test)
+    driven, (answer, error, told) = sign * test.driven, _without_offset(test)
     answer = sign * answer
     used = test.used & np.isfinite(answer) & (test.time >= start) & (test.time > test.begun)
     if used.sum() < 4:
         raise InputError(
-            f"{test.source}: {used.sum()} usable responses are left; give four or more (is --min-time too late?)"
+            f"{test.source}: {used.sum()} usable responses remain; give four or more (is --min-time too late?)"
         )
     if not np.sum(driven[used] * answer[used]) > 0:
         raise InputError(
@@ -491,4 +495,4 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
     notes = (*test.notes, *told)
     if np.sum(test.time <= test.begun) > 2:
         notes = (*notes, f"the load begins at {test.begun:.3g} s: the rows before it are not fitted")
-    return test._replace(driven=driven, answer=answer, used=used, notes=notes)
+    return test._replace(driven=driven, answer=answer, used=used, notes=notes, offset_error=error)

@@ -1,6 +1,6 @@
 """TA TRIOS exports in JSON, converted to the text tables that the other readers read.
 
-The layout is the TRIOSJSONExportSchema of TA Instruments. The table is in `Results`, or in its part `Processed` or
+The layout is the TRIOSJSONExportSchema of TA Instruments. The table is in `Results`, or in its entry `Processed` or
 `Raw`. There, `ColumnHeaders` gives the name and unit of each column key, and `Rows` gives a value for each key.
 `ResultsSteps` gives the name of each test step by its id.
 """
@@ -12,8 +12,8 @@ STEP = "Results Step Id"
 
 
 def tables(text: str) -> str | None:
-    """Return tab-separated tables, one per step, with a row of names and a row of units. Returns None if the text is
-    not JSON of this layout."""
+    """Return tab-separated tables, one for each step, with a row of names and a row of units. Returns None if the
+    string is not JSON of this layout."""
     try:
         content = json.loads(text)
         results = content["Results"]

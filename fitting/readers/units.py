@@ -2,7 +2,7 @@
 
 import numpy as np
 
-#: mPa is left out on purpose. It means millipascal but, in careless spelling, also megapascal: a factor of 1e9.
+#: mPa is excluded, because it means millipascal but is also a common misspelling of MPa (a factor of 1e9).
 MODULUS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9} | {"pa": 1.0, "kpa": 1e3, "gpa": 1e9, "MPA": 1e6}
 MODULUS_UNITS |= {"PA": 1.0, "KPA": 1e3}
 MODULUS_UNITS |= dict.fromkeys(("N/m2", "N/m²", "N/m^2"), 1.0) | {"N/mm2": 1e6, "N/mm²": 1e6, "N/mm^2": 1e6}

@@ -28,7 +28,7 @@ _stress = jax.jit(partial(homogeneous.nominal_stress, constant=True))
 
 
 def best_first(fits: list[LawFit]) -> list[LawFit]:
-    """Sort the laws by Akaike's criterion, corrected for few points."""
+    """Sort the laws by Akaike's criterion, corrected for few points, with the best law first."""
     return sorted(fits, key=lambda f: f.aicc)
 
 

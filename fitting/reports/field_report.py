@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: If chi^2 per component is above TOO_FAR, a warning says that the model does not explain the data. Below TOO_NEAR, the
-#: stated noise counts as too large. With FEW components, this happens by chance once in a million times.
+#: If chi^2 per component is above TOO_FAR, the program warns that the model does not explain the data. Below TOO_NEAR,
+#: the stated noise counts as too large. With FEW components, this happens by chance once in a million times.
 TOO_FAR, TOO_NEAR, FEW = 1.5, 0.4, 50
 #: If chi^2 is too large, a mesh error above this many times the noise of the data is reported too.
 MESH = 1.0
@@ -50,7 +50,7 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
     if not np.any(np.isfinite(found.standard_errors)):
         return (
             f"no values of {', '.join(found.names)} explain the displacements (chi2 is {ratio:.3g} per component). The "
-            "fit ran away, and the printed values have no meaning: check the unit (--unit), the sign and the origin "
+            "fit diverged, and the printed values have no meaning: check the unit (--unit), the sign and the origin "
             "of the coordinates, node numbers (from 0), loads and supports"
         )
     said = (
@@ -69,7 +69,8 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
 
 
 def noise_sentence(found: Field) -> str | None:
-    """Return a warning if the residuals of a map exceed the stated noise by more than chance explains, or else None."""
+    """Return a warning if the residuals of a map exceed the stated noise by more than expected by chance, or else
+    None."""
     chance = 3 * np.sqrt(2 * found.components)
     if found.reached or found.chi2 <= found.components + chance:
         return None

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Above these ratios (contact radius / radius of the sphere, depth / thickness), the strains may not be small.
+#: The strains may not be small if the contact radius exceeds _WIDE times the radius of the sphere, or if the depth
+#: exceeds _DEEP times the thickness.
 _WIDE, _DEEP = 0.4, 0.2
 
 

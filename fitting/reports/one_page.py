@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Width and height of A4 [inch], the part of the height that is text, and the margin (as a part of the size).
+#: Width and height of A4 [inch], fraction of the height for the text, and margin (as a fraction of width or height).
 WIDTH, HEIGHT, TEXT, MARGIN = 8.27, 11.69, 0.56, 0.06
 #: Characters per line, and the font size [pt] at which a line fits. A text with more lines gets a smaller font.
 CHARACTERS, SIZE = 104, 8.0

@@ -1,4 +1,4 @@
-"""Report the draws of a posterior: a part of fit.json, the file posterior.csv, and lines on the terminal."""
+"""Report the draws of a posterior: an entry of fit.json, the file posterior.csv, and lines on the terminal."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ QUANTILES = (0.025, 0.5, 0.975)
 
 
 def summary(p: Posterior) -> Content:
-    """Return the part `posterior` of fit.json."""
+    """Return the entry `posterior` of fit.json."""
     flat = p.draws.reshape(-1, p.draws.shape[-1])
     rows = zip(p.names, flat.mean(axis=0), flat.std(axis=0, ddof=1), *np.quantile(flat, QUANTILES, axis=0), strict=True)
     evidence = p.chains.log_evidence

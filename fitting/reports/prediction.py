@@ -34,8 +34,8 @@ class Prediction(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """The factor by which the prediction fits best. Another sample or another strain often changes all values by
-        one factor."""
+        """Factor that multiplies the prediction to give the best fit. Another sample or another strain often changes
+        all values by one factor."""
         y, p = (v[self.inside] / self.scales[self.inside] for v in (self.measured, self.predicted))
         return float(p @ y / (p @ p))
 

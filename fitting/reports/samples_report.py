@@ -116,7 +116,9 @@ def warnings(found: Samples) -> list[str]:
         if name.startswith("strengths["):
             continue  # no warning: many strengths are zero or not determined
         if p is None and "exponent" in name and np.all(np.abs(own - np.round(own[0])) < 1e-3):
-            out.append(f"{name}: it is {np.round(own[0]):g} in all samples, so the springpot is a spring or dashpot")
+            out.append(
+                f"{name}: the value is {np.round(own[0]):g} in all samples, so the springpot is a spring or dashpot"
+            )
         elif p is None:
             out.append(f"{name}: fewer than two samples determine this parameter, so it has no population")
         else:
@@ -127,8 +129,8 @@ def warnings(found: Samples) -> list[str]:
             without = [Path(s.source).name for s, x in zip(found.sweeps, p.pooled, strict=True) if np.isnan(x)]
             if without:
                 out.append(
-                    f"{name}: {', '.join(without)} does not determine it (a fluid, or another band?), so the "
-                    "population contains only the other samples"
+                    f"{name}: {', '.join(without)} does not determine this parameter (a fluid, or another band?), so "
+                    "the population contains only the other samples"
                 )
     out += _limits_of_typical(found)
     out += outliers(found)
@@ -175,7 +177,7 @@ def _limits_of_typical(found: Samples) -> list[str]:
         return []
     return [
         f"the equilibrium modulus of the typical sample's Prony modes is {rest:.4g} Pa, but the population mean is "
-        f"{p.mean:.4g} Pa: the modes follow the model {found.kind.name} over the measured band only"
+        f"{p.mean:.4g} Pa: the modes agree with the model {found.kind.name} only over the measured band"
     ]
 
 
@@ -200,7 +202,7 @@ def table(found: Samples) -> str:
         middle, new = ends
         rows.append(f"{label:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
     every = [found.values(k) for k in range(len(found.fits))]
-    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # in most samples
+    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # present in most samples
     rows.append(f"{'sample':32s} {'mean error':>10s}   {labels[name]}")
     for (fit, sweep), own in zip(_pairs(found), every, strict=True):
         value, error = own[name]

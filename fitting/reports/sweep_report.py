@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 #: Closed form and simulation count as equal if they differ by less than this fraction of a standard error.
 AGREED = 0.1
 STEMS = ("ratios", "relaxation_times")
-MARK = "* changes by more than independent noise explains if the first or the last half decade is left out"
+MARK = "* changes by more than expected from independent noise if the first or the last half decade is left out"
 
 
 def numbers(values: Any) -> Any:
@@ -87,7 +87,8 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
 
 
 def ends_of_interval(details: Content) -> list[float] | None:
-    """Return the ends of the interval of the equilibrium modulus, or None for models other than Prony modes."""
+    """Return the lower and upper end of the 95 % interval of the equilibrium modulus, or None if the fit has no such
+    interval (not converged, or not Prony modes)."""
     found = details.get(INTERVAL)
     return [found["low"], found["high"]] if found else None
 
@@ -108,7 +109,8 @@ def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
 
 
 def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | None:
-    """Return the bias of each parameter, with the names of `standard_errors`. Returns None if it is unknown."""
+    """Return the bias of each parameter, under the same names as the standard errors. `moved`: the biases, or None.
+    Returns None if the biases are unknown."""
     if moved is None:
         return None
     return {
@@ -201,7 +203,7 @@ def write(
         content["warnings"] += posterior.warnings()
         if alike_points.INDEPENDENT in main.details:
             content["warnings"].append(
-                "the posterior takes the noise of all moduli as independent, but neighbouring points are correlated: "
+                "the posterior assumes independent noise of all moduli, but neighbouring points are correlated: "
                 "its intervals are too narrow; use the standard errors"
             )
         posterior_report.write_draws(out / "posterior.csv", posterior)

@@ -27,7 +27,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.laws import Law
 
-#: Maximum compression of a sample, as a part of its height.
+#: Maximum compression of a sample, as a fraction of its height.
 LARGEST = 0.5
 #: Maximum strain of one load step.
 _STEP = 0.05
@@ -46,7 +46,7 @@ def check_strain(strain: float) -> None:
     if not 0 <= strain <= LARGEST:
         meant = f"{strain / 100:g}" if 1 <= strain <= 100 * LARGEST else "0.05"  # the value may be in percent
         raise InputError(
-            f"--precompression {strain:g} is out of range: the compression is a part of the height, from 0 to "
+            f"--precompression {strain:g} is out of range: the compression is a fraction of the height, from 0 to "
             f"{LARGEST:g}; give e.g. --precompression {meant}"
         )
 
@@ -73,8 +73,8 @@ def shares(law: Law, strain: float) -> Shares:
 
 
 def incompressible(law: Law, strain: float) -> Shares | None:
-    """Return the factors as in `shares`, but for an incompressible sample. The axial stress s is then computed without
-    the volumetric energy U(J) of the law.
+    """Return the same factors as `shares`, but for an incompressible sample. The axial stress s is then computed
+    without the volumetric energy U(J) of the law.
 
     Returns None if the law has no isochoric part, or if the strain is 0.
     """
@@ -150,7 +150,7 @@ def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
     Args:
         rig: rig of the uncompressed sample. The height of the returned rig is the gap after the compression.
         law: law of the sample.
-        strain: compression, as a part of the height at rest.
+        strain: compression, as a fraction of the height at rest.
         smooth: the sample slides sideways on the plates during the compression, so that it stays a cylinder. Otherwise
             it is glued and bulges.
 

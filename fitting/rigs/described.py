@@ -1,4 +1,4 @@
-"""Relaxation and creep tests in other loadings than simple shear.
+"""Relaxation and creep tests under loadings other than simple shear.
 
 A small TOML file describes the test, the sample and its rig (the test machine). f(d) is the force on an elastic sample
 of unit shear modulus at a displacement d. For glued samples, f(d) is computed by finite elements and corrected for the
@@ -98,7 +98,7 @@ def read_described(path: str | Path) -> TimeTest:
             )
     d, force = columns["displacement"], columns["force"]
     if described.test == "compression":
-        notes.append("displacement and force are taken as positive in compression")
+        notes.append("displacement and force are assumed to be positive in compression")
     sign = np.sign(d[np.argmax(np.abs(d))]) or 1.0
     largest = float(np.max(sign * d))
     if not largest > 0:
@@ -142,7 +142,7 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
         return len(time), []
     kept = int(np.argmax(back))
     return kept, [
-        f"{len(time) - kept} rows from {time[kept]:.4g} s on are left out: the indenter goes back there, and the "
+        f"{len(time) - kept} rows from {time[kept]:.4g} s on are ignored: the indenter goes back there, and the "
         "formulas are not valid while the contact shrinks"
     ]
 
@@ -159,7 +159,7 @@ def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tu
 
 
 def curve_of(curve: Callable[[float], float], d: np.ndarray) -> np.ndarray:
-    """Return f (n,) [m^2] at displacements d (n,) [m]. For d < 0, f is continued as a straight line."""
+    """Return f (n,) [m^2] at displacements d (n,) [m]. For d < 0, f is continued linearly."""
     grid = np.linspace(0.0, max(float(d.max()), 0.0), 400)
     values = np.array([0.0, *(curve(each) for each in grid[1:])])
     below = curve(grid[1]) / grid[1] * np.minimum(d, 0.0)
@@ -192,7 +192,7 @@ def _description(path: Path) -> Described:
     own = _LAYER if "thickness" in needed else _GLUED
     poisson = _number_of(path, "poisson", table.get("poisson", own))
     if not 0 <= poisson <= own:
-        raise InputError(f"{path}: poisson = {poisson:g} must be from 0 to {own:g}: leave it out for a soft tissue")
+        raise InputError(f"{path}: poisson = {poisson:g} must be from 0 to {own:g}: remove poisson for a soft tissue")
     if not isinstance(table["data"], str):
         raise InputError(f"{path}: data = {table['data']!r} must name a file: write data = 'test.csv'")
     drive = table.get("drive", "displacement")
@@ -204,7 +204,7 @@ def _description(path: Path) -> Described:
     ramp = table.get("ramp")
     if ramp is not None and _number_of(path, "ramp", ramp) != 0:
         raise InputError(
-            f"{path}: ramp = {ramp} cannot be used: leave it out, or give 0 for a step whose rise no row shows"
+            f"{path}: ramp = {ramp} cannot be used: remove ramp, or give 0 for a step whose rise no row shows"
         )
     return Described(test, path.parent / table["data"], sizes, poisson, drive, first, ramp is not None)
 

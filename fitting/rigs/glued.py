@@ -38,9 +38,11 @@ class Cells(NamedTuple):
     """The mesh of a rig. Results of the default mesh are within 1 % of converged results (experiments/TABLES.md)."""
 
     size: float | None = None  # [m] length of all cells of a whole cylinder; None: a graded sector
-    rim: float = 0.04  # in a sector: cell size at the rim of a plate / shortest length there
-    edge: float = 0.02  # in a sector: cell size at the edge of a punch / shortest length there
-    largest: float = 0.34  # in a sector: longest cells / radius; twice as long along the axis
+    # In a sector: cell size at the rim of a plate, divided by the shortest dimension of the sample at this rim (radius,
+    # half the height, …).
+    rim: float = 0.04
+    edge: float = 0.02  # in a sector: cell size at the edge of a punch, divided by the shortest dimension at this edge
+    largest: float = 0.34  # in a sector: longest cells, divided by the radius; twice as long along the axis
     growth: float = cylinders.GROWTH  # increase of the cell length per distance from rims and edge
     corners: int = 24  # corners of the polygon that replaces the circle; a sector has one of its edges
     order: int = 2  # order of the elements
@@ -80,8 +82,8 @@ def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]
 
 
 def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
-    """Estimate how each reading (T,) [N] or [m] would change with an infinitely fine mesh. Law and viscosity must not
-    be traced by JAX.
+    """Estimate how each reading (T,) [N] or [m] would change with an infinitely fine mesh. Law and viscosity must
+    have known numbers (not inside jit, grad or vmap).
 
     The estimate needs one run, and for each step one linear solve with elements of higher order
     (`liverjax.simulation.mesh_error`). The result is NaN for a step without an estimate.
@@ -111,7 +113,8 @@ def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
 
 
 def _ratio(law: Law) -> float | None:
-    """Return bulk modulus / shear modulus. Returns None if the law does not define them, or if JAX traces them."""
+    """Return the bulk modulus divided by the shear modulus. Returns None if the law does not define these moduli, or if
+    their numbers are unknown (inside jit, grad or vmap)."""
     try:
         moduli = law.bulk_modulus(), law.shear_modulus()
     except InputError:
@@ -196,7 +199,7 @@ def creep(
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
         raise InputError(f"steps = {steps!r} must be a whole number, 1 or more")
     if not np.isfinite(stress):
-        raise InputError(f"stress = {stress!r} must be finite: give the pull in Pa")
+        raise InputError(f"stress = {stress!r} must be finite: give the tensile stress in Pa")
     cells = _cells(radius, height, dt, cell_size)
     rim = cells.rim * min(radius, height)
     sample = _sample({radius: rim}, {0.0: rim, height: height}, cells)

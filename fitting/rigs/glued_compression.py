@@ -48,17 +48,17 @@ class Glued(NamedTuple):
 
 
 def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Glued]:
-    """Return factors and force of a sample that is compressed by `strain` between glued plates, and an estimate of the
-    mesh error of each value.
+    """Return (values, change) for a sample that is compressed by `strain` between glued plates.
 
-    The results of two meshes are extrapolated with `ORDER`. This order is low because stresses are infinite at the
-    rims. The second result is the change due to the extrapolation, with its sign.
+    values: factors and force, extrapolated with `ORDER` from the results of two meshes. This order is low because
+    stresses are infinite at the rims. change: change of each value due to the extrapolation, with its sign. It is an
+    estimate of the mesh error.
 
     Args:
         radius: radius of the plates, and of the sample at rest [m].
         gap: height of the compressed sample [m].
         law: law of the sample.
-        strain: compression, as a part of the height at rest.
+        strain: compression, as a fraction of the height at rest.
 
     Raises:
         InputError: the simulation does not converge at this compression.

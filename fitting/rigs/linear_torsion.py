@@ -54,7 +54,8 @@ class Response(NamedTuple):
 
 
 def _response(column: jax.Array) -> Response:
-    """Return the response from the coordinates (n,) that a unit force on the last coordinate causes."""
+    """Return the response to a motion of the last coordinate. `column`: the coordinates (n,) under a unit force on the
+    last coordinate."""
     return Response(column / column[-1], 1 / column[-1])
 
 
@@ -90,10 +91,10 @@ class Linearised(NamedTuple):
     """Matrices of the linearised rig that serve for all frequencies."""
 
     inverse: jax.Array  # inverse of the stiffness (n, n) for motions too fast for relaxation
-    relaxing: jax.Array | None  # (n, n) relaxing part of the stiffness; None: everything relaxes
-    standing: jax.Array | None  # (n, n) part of the stiffness that does not relax; None: everything relaxes
+    relaxing: jax.Array | None  # (n, n) relaxing part of the stiffness; None: the whole stress relaxes
+    standing: jax.Array | None  # (n, n) part of the stiffness that does not relax; None: the whole stress relaxes
     held: "Held | None" = None  # the compressed sample; None: not compressed
-    stands: Number = 1.0  # part of the stress that does not relax
+    stands: Number = 1.0  # fraction of the stress that does not relax
     mass: jax.Array | None = None  # (n,) [kg] for each coordinate; None: no inertia
     elastic: jax.Array | None = None  # (n, n) [N/m] elastic stiffness, only with inertia
     modes: Vibrations | None = None  # only with inertia
@@ -180,8 +181,8 @@ def torque_for_strain(rig: Rig, modulus: Number, strain: Number) -> Number:
 
 
 def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """Return the complex moduli (n,) [Pa] at small strain that the recursion (the update of the viscous memory from
-    step to step) gives. They are the limit of `torsion.moduli`.
+    """Return the complex moduli (n,) [Pa] at small strain that the recursion (the update of the history variables
+    from step to step) gives. They are the limit of `torsion.moduli`.
 
     In this limit, the rig is linear, and dividing by the bias removes the error of the mesh. So the moduli depend
     neither on the mesh nor on the plates. Up to an error of the order of the strain, their derivatives with respect to
@@ -208,8 +209,8 @@ class Held(NamedTuple):
     meshless: jax.Array | None  # R and S (2,) without mesh error; None: unknown
 
     def bias_at(self, modulus: Number, stands: Number) -> jax.Array:
-        """Return the bias of the mesh. `modulus`: complex factor by which the stress relaxes. `stands`: part of the
-        stress that never relaxes."""
+        """Return the bias of the mesh. `modulus`: complex factor by which the stress relaxes. `stands`: fraction of
+        the stress that never relaxes."""
         if self.meshless is None:
             return self.bias + 0j
         own, true = (R * modulus + S * stands for R, S in (self.factors, self.meshless))

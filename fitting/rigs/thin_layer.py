@@ -17,7 +17,7 @@ import scipy.interpolate
 from fitting.rigs.hertz import SHAPES, Indenter, half_space
 from liverjax.core.errors import InputError
 
-#: Maximum of contact radius / thickness in a table.
+#: Largest contact radius in a table, divided by the thickness.
 WIDEST = 8.0
 #: Above this eta, 1 - K(eta) is below 1e-13 (it falls as eta^2 exp(-2 eta)).
 _LAST_WAVE = 20.0
@@ -27,8 +27,10 @@ _WAVES, _POINTS, _ROWS = 160, 48, 48
 class Factors(NamedTuple):
     """Table of the force on a layer divided by the force on a half-space at the same depth."""
 
-    reach: np.ndarray  # (n,) ascending from 0: size of the contact on a half-space / thickness, see `reach`
-    factor: np.ndarray  # (n,) force / force on the half-space
+    reach: (
+        np.ndarray
+    )  # (n,) ascending from 0: size of the contact on a half-space, divided by the thickness; see `reach`
+    factor: np.ndarray  # (n,) force divided by the force on the half-space
 
 
 def stiffening(eta: np.ndarray, poisson: float) -> np.ndarray:
@@ -61,7 +63,7 @@ def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
 
 
 def factors(poisson: float, shape: str) -> Factors:
-    """Compute the table for a sphere or a cone, for contact radius / thickness from 0 to 8.
+    """Compute the table for a sphere or a cone, for contact radii from 0 to 8 times the thickness.
 
     Args:
         poisson: 0 to 0.5.
@@ -138,15 +140,15 @@ class Layer:
         if not largest <= self.deepest:
             raise InputError(
                 f"depth = {largest:.4g} m is not within the {self.deepest:.4g} m that the table of the layer covers: "
-                "leave deeper points out"
+                "remove all deeper points"
             )
         alone = half_space(self.rig, depth)
         return alone * (self._punch if self.rig.shape == "punch" else self._factor(reach(self.rig, depth)))
 
 
 def series(chi: np.ndarray, poisson: float) -> np.ndarray:
-    """Return the factor (force / force on a half-space) of a sphere for small chi = sqrt(R d)/h, to third order in chi.
-    It is derived from the same integral equation."""
+    """Return the factor (force divided by the force on a half-space) of a sphere for small chi = sqrt(R d)/h, to third
+    order in chi. The series is derived from the same integral equation."""
     eta, v = np.polynomial.legendre.leggauss(_WAVES)
     eta, v = _LAST_WAVE * (eta + 1) / 2, _LAST_WAVE * v / 2
     missing = v * stiffening(eta, poisson)

@@ -63,8 +63,8 @@ from liverjax.tensors.matrices import deformation_gradient
 
 
 class Drive(NamedTuple):
-    """How the rig (the rheometer with its sample) is driven, and the number of steps. All values are static in compiled
-    programs.
+    """Imposed load of the rig (the rheometer with its sample), and the number of steps. A change of any value compiles
+    a new program.
 
     `steps`: time steps per cycle. `cycles`: cycles of a run; the last one is demodulated. `by`: imposed quantity,
     "torque" or "angle". `start`: initial state, "cycle" (the steady linear cycle) or "rest".
@@ -93,9 +93,9 @@ class Moduli(NamedTuple):
     storage: jax.Array  # G' [Pa]
     loss: jax.Array  # G'' [Pa]
     strain: jax.Array  # amplitude at the rim, radius * angle / height
-    defect: jax.Array  # |angle at the end - angle one period earlier| / amplitude: the remaining transient
+    defect: jax.Array  # |angle at the end - angle one period earlier| divided by the amplitude: the remaining transient
     bias: jax.Array  # bias of the mesh, complex; `geometry_factor` if the whole stress relaxes
-    statistics: newton.NewtonStatistics  # largest over the steps
+    statistics: newton.NewtonStatistics  # largest value over the steps
 
 
 def scene_of(
@@ -232,20 +232,21 @@ def _preconditioner(o: _Oscillation, rest: Linearised) -> Callable[[jax.Array], 
 
 
 def _twist(o: _Oscillation) -> jax.Array:
-    """Return torque / radius [N] of the compressed, relaxed sample without a load."""
+    """Return torque / radius [N] of the compressed, relaxed sample at the angle 0. It is not exactly 0, because the
+    mesh is not quite symmetric."""
     standing = 1.0 if o.prony is None else 1 - jnp.sum(jnp.asarray(o.prony.ratios))
     x = o.positions(jnp.zeros(number_of_coordinates(o.rig), o.rig.mesh.points.dtype))
     return standing * work_conjugates(o.rig, x, mjed.internal_force(o.rig.mesh, o.law, x))[2]
 
 
 def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tuple[tuple, tuple]:
-    """Solve one time step. Returns the new coordinates and memories, then angle, torque, lift and Newton's
-    statistics."""
+    """Solve one time step. Returns the new coordinates and internal variables, then angle, torque, lift and
+    Newton's statistics."""
     (q_old, memories), rig, mesh = carry, o.rig, o.rig.mesh
     mask = jnp.ones_like(mesh.points)
     if not o.by_torque and o.drive.start == "rest":
         # The velocity of the top plate jumps at the start, so its acceleration would oscillate and grow in the average
-        # acceleration method. Therefore this acceleration is left out. The remaining error is of first order in the
+        # acceleration method. Therefore this acceleration is ignored. The remaining error is of first order in the
         # time step. If the run starts on the cycle, the velocity does not jump, and the error is of second order.
         mask = mask.at[len(mask) - rig.top :, :2].set(0.0)
     physics, free = _sample_physics(rig, o.law, o.prony), Free(mask)
@@ -281,8 +282,8 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
 
 
 def _without_last(inverse: jax.Array) -> jax.Array:
-    """Return the inverse of a symmetric matrix without its last row and column, from the whole inverse (Schur
-    complement)."""
+    """Remove the last row and column of a symmetric matrix, and return the inverse of the rest (Schur complement).
+    `inverse`: inverse of the whole matrix."""
     b = inverse[:-1, -1]
     return inverse[:-1, :-1] - jnp.outer(b, b) / inverse[-1, -1]
 
@@ -294,8 +295,8 @@ def _sample_physics(rig: Rig, law: Law, prony: Prony | None) -> tuple[Physics, .
 
 
 def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[jax.Array, tuple]:
-    """Return the coordinates at time 0 and the memories of the physics objects, either at rest or on the cycle of the
-    linearised problem."""
+    """Return the coordinates at time 0 and the internal variables of the physics objects (here `memories`), either at
+    rest or on the cycle of the linearised problem."""
     rig, prony, on_cycle, mesh = o.rig, o.prony, o.drive.start == "cycle", o.rig.mesh
     q = jnp.real(shape * arc) if on_cycle else jnp.zeros(shape.shape, mesh.points.dtype)
     history = None if prony is None else viscosity.initial_history(prony, mesh.volumes.shape[0], q.dtype)
@@ -309,7 +310,8 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[
     if prony is not None and on_cycle:
         _, slope = jax.linearize(S, jnp.zeros_like(q))
         S_shape = slope(jnp.real(shape)) * arc
-        if jnp.iscomplexobj(shape):  # a real shape needs one derivative only; the other is a fifth of the program
+        # A real shape needs one derivative only. The other derivative is a fifth of the compiled program.
+        if jnp.iscomplexobj(shape):
             S_shape += slope(jnp.imag(shape)) * 1j * arc
         ratios = viscosity.complex_ratios(prony, o.omega, o.dt)
         gamma = jnp.real(ratios[:, None, None] * S_shape[None])
@@ -332,7 +334,7 @@ def oscillate(rig: Rig, law: Law, prony: Prony | None, omega: Number, amplitude:
         prony: relaxation of the law, or None.
         omega: angular frequency [rad/s].
         amplitude: amplitude of the torque [N m] or of the angle [rad].
-        drive: see `Drive`; static in compiled programs.
+        drive: see `Drive`; a change compiles a new program.
     """
     return _oscillate(_Oscillation(rig, law, prony, omega, amplitude, drive), linearised_rig(rig, law, prony))[0]
 

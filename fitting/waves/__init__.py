@@ -1,1 +1,1 @@
-"""Shear waves in a material, and the moduli that follow from them."""
+"""Compute moduli from measured shear waves."""

@@ -1,19 +1,19 @@
-"""The balance of forces in measured waves, and the modulus that follows from it.
+"""The balance of forces in measured waves, and the computation of the modulus from this balance.
 
 No external force acts at the inner nodes of a body, so C(G) u + B p = 0, with the moduli G and the nodal displacements
-u. C consists of the rows of K(G) - omega^2 M at these nodes. K is the stiffness matrix of the shear stress alone, and M
-is the mass matrix. B p are the nodal forces of a pressure p, which is continuous and linear in each element. The
-pressure is unknown, so no bulk modulus is needed. The measured motion at all nodes is d = u + noise, and the noise has
-the standard deviation sd. If the pressure has a large prior variance g sd^2, the most probable motion that fulfils this
-balance is
+u. C consists of the rows of K(G) - omega^2 M that belong to these nodes. K is the stiffness matrix due to the shear
+stress alone, and M is the mass matrix. B p are the nodal forces of a pressure p, which is continuous and linear in each
+element. The pressure is an unknown, so no bulk modulus is needed. The measured motion at all nodes is d = u + noise,
+and the noise has the standard deviation sd. The pressure has a large prior variance g sd^2. Then the most probable
+motion u that fulfils this balance is
 
     u = d - C^H q,   S q = C d,   S = C C^H + g B B^H,   chi^2 = (C d)^H q / sd^2.
 
-No condition is needed at the surface of the body: the motion of the surface is measured with noise, like all other
-motion. Let C' be the derivative of C with respect to a modulus. As a function of the modulus, chi^2 / 2 has the
+No boundary condition is needed at the surface of the body, because the motion there is measured, with noise, as at all
+other nodes. Let C' be the derivative of C with respect to a modulus. With respect to this modulus, chi^2 / 2 has the
 gradient Re(q^H C' u) / sd^2 and the Gauss-Newton Hessian (C' u)^H S^-1 C' u / sd^2 (variable projection: Golub and
-Pereyra 1973, SIAM J. Numer. Anal. 10, 413). C' acts on the fitted motion u and not on the noisy d, so noise does not
-lower the modulus. In a direct inversion with second derivatives, noise lowers the modulus.
+Pereyra 1973, SIAM J. Numer. Anal. 10, 413). C' multiplies the fitted motion u and not the noisy d, so noise does not
+make the modulus too small. In a direct inversion with second derivatives, noise makes the modulus too small.
 """
 
 import itertools
@@ -35,26 +35,26 @@ from liverjax.waves.harmonic import element_operator
 
 
 class Matrices(NamedTuple):
-    """Parts of the dynamic stiffness of every element with n nodes, and the positions of these parts in the matrices.
+    """Element matrices for elements with n nodes, and the positions of their entries in the matrix C.
 
     There are E elements, V nodes and I unknowns at inner nodes. I is also the number of rows of C.
     """
 
     shear: np.ndarray  # (n, 3, n, 3, E) for a shear modulus of 1 Pa [N/m/Pa]
-    mass: np.ndarray  # (n, n, E) of one component [kg]
+    mass: np.ndarray  # (n, n, E) [kg], the same for x, y and z
     unknowns: np.ndarray  # (n, 3, E) index of each unknown in a vector (3 V,) with x, y, z of a node together
-    rows: np.ndarray  # (n, 3, E) row of C of each unknown, -1 if the node is not an inner node
+    rows: np.ndarray  # (n, 3, E) row of C for each unknown, -1 if the node is not an inner node
     pattern: scipy.sparse.csr_array  # positions of the entries of C
-    places: np.ndarray  # positions in pattern.data of the element entries that are in a row of C
+    places: np.ndarray  # positions in pattern.data of the element entries that belong to a row of C
     entries: np.ndarray  # indices of these entries among all element entries
     pressure: np.ndarray  # lower triangle of g B B^H, stored by diagonals (bandwidth + 1, I)
     balances: int  # number of real equations in chi^2
-    parts: tuple[slice, ...]  # rows of C of each part of the body: rows of different parts have no common unknowns
+    parts: tuple[slice, ...]  # rows of C of each part of the body; rows of different parts share no unknowns
 
 
-#: FREE: ratio of the two terms of S: the term of the pressures divided by the term of the shear stress at the modulus
-#: `TYPICAL` [Pa]. A finite ratio causes a relative error of about 1 / FREE. The term of the pressures is the same for
-#: every modulus, so the values of chi^2 for two moduli can be compared.
+#: FREE: size of the pressure term g B B^H of S, divided by the size of the term C C^H at the modulus `TYPICAL` [Pa].
+#: Since this ratio is finite, the relative error is about 1 / FREE. The pressure term is the same for all moduli, so
+#: that values of chi^2 for different moduli can be compared.
 FREE, TYPICAL = 1e4, 3000.0
 
 
@@ -70,20 +70,22 @@ def _columns_of(band: np.ndarray, a: int, b: int) -> np.ndarray:
 
 
 class Balanced(NamedTuple):
-    """The most probable motion for given moduli, and the quantities of its computation (see the module docstring)."""
+    """The most probable motion u for given moduli, with chi^2, the multipliers q and the Cholesky factor of S (symbols:
+    module docstring)."""
 
     chi2: float
     motion: np.ndarray  # u (3 V,) complex [m]
     multipliers: np.ndarray  # q (I,)
-    factor: np.ndarray  # (bandwidth + 1, I): L of S = L L^H, by diagonals
+    factor: np.ndarray  # (bandwidth + 1, I): L of S = L L^H, stored by diagonals
 
     def of(self, rows: slice) -> "Balanced":
-        """Return the result for some rows of C that have no common unknowns with the other rows. The motion is not
-        changed."""
+        """Return the multipliers and the factor for some rows of C only. These rows must share no unknowns with the
+        other rows. The motion is not changed."""
         return self._replace(multipliers=self.multipliers[rows], factor=self.factor[:, rows])
 
     def whitened(self, columns: scipy.sparse.csc_array, kind: type = np.complex128) -> np.ndarray:
-        """Return L^-1 times columns (I, k). For columns a and b, the scalar product of the results is a^H S^-1 b."""
+        """Return the whitened columns L^-1 `columns` (I, k). For two columns a and b, the scalar product of the
+        whitened columns is a^H S^-1 b."""
         left, (bands, n) = columns.astype(kind).toarray(), self.factor.shape
         for a in range(0, n, bands):
             b = min(a + bands, n)
@@ -95,7 +97,7 @@ class Balanced(NamedTuple):
 
 
 def matrices(body: VoxelBody, density: float) -> Matrices:
-    """Return the matrices of a body with this density [kg/m^3]."""
+    """Return the matrices of the force balance for a body with this density [kg/m^3]."""
     scene = lj.Scene(
         mesh=body.mesh,
         law=lj.laws.NeoHookean(mu=1.0, bulk=1.0),
@@ -127,26 +129,26 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
 
 
 def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_array:
-    """Return the forces of the pressures, scaled to the prior variance that `FREE` determines.
+    """Return the matrix B of the pressure forces, scaled to the prior variance that `FREE` determines.
 
     Args:
-        B: forces of pressures of 1 Pa.
+        B: nodal forces of pressures of 1 Pa.
         shear: entries of C at the modulus `TYPICAL`.
     """
-    part = np.sum(shear**2) / B.shape[0]  # mean of the diagonal of C C^H
+    part = np.sum(shear**2) / B.shape[0]  # mean diagonal entry of C C^H
     return np.sqrt(FREE * part / B.power(2).sum(axis=1).mean()) * B
 
 
 def _in_order(body: VoxelBody) -> np.ndarray:
-    """Return the indices of the unknowns of the inner nodes, in the order of `by_part_and_slice`."""
+    """Return the indices of the unknowns at inner nodes, in the order of `by_part_and_slice`."""
     nodes = np.flatnonzero(body.inner)
     order = by_part_and_slice(body.voxel[nodes], body.part[nodes])
     return (3 * nodes[order][:, None] + np.arange(3)).ravel()
 
 
 def by_part_and_slice(voxel: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Return the order (n,) of nodes with voxel indices (n, 3): part by part, and slice by slice along the longest side
-    of each part. In this order, coupled nodes have close indices."""
+    """Return the indices (n,) that sort nodes with voxel indices (n, 3) by the parts of the body, and by slices along
+    the longest side of each part. In this order, coupled nodes have close indices."""
     longest_last = voxel.copy()
     for k in np.unique(part):
         own = voxel[part == k]
@@ -158,7 +160,7 @@ def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy
     """Return B (I, P): integrals of the linear shape function of each corner times the divergence of the quadratic
     shape function of each inner node."""
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
-    gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3) of the linear functions
+    gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3) of linear shape functions
     second = (1 + np.eye(4)) / 20  # integrals of the products of two linear functions, divided by the volume
     parts = [np.einsum("v,ec->vce", 4 * second[i] - 0.25, gradients[:, i]) for i in range(4)]
     for i, j in PAIRS:
@@ -174,7 +176,9 @@ def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy
 
 
 def rows_of_balance(m: Matrices, G: np.ndarray, omega: float) -> scipy.sparse.csr_array:
-    """Return C (I, 3 V) for complex moduli G of the elements (E,) [Pa] at an angular frequency [rad/s]."""
+    """Return the matrix C of the force balance (I, 3 V; module docstring), for complex moduli G of the elements (E,)
+    [Pa] and an angular frequency [rad/s]. It has one row for each of the I unknowns at inner nodes, and one column for
+    each unknown of the body."""
     mass = m.mass[:, None, :, None] * np.eye(3)[None, :, None, :, None]
     real = G.real * m.shear - omega**2 * mass
     C = m.pattern.copy()
@@ -184,7 +188,7 @@ def rows_of_balance(m: Matrices, G: np.ndarray, omega: float) -> scipy.sparse.cs
 
 
 def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float) -> Balanced:
-    """Return the most probable motion for given moduli.
+    """Compute the most probable motion for given moduli.
 
     Args:
         m: result of `matrices`.
@@ -199,14 +203,14 @@ def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float)
 def likeliest(
     C: scipy.sparse.csr_array, B: np.ndarray, d: np.ndarray, sd: float, spread: np.ndarray | None = None
 ) -> Balanced:
-    """Return the most probable motion (U,) for which the equations with the matrix C (I, U) are in balance.
+    """Compute the most probable motion (U,) that fulfils the force balance with the matrix C (I, U).
 
     Args:
-        C: matrix of the equations of balance.
+        C: matrix of the force balance.
         B: covariance of the forces of the pressures, stored by diagonals.
         d: measured motion (U,) [m]; 0 where it was not measured.
         sd: standard deviation of real and imaginary part of one component [m].
-        spread: variance (U,) of the difference between each unknown and d, divided by sd^2. None means 1.
+        spread: variance (U,) of the difference between each unknown and d, divided by sd^2; None: 1.
     """
     CH = C.conj().T.tocsr()
     WCH = CH if spread is None else scipy.sparse.diags_array(spread) @ CH
@@ -216,7 +220,8 @@ def likeliest(
     if len(S) < len(B):
         S = np.pad(S, ((0, len(B) - len(S)), (0, 0)))
     S[: len(B)] += B
-    # A banded factorisation is faster here than a sparse one, whose factor would also fill the band.
+    # A banded factorisation is faster here than a sparse factorisation, because the sparse factor would also fill the
+    # band.
     factor = _factor_of_blocks(S)
     r = C @ d
     q = scipy.linalg.cho_solve_banded((factor, True), r, check_finite=False)
@@ -224,9 +229,9 @@ def likeliest(
 
 
 def _factor_of_blocks(S: np.ndarray) -> np.ndarray:
-    """Return L of S = L L^H, stored by diagonals. Uncoupled blocks, for example those of the parts of a body, are
-    factorised in parallel."""
-    gaps = np.flatnonzero(~S[1:2, :-1].any(axis=0))  # rows that are not coupled with the next one
+    """Return the Cholesky factor L of S = L L^H, stored by diagonals. Uncoupled blocks, for example the parts of a
+    body, are factorised in parallel."""
+    gaps = np.flatnonzero(~S[1:2, :-1].any(axis=0))  # rows that are not coupled with the next row
     ends = [k + 1 for k in gaps.tolist() if not _coupled_across(S, k)]
     blocks = [slice(a, b) for a, b in itertools.pairwise([0, *ends, S.shape[1]])]
     if len(blocks) == 1:
@@ -268,7 +273,7 @@ def gigabytes(body: VoxelBody) -> float:
 
 
 def by_modulus(m: Matrices, u: np.ndarray) -> scipy.sparse.csc_array:
-    """Return C' u: the derivatives (I, E) of C u with respect to the modulus of every element."""
+    """Return the derivatives (I, E) of the nodal forces C u with respect to the modulus of every element."""
     forces = np.einsum("arbse,bse->are", m.shear, u[m.unknowns], optimize=True)
     inside = m.rows >= 0
     element = np.broadcast_to(np.arange(m.rows.shape[-1]), m.rows.shape)

@@ -1,18 +1,19 @@
-"""Noise that is correlated between neighbouring voxels: how much larger it makes the errors of moduli than white noise.
+"""Noise that is correlated between neighbouring voxels. Estimate how much larger the errors of moduli are than for
+white noise.
 
 Scanners and filters smooth the data, so the noise of neighbouring voxels is correlated. Then the data contain fewer
-independent values, and the noise estimate from fourth differences contains only a part of the noise. The residual
-motion d - u (measured minus fitted) shows both effects. The residual is a projection of the noise, so even white noise
-leaves residuals with a small negative correlation between neighbours. Therefore random white noise and smoothed noise
-are projected in the same way. The comparison determines which width of a Gaussian filter gives the observed correlation
-along each axis, and which part of the noise is left in the residuals.
+independent values, and fourth differences show only a part of the noise. The residual motion d - u (measured minus
+fitted) shows both effects. The residual is a projection of the noise, so even white noise leaves residuals with a small
+negative correlation between neighbours. Therefore random white noise and smoothed noise are projected in the same way.
+The comparison shows which width of a Gaussian filter gives the observed correlation along each axis, and which fraction
+of the noise remains in the residuals.
 
-The error of a modulus is a sum over the voxels, v^H n / H, with the noise n, v = C^H S^-1 C' u and H = (C' u)^H S^-1
-C' u (`fitting.waves.balance`). So the variance for white noise is multiplied by
+The error of a modulus is the sum v^H n / H over the voxels, with the noise n, v = C^H S^-1 C' u and H = (C' u)^H S^-1
+C' u (the symbols are explained in `fitting.waves.balance`). So the variance for white noise is multiplied by
 
     sum_l R(l) sum_x conj(v(x)) v(x + l) / sum_x |v(x)|^2,
 
-where R(l) is the autocorrelation of the noise at the distance l, and x is a voxel.
+where R(l) is the autocorrelation of the noise for two voxels x and x + l.
 """
 
 from typing import NamedTuple
@@ -37,12 +38,12 @@ class Correlation(NamedTuple):
     """The correlation of the noise at one frequency, estimated from the residuals."""
 
     beyond: float  # largest correlation of neighbours along an axis, minus the correlation for white noise
-    seen: bool  # whether this difference is larger than a difference by chance
-    enlarged: np.ndarray  # (R,) error of each modulus, divided by its error for white noise with the given sd
+    seen: bool  # whether this difference is larger than expected from white noise
+    enlarged: np.ndarray  # (R,) error of each modulus / its error for white noise (with the given sd if `seen`)
 
 
 class _Projection(NamedTuple):
-    """The matrices of the most probable motion, and the voxels of the measured unknowns."""
+    """The matrix C of the force balance, the most probable motion, and the voxels of the nodes."""
 
     C: scipy.sparse.csr_array
     here: Balanced
@@ -53,13 +54,13 @@ class _Projection(NamedTuple):
         return 3 * len(self.voxel)
 
     def grid(self, values: np.ndarray) -> np.ndarray:
-        """Return nodal values (3 V,) as an array over the voxels (nx, ny, nz, 3), with 0 outside of the body."""
+        """Return nodal values (3 V,) as an array over the voxels (nx, ny, nz, 3), with 0 outside the body."""
         out = np.zeros((*(self.voxel.max(axis=0) + 1), 3), complex)
         out[tuple(self.voxel.T)] = values[: self.measured].reshape(-1, 3)
         return out
 
     def residual(self, noise: np.ndarray) -> np.ndarray:
-        """Return the residuals (nx, ny, nz, 3) if noise (nx, ny, nz, 3) is added to the most probable motion."""
+        """Return the residuals (nx, ny, nz, 3) of a fit to the most probable motion plus `noise` (nx, ny, nz, 3)."""
         n = np.zeros(self.C.shape[1], complex)
         n[: self.measured] = noise[tuple(self.voxel.T)].ravel()
         q = scipy.linalg.cho_solve_banded((self.here.factor, True), self.C @ n, check_finite=False)
@@ -72,7 +73,7 @@ def correlation(
     """Estimate the correlation of the noise from the residuals at the fitted moduli.
 
     Args:
-        C: matrix of the equations of balance (I, U) at these moduli.
+        C: matrix of the force balance (I, U) at these moduli.
         here: the most probable motion.
         columns: derivatives of C u with respect to the moduli (I, R).
         d: measured motion (3 V,) [m], x, y, z of a node together.
@@ -98,7 +99,7 @@ def correlation(
 
 
 def _mean_square(own: _Projection, values: np.ndarray) -> float:
-    """Return the mean square of real and imaginary parts over the measured components."""
+    """Return the mean square of the values' real and imaginary parts over the measured components."""
     return float(np.sum(np.abs(values) ** 2)) / (2 * own.measured)
 
 
@@ -110,8 +111,8 @@ def _of_neighbours(values: np.ndarray) -> np.ndarray:
 
 
 def _drawn(own: _Projection, width: float, draws: int) -> tuple[np.ndarray, float]:
-    """Return the correlation (3,) of neighbouring residuals, and the part of the noise that is left in the residuals,
-    for random noise that is smoothed with this width."""
+    """Simulate random noise that is smoothed by a Gaussian with this width [voxels]. Return the correlation (3,) of
+    neighbouring residuals, and the root mean square of the residuals divided by that of the noise."""
     rng, shape = np.random.default_rng(0), tuple(own.voxel.max(axis=0) + 1 + 2 * REACH)
     inside = (slice(REACH, -REACH),) * 3
     found, parts = [], []
@@ -136,7 +137,7 @@ def _filter(width: float) -> np.ndarray:
 
 def _enlargement(own: _Projection, column: np.ndarray, widths: np.ndarray) -> float:
     """Return the error of one modulus for noise smoothed with these widths (3,), divided by the error for white noise
-    with the same standard deviation at each node. Nodes of different parts of the body on the same voxel have the same
+    with the same standard deviation at each node. Nodes of different parts of the body at the same voxel have the same
     noise."""
     q = scipy.linalg.cho_solve_banded((own.here.factor, True), column, check_finite=False)
     each = (own.C.conj().T @ q)[: own.measured]

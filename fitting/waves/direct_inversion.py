@@ -1,13 +1,13 @@
 """The usual direct inversion of waves (algebraic Helmholtz inversion), for comparison with the balance of forces.
 
-Where the modulus G is uniform, the curl q of the displacement fulfils G laplace(q) = - density omega^2 q: taking the
-curl removes the pressure. Least squares over the three components and a window of voxels give
+Where the modulus G is uniform, the curl q of the displacement fulfils G laplace(q) = - density omega^2 q. The pressure
+does not occur in this equation. Least squares over the three components and a window of voxels give
 
     G = - density omega^2 sum(conj(laplace q) q) / sum(|laplace q|^2)
 
 (Oliphant et al. 2001, Magn. Reson. Med. 45, 299; Papazoglou et al. 2008, Phys. Med. Biol. 53, 3147). The denominator
-contains the square of the noise of laplace(q), so noise makes the modulus too small. A window over an edge mixes the
-moduli of both sides. Both errors of the method are well known. They are not corrected here.
+contains the square of the noise of laplace(q), so noise makes the modulus too small. In a window that contains an edge,
+the moduli of both sides are mixed. Both errors of the method are well known, and are not corrected here.
 """
 
 import math
@@ -25,8 +25,8 @@ WINDOW = 3
 
 
 def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, window: int = WINDOW) -> np.ndarray:
-    """Return the complex modulus (F, nx, ny, nz) [Pa]. The modulus is NaN outside of the mask, and near the edge of the
-    mask, where derivatives or smoothing need voxels outside.
+    """Return the complex modulus (F, nx, ny, nz) [Pa]. The modulus is NaN outside the mask, and also near the edge of
+    the mask, where derivatives or smoothing would need voxels outside the mask.
 
     Args:
         field: measured waves. If not all three components are measured, the result is NaN everywhere.
@@ -47,7 +47,7 @@ def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, windo
 
 def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.ndarray:
     inside = field.mask & np.all(np.isfinite(U), axis=-1)
-    # A derivative and a second difference reach one voxel each. The Gaussian reaches three standard deviations.
+    # A derivative and a second difference use one voxel more on each side. The Gaussian uses three standard deviations.
     reach = [2 + math.ceil(3 * smoothing)] * 3
     ends = [np.flatnonzero(inside.any(axis=tuple(b for b in range(3) if b != a))) for a in range(3)]
     widths = [0.0] * 3
@@ -73,8 +73,8 @@ def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.n
 
 
 def _smooth(u: np.ndarray, inside: np.ndarray, widths: list[float]) -> np.ndarray:
-    """Return the mean over the voxels inside, weighted by a Gaussian. `widths`: standard deviation of the Gaussian
-    along each axis [voxels]."""
+    """Return u, smoothed by a Gaussian. Only voxels in the mask `inside` are used. `widths`: standard deviation of the
+    Gaussian along each axis [voxels]."""
     known = np.where(inside, u, 0.0)
     if not any(widths):
         return known
@@ -84,7 +84,8 @@ def _smooth(u: np.ndarray, inside: np.ndarray, widths: list[float]) -> np.ndarra
 
 
 def _second(q: np.ndarray, axis: int, h: float) -> np.ndarray:
-    """Return the second difference along an axis divided by h^2; it is 0 at the ends of the axis."""
+    """Return the second derivative of q along an axis, from differences with the spacing h. It is 0 at the ends of the
+    axis."""
     out = np.zeros_like(q)
     rows, to = np.moveaxis(q, axis, 0), np.moveaxis(out, axis, 0)
     to[1:-1] = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / h**2

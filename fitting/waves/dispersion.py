@@ -1,5 +1,5 @@
-"""Read phase velocities of shear waves at several frequencies from files, with or without attenuation. Such data come
-for example from ultrasound."""
+"""Read phase velocities of shear waves at several frequencies from files, with or without attenuation. Such data are
+measured for example with ultrasound."""
 
 import os
 import re
@@ -29,7 +29,7 @@ FEWEST = 3
 
 
 class Dispersion(NamedTuple):
-    """Shear waves of a material in SI units, sorted by frequency."""
+    """Phase velocity and attenuation of shear waves in a material, in SI units and sorted by frequency."""
 
     angular_frequency: np.ndarray  # (n,) [rad/s]
     velocity: np.ndarray  # (n,) [m/s]
@@ -40,7 +40,7 @@ class Dispersion(NamedTuple):
 
     @property
     def resolved(self) -> tuple[float, float]:
-        """Shortest and longest relaxation time [s] that the data at these frequencies can determine."""
+        """Shortest and longest relaxation time [s] that data at these frequencies can determine."""
         return float(1 / self.angular_frequency[-1]), float(1 / self.angular_frequency[0])
 
     @property
@@ -50,13 +50,14 @@ class Dispersion(NamedTuple):
 
     @property
     def scales(self) -> np.ndarray:
-        """Values of smooth curves through the measured values. Relative errors are errors divided by these values."""
+        """Values of smooth curves through the measured values. Relative errors are errors divided by these smooth
+        values."""
         columns = [self.velocity] if self.attenuation is None else [self.velocity, self.attenuation]
         return np.concatenate([smooth_curve(self.angular_frequency, column) for column in columns])
 
 
 def names_velocities(path: str | os.PathLike) -> bool:
-    """Return whether a line of the file names a frequency and a velocity."""
+    """Return whether the file has a header line with a frequency and a velocity."""
     return _header(text_of(Path(path), "shear waves").splitlines()) is not None
 
 
@@ -68,7 +69,7 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
         density: density of the material [kg/m^3]. If it is None, `DENSITY` is used, and a note is added.
 
     Raises:
-        InputError: the file cannot be used; the message names the file, the line or column, the value and the remedy.
+        InputError: the file cannot be used; the message states the file, the line or column, the value and what to do.
     """
     lines = text_of(Path(path), "shear waves").splitlines()
     header = _header(lines)
@@ -84,7 +85,7 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
             raise InputError(f"{path}: {quantity} {values[bad[0]]:g} must be above 0: correct or remove this row")
     if len(np.unique(columns["frequency"])) < FEWEST:
         raise InputError(
-            f"{path}: {len(order)} rows of numbers are below the header: give at least {FEWEST} different frequencies"
+            f"{path}: {len(order)} rows of numbers follow the header: give at least {FEWEST} different frequencies"
         )
     return Dispersion(
         columns["frequency"],
@@ -97,7 +98,7 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
 
 
 def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispersion:
-    """Return the waves at frequencies from `low` to `high` [Hz]. A note states how many waves are left out.
+    """Return the waves at frequencies from `low` to `high` [Hz]. A note states how many waves are ignored.
 
     Raises:
         InputError: fewer than `FEWEST` frequencies are left.
@@ -115,7 +116,7 @@ def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispers
             "are needed: widen the band"
         )
     attenuation = None if waves.attenuation is None else waves.attenuation[kept]
-    note = f"{np.sum(~kept)} waves outside of the given frequency band are left out"
+    note = f"{np.sum(~kept)} waves outside of the given frequency band are ignored"
     return waves._replace(
         angular_frequency=waves.angular_frequency[kept],
         velocity=waves.velocity[kept],
@@ -140,8 +141,8 @@ def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | N
 
 
 def _quantity_named(cell: str) -> tuple[str, str] | None:
-    """Return quantity and unit of a heading, for example "Phase velocity (m/s)" or "attenuation_Np/m"; None if the
-    heading is not known."""
+    """Return quantity and unit of a heading, for example "Phase velocity (m/s)" or "attenuation_Np/m". Return None if
+    the heading is not known."""
     parts = re.match(r'^"?([^\[(]*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?"?$', cell.strip())
     if parts is None:
         return None

@@ -1,10 +1,11 @@
 """Positions of the edges of labels between the voxels, and the uncertainty of these positions.
 
-The labels give one region for each whole voxel. From smoothed labels the volume of a region is known, but
-the position of its edge has an error of a fraction of a voxel. For circles of 2.5 to 8 voxels, the mean radius is wrong
-by 0.05 to 0.1 voxels. The local position of the edge is wrong by another 0.13 voxels, with a correlation length of 1.6
-voxels. This changes the modulus of a stiff cylinder of 5 voxels by 3 to 4 % (`tests/test_wave_edges.py`). So the edges
-are divided into patches, and the outward shift of each patch is an unknown of the fit.
+The labels give one region for each whole voxel. Smoothed labels give the volume of a region, but the position of the
+edge has an error of a fraction of a voxel. For circles with a radius of 2.5 to 8 voxels, the error of the mean radius
+is 0.05 to 0.1 voxels. In addition, the local position of the edge has an error with a standard deviation of 0.13 voxels
+and a correlation length of 1.6 voxels. These errors change the modulus of a stiff cylinder with a radius of 5 voxels by
+3 to 4 % (`tests/test_wave_edges.py`). So the edges are divided into patches, and the outward shift of each patch is an
+unknown of the fit.
 """
 
 from typing import NamedTuple
@@ -14,16 +15,16 @@ from scipy import ndimage
 
 from fitting.waves.voxels import VoxelBody
 
-#: Standard deviation of the Gaussian that smooths the steps of labels [voxels].
+#: Standard deviation [voxels] of the Gaussian that smooths the labels.
 SMOOTHING = 1.4
 #: Number of parts into which each side of a voxel is divided when volumes are computed.
 FINE = 4
-#: Shift of the edges [voxels] in the finite difference that gives the derivative with respect to their position.
+#: Shift of the edges [voxels] in the finite difference for derivatives with respect to the position of the edges.
 FARTHER = 0.1
-#: Side of a patch, and maximum distance between an edge and a node of a cut element [voxels].
+#: SIDE: side of a patch. REACH: maximum distance between an edge and a node of a cut element (both in voxels).
 SIDE, REACH = 2.0, 2.0
-#: Standard deviation of the position of a whole edge (rounding to a voxel), standard deviation of its patches, and
-#: correlation length of the patches [voxels].
+#: WHOLE: standard deviation of the position of a whole edge (rounding to a voxel). PATCH, ALIKE: standard deviation and
+#: correlation length of the positions of the patches (all in voxels).
 WHOLE, PATCH, ALIKE = 1 / np.sqrt(12), 0.13, 1.6
 
 
@@ -31,11 +32,11 @@ class Patches(NamedTuple):
     """P patches of the edges of regions."""
 
     region: np.ndarray  # (P,) index of the region to which the edge belongs
-    centre: np.ndarray  # (P, 3) [voxels]
+    centre: np.ndarray  # (P, 3) centre of each patch [voxels]
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (P, P) [voxels^2] of the outward shifts of the patches, from the labels alone."""
+        """Prior covariance (P, P) [voxels^2] of the outward shifts of the patches, before the waves are used."""
         apart = np.sum((self.centre[:, None] - self.centre[None]) ** 2, axis=-1)
         same = self.region[:, None] == self.region[None]
         return np.asarray(same * (WHOLE**2 + PATCH**2 * np.exp(-0.5 * apart / ALIKE**2)))
@@ -50,14 +51,15 @@ NO_PATCHES = Patches(np.zeros(0, int), np.zeros((0, 3)))
 
 
 def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: float = 0.0) -> np.ndarray:
-    """Return the smoothed indicator functions s_k (R, V) of the labels `known` (R,) at the nodes.
+    """Return the smoothed indicator function s_k (R, V) of each label in `known` (R,), at the nodes.
 
-    With a Gaussian filter g, the smoothed function is 2 g - g g, which hardly moves curved edges. A constant is added,
-    so that each region keeps the volume of its label.
+    An indicator function is 1 inside the region and 0 outside. It is smoothed by the filter 2 g - g g with a Gaussian
+    filter g, because this filter hardly moves curved edges. A constant is added, so that the volume of each region is
+    the volume of its label.
 
     Args:
         labels: label of each voxel (nx, ny, nz).
-        body: labels are used only at the voxels of this body. Every other voxel gets the nearest of these labels.
+        body: only labels at the voxels of this body are used. Every other voxel gets the nearest of these labels.
         known: the R labels that occur in the body.
         farther: distance [voxels] by which the edges of all regions except the largest are moved outwards.
     """
@@ -87,8 +89,8 @@ def _smoothed(place: np.ndarray) -> np.ndarray:
 
 
 def _level(above: np.ndarray, place: np.ndarray, count: int) -> float:
-    """Return the constant to add to a field near a label, so that the volume with a positive field is the volume of
-    the label."""
+    """Return the constant that must be added to the field `above` near a label. With this constant, the volume where
+    the field is positive is the volume of the label (`count` voxels)."""
     reach = ndimage.find_objects(place.astype(int))[0]
     box = tuple(slice(max(0, r.start - 2), r.stop + 2) for r in reach)
     # Values at several points within each voxel, by linear interpolation between the centres of the voxels.
@@ -101,10 +103,10 @@ def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patch
     """Return the patches of the edges near given nodes, and the index of the nearest patch for each node (V,). The
     index is -1 for nodes that are not given.
 
-    The largest region has no patches, because its edges are already the edges of the other regions.
+    The largest region has no patches, because its edges are also edges of the other regions.
 
     Args:
-        s: result of `places` (R, V).
+        s: smoothed indicator functions (R, V) from `places`.
         body: the body of the nodes.
         nodes: indices of the nodes of cut elements.
     """
@@ -127,8 +129,8 @@ def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patch
 
 
 def _feet(above: np.ndarray, body: VoxelBody) -> np.ndarray:
-    """Return for each node the nearest point (V, 3) [voxels] with a field value of zero. The point is estimated from
-    the nodal values (V,) and the gradient of the field, and is at most `REACH` away from the node."""
+    """Return for each node the nearest point (V, 3) [voxels] where the field `above` is zero. The point is estimated
+    from the nodal values (V,) and the gradient of the field. Its distance from the node is at most `REACH`."""
     first = body.voxel.min(axis=0)
     at = tuple((body.voxel - first).T)
     grid, known = np.zeros(np.ptp(body.voxel, axis=0) + 1), np.zeros(np.ptp(body.voxel, axis=0) + 1, bool)

@@ -1,4 +1,5 @@
-"""Regions with edges inside the elements. At an edge the displacement has a kink and the pressure has a jump.
+"""Equations for regions with edges inside the elements. At an edge the displacement has a kink and the pressure has a
+jump.
 
 At an edge between two materials, displacement and traction are continuous, but strain and pressure are not. The
 displacement within a quadratic element cannot have a kink. So a standard element at an edge is too stiff, and the
@@ -7,11 +8,11 @@ shape function L_i psi for each of its corners i. L_i is the linear shape functi
 
     psi = sum_a N_a max_k s_k(x_a) - max_k sum_a N_a s_k(x_a).
 
-N_a is the quadratic shape function of node a, x_a is the position of this node, and s_k is the smoothed indicator
-function of region k. Psi is continuous, has a kink at the edges and is zero at all nodes (extended finite elements:
-Moes et al. 2003, Comput. Methods Appl. Mech. Eng. 192, 3163). So the displacements of the nodes are still the
-displacements of their voxels. The amplitudes of the kinks are unknowns without a measured value. Every point has the
-modulus and the pressure of its side of the edge.
+N_a is the quadratic shape function of node a, and x_a is the position of this node. s_k is the indicator function of
+region k after smoothing: about 1 inside the region and about 0 outside. Psi is continuous, has a kink at the edges and
+is zero at all nodes (extended finite elements: Moes et al. 2003, Comput. Methods Appl. Mech. Eng. 192, 3163). So the
+displacements of the nodes are still the displacements of their voxels. The amplitudes of the kinks are unknowns without
+a measured value. Every point has the modulus and the pressure of the region in which it lies.
 """
 
 from typing import NamedTuple
@@ -25,8 +26,8 @@ from fitting.waves.edge_places import NO_PATCHES, Patches, patches_of
 from fitting.waves.voxels import VoxelBody
 from liverjax.mesh.adjacency import PAIRS
 
-#: HALVINGS: number of times that the sides of cut elements are halved; in each resulting part, edges are planes.
-#: CHUNK: number of elements that are computed at once.
+#: HALVINGS: number of times that the sides of cut elements are halved; in each of the resulting small tetrahedra, edges
+#: are planes. CHUNK: number of elements that are computed at once.
 HALVINGS, CHUNK = 3, 60
 
 
@@ -34,14 +35,14 @@ class RegionMatrices(NamedTuple):
     """Matrices for the balance of forces with R regions.
 
     There are U unknowns: the 3 V displacements of the nodes, then the amplitudes of the kinks. C (I, U) is the matrix
-    of the balance, as in `fitting.waves.balance`.
+    of the force balance (see `fitting.waves.balance`).
     """
 
     stiffness: np.ndarray  # (R, N) entries of C for a shear modulus of 1 Pa in each region
     mass: np.ndarray  # (N,) entries of C that are multiplied by -omega^2
     pattern: scipy.sparse.csr_array  # (I, U): positions of these entries
     forces: scipy.sparse.csr_array  # (I, P) nodal forces of the pressures, which have the same large variance
-    pressure: np.ndarray  # covariance of these forces, stored as in `Matrices`
+    pressure: np.ndarray  # covariance of these forces, stored as `Matrices.pressure`
     kinks: int  # number of unknowns of the kinks, which are not measured
     patches: Patches
     patch: np.ndarray  # (I,) index of the nearest patch for each row of C, -1 for rows away from cut elements
@@ -53,16 +54,16 @@ class RegionMatrices(NamedTuple):
         return 2 * (self.forces.shape[0] - int(np.sum(np.diff(self.forces.tocsc().indptr) > 0)) - self.kinks)
 
     def rows(self, G: np.ndarray, omega: float) -> scipy.sparse.csr_array:
-        """Return C (I, U) for moduli G (R,) [Pa] at an angular frequency [rad/s]."""
+        """Return the matrix C (I, U) of the force balance for moduli G (R,) [Pa] at an angular frequency [rad/s]."""
         return self._filled(G @ self.stiffness - omega**2 * self.mass)
 
     def by_moduli(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivatives (I, R) of C u with respect to the moduli."""
+        """Return the derivatives (I, R) of the nodal forces C u with respect to the moduli."""
         return np.stack([self._filled(own) @ u for own in self.stiffness], axis=1)
 
     def by_edges(self, here: balance.Balanced, G: np.ndarray, omega: float) -> np.ndarray:
-        """Return the derivatives (I, P) of C u - B p with respect to the outward shift [voxels] of each of the P
-        patches of the edges."""
+        """Return the derivatives (I, P) of the unbalanced forces with respect to the outward shift [voxels] of each of
+        the P patches of the edges."""
         out = np.zeros((len(self.patch), len(self.patches.region)), complex)
         if self.farther is not None:
             p = self.forces.T @ here.multipliers
@@ -79,12 +80,12 @@ class RegionMatrices(NamedTuple):
 class _CutElements(NamedTuple):
     """K elements with n shape functions each, or the parts of these elements that lie in one region."""
 
-    region: np.ndarray  # (K,)
+    region: np.ndarray  # (K,) index of the region
     functions: np.ndarray  # (K, n) indices of the shape functions
     shear: np.ndarray  # (K, n, 3, n, 3) for a shear modulus of 1 Pa
     mass: np.ndarray  # (K, n, n) for a density of 1
     corners: np.ndarray  # (K, 4) node numbers of the corners
-    divergence: np.ndarray  # (K, n, 3, 4): integrals of the divergence times the linear shape functions of the corners
+    divergence: np.ndarray  # (K, n, 3, 4) integrals of the divergence times linear shape functions of the corners
 
 
 def region_matrices(
@@ -93,10 +94,10 @@ def region_matrices(
     """Return the matrices for the balance of forces with R regions.
 
     Args:
-        m, body: the result of `balance.matrices`, and the body for which it was computed.
+        m, body: the result of `balance.matrices`, and the body for which this result was computed.
         density: [kg/m^3].
-        s: result of `edge_places.places` (R, V).
-        farther: result of `edge_places.places` with edges moved outwards by `edge_places.FARTHER`.
+        s: smoothed indicator functions (R, V) from `edge_places.places`.
+        farther: the same functions with edges moved outwards by `edge_places.FARTHER`.
     """
     nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
     both = [s] if farther is None else [s, farther]
@@ -126,8 +127,8 @@ def _nodes_of_elements(body: VoxelBody) -> np.ndarray:
 
 
 def _numbers_of_rows(body: VoxelBody, kinked: np.ndarray) -> np.ndarray:
-    """Return the row of C for each unknown, -1 for unknowns without a row. The rows have the order of
-    `balance.by_part_and_slice`."""
+    """Return the number of the row of C for each unknown, or -1 for unknowns without a row. The order of the rows is
+    that of `balance.by_part_and_slice`."""
     inner, hidden = np.flatnonzero(body.inner), np.flatnonzero(body.inner[kinked])
     at = np.concatenate([inner, kinked[hidden]])
     functions = np.concatenate([inner, len(body.inner) + hidden])
@@ -153,7 +154,8 @@ def _whole_parts(m: Matrices, body: VoxelBody, region: np.ndarray, chosen: np.nd
 
 
 def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarray) -> list[_CutElements]:
-    """Return the parts of the cut elements in each region, one entry for each region and chunk of elements."""
+    """Return the parts of the cut elements that lie in each region. The list has one entry for each region and chunk of
+    elements."""
     corners = _equal_parts(HALVINGS)  # (Q, 4, 4)
     lam = corners.mean(axis=1)
     N, dN = _quadratic_functions(lam)
@@ -171,7 +173,7 @@ def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarr
         functions = np.concatenate([nodes[:, chunk].T, hidden[tets[chunk]]], axis=1)
         weights = _parts_by_region(at) * np.asarray(body.linear.volumes)[chunk, None] / len(lam)
         for region, weight in zip(there, weights, strict=True):
-            # In this region, psi is the interpolated maximum minus the indicator function of this region.
+            # In this region, psi is the interpolated maximum of all s_k minus the function s_k of this region.
             above = highest - own[region]  # (10, K)
             psi = np.einsum("ak,qa->kq", above, N)
             slope = np.einsum("ak,kqaj->kqj", above, plain)
@@ -183,8 +185,8 @@ def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarr
 
 
 def _parts_by_region(at: np.ndarray) -> np.ndarray:
-    """Return for each of R linear functions the volume fraction (R, ...) of each tetrahedron in which this function is
-    the largest. `at` (R, ..., 4): values of the functions at the corners."""
+    """Return volume fractions (R, ...) of tetrahedra: the fraction of each tetrahedron in which each of R linear
+    functions is the largest. `at` (R, ..., 4): values of the functions at the corners."""
     if len(at) == 1:
         return np.ones(at.shape[:-1])
     out = []
@@ -201,7 +203,7 @@ def _parts_by_region(at: np.ndarray) -> np.ndarray:
 def _integrals(
     values: np.ndarray, gradients: np.ndarray, lam: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return shear stiffness, mass and divergence of shape functions, as in `_CutElements`.
+    """Return the arrays `shear`, `mass` and `divergence` of `_CutElements`.
 
     Args:
         values: values (K, Q, n) of the shape functions at Q points.
@@ -212,15 +214,15 @@ def _integrals(
     K, Q, n = values.shape
     flat = gradients.reshape(K, Q, 3 * n)
     D = np.matmul(np.swapaxes(flat * weights[..., None], 1, 2), flat).reshape(K, n, 3, n, 3)
-    # Double contraction of twice the deviatoric strain with the strain.
+    # Twice the deviatoric strain of one shape function, contracted with the strain of another.
     shear = np.einsum("ik,eajbj->eaibk", np.eye(3), D) + np.einsum("eakbi->eaibk", D) - 2 / 3 * D
     mass = np.matmul(np.swapaxes(values * weights[..., None], 1, 2), values)
     return shear, mass, np.einsum("kq,qv,kqaj->kajv", weights, lam, gradients, optimize=True)
 
 
 def _with_forces(parts: list[_CutElements], kinks: int, nodes: int) -> np.ndarray:
-    """Return for each kink function (kinks,) whether it differs from zero. If an edge meets an element only at a node,
-    the kink function is zero."""
+    """Return for each kink function whether it differs from zero (kinks,). It is zero if the edge meets an element only
+    at a node."""
     size = np.zeros(kinks)
     for p in parts:
         np.add.at(size, p.functions[:, 10:] - nodes, np.einsum("eaibi->eab", p.shear)[:, range(10, 14), range(10, 14)])
@@ -235,7 +237,7 @@ def _renumbered(p: _CutElements, alive: np.ndarray, nodes: int) -> _CutElements:
 
 
 def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: float) -> RegionMatrices:
-    """Return the sum of the matrices of all parts. `rows` (U,): row of C for each unknown."""
+    """Return the assembled matrices of all parts. `rows` (U,): row of C for each unknown."""
     I, U = int(rows.max()) + 1, len(rows)
     known, ends, at = _pattern(parts, rows)
     stiffness, mass = np.zeros((R, len(known))), np.zeros(len(known))
@@ -258,8 +260,8 @@ def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: 
 def _pattern(
     parts: list[_CutElements], rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the sparsity pattern: sorted keys of the entries, ends of the rows, and for each part which of its entries
-    exist and the positions of these entries."""
+    """Return the sparsity pattern of C: sorted keys of the matrix entries, ends of the rows, and for each part (which
+    of its entries exist, positions of these entries)."""
     keys, insides, U = [], [], len(rows)
     for p in parts:
         unknowns, lines = _unknowns_and_rows(p, rows)
@@ -273,8 +275,8 @@ def _pattern(
 
 
 def _unknowns_and_rows(p: _CutElements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices (K, n, 3) of the unknowns of the shape functions, and the rows of these unknowns. An index is
-    -1 if there is no such unknown or row."""
+    """Return the indices (K, n, 3) of the unknowns of the shape functions, and the rows (K, n, 3) of C for these
+    unknowns. An index is -1 if this unknown or row does not exist."""
     unknowns = np.where(p.functions[..., None] < 0, -1, 3 * p.functions[..., None] + np.arange(3))
     return unknowns, np.where(unknowns < 0, -1, rows[unknowns])
 
@@ -319,7 +321,7 @@ def _rule_of_four() -> np.ndarray:
 
 
 def _equal_parts(halvings: int) -> np.ndarray:
-    """Return the barycentric coordinates (8^halvings, 4, 4) of the corners of equal parts of a tetrahedron."""
+    """Divide a tetrahedron into equal parts. Return the barycentric coordinates (8^halvings, 4, 4) of their corners."""
     parts = [np.eye(4)]
     for _ in range(halvings):
         parts = [part for t in parts for part in _split_in_eight(t)]
@@ -327,7 +329,7 @@ def _equal_parts(halvings: int) -> np.ndarray:
 
 
 def _split_in_eight(t: np.ndarray) -> list[np.ndarray]:
-    """Return the corners (4, 4) of the eight parts of a tetrahedron with corners (4, 4)."""
+    """Divide a tetrahedron with corners (4, 4) into eight parts. Return the corners (4, 4) of each part."""
     middle = {pair: 0.5 * (t[pair[0]] + t[pair[1]]) for pair in PAIRS}
     ab, ac, ad, bc, bd, cd = (middle[pair] for pair in PAIRS)
     a, b, c, d = t

@@ -1,4 +1,4 @@
-"""Moduli of an organ and of its regions from measured waves, and the input for a map of the modulus."""
+"""Compute the moduli of an organ and of its regions from measured waves, and the input for a map of the modulus."""
 
 import itertools
 from collections.abc import Callable
@@ -18,19 +18,19 @@ from liverjax.core.errors import InputError
 
 __all__ = ["Found", "Organ", "body_of", "gigabytes", "organ_of", "plane_wave_biases", "problem_of_map", "regions_of"]
 #: DIRECTIONS: the D directions of plane waves, from a voxel to its neighbours. Only one of two opposite directions is
-#: used. SHARPNESS: exponent of the weights of the directions. A large exponent gives a weight only to directions close
-#: to those of the measured waves.
+#: used. SHARPNESS: exponent of the weights of the directions. With a large exponent, only directions close to those of
+#: the measured waves have a weight.
 DIRECTIONS = tuple(n for n in itertools.product((1, 0, -1), repeat=3) if n > (0, 0, 0))
 SHARPNESS = 4
 
 
-#: Minimum number of equations at one frequency after the number of unknown pressures is subtracted. Two values (storage
-#: and loss modulus) must be determined from noisy data.
+#: Minimum number of equations at one frequency, minus the number of unknown pressures. These equations must determine
+#: two values (storage and loss modulus) from noisy data.
 FEWEST_BALANCES = 10
 
 
 class Organ(NamedTuple):
-    """Measured waves of an organ, with the elements on the measured voxels and their equations."""
+    """Measured waves of an organ, the elements on the measured voxels, and the matrices of these elements."""
 
     field: WaveField
     body: VoxelBody
@@ -40,21 +40,23 @@ class Organ(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Fitted moduli of an organ, and the relative errors that the elements cause in these moduli (mesh bias)."""
+    """Fitted moduli of an organ, and the relative errors of these moduli that are due to the finite elements (mesh
+    bias)."""
 
     whole: Regions  # fit with one region
     labels: np.ndarray | None  # (R,) label of each region
     parts: Regions | None  # fit with R regions
     mesh_bias: np.ndarray  # (F,) complex mesh bias of `whole`: weighted mean over plane waves
-    bias_left: np.ndarray  # (F, 2 D) contribution of each of these waves to the uncertainty of this mean
+    # (F, 2 D) contribution of each of the 2 D plane waves (D directions, two polarisations) to the error of this mean
+    bias_left: np.ndarray
     parts_bias: np.ndarray | None = None  # (F, R) mesh bias of `parts`
-    parts_bias_left: np.ndarray | None = None  # (F, R, 2 D) contributions to its uncertainty
+    parts_bias_left: np.ndarray | None = None  # (F, R, 2 D) contributions to the uncertainty of `parts_bias`
 
 
 def body_of(field: WaveField, side: int | None = None) -> VoxelBody:
     """Return the body of elements on the voxels that are measured and in the mask.
 
-    The body is divided into parts of at most `side` bricks along each axis. If `side` is None, it has one part.
+    The body is divided into parts of at most `side` bricks along each axis. If `side` is None, the body is not divided.
 
     Raises:
         InputError: there are too few such voxels, or the displacements have fewer than three components.
@@ -68,8 +70,8 @@ def body_of(field: WaveField, side: int | None = None) -> VoxelBody:
     return voxels.voxel_body(field.mask & np.all(measured, axis=-1), field.spacing, field.origin, side)
 
 
-#: Maximum number of bricks along the side of a part: the values are tried in this order. Larger parts would take much
-#: longer to factorise. In smaller parts, most of the equations would be lost at the faces between the parts.
+#: Maximum numbers of bricks along the side of a part, which are tried in this order. The factorisation of larger parts
+#: would need much more time. In smaller parts, most of the equations would be lost at the faces between the parts.
 SIDES = (8, 7, 6)
 
 
@@ -92,8 +94,8 @@ GAPS = 0.8
 
 
 def notes_on_gaps(field: WaveField) -> list[str]:
-    """Return a note if voxels without displacement within the organ remove many elements. An element exists only if
-    all 27 voxels of its brick are measured."""
+    """Return a note if many elements are missing because voxels within the organ have no displacement. An element
+    exists only if all 27 voxels of its brick are measured."""
     inside = field.mask & np.isfinite(field.displacement).all(axis=(0, 4))
     whole = scipy.ndimage.binary_fill_holes(inside)
     left, most = voxels.number_of_bricks(inside), voxels.number_of_bricks(whole)
@@ -101,8 +103,8 @@ def notes_on_gaps(field: WaveField) -> list[str]:
         return []
     return [
         f"{int((whole & ~inside).sum())} voxels within the organ have no displacement or are not in the mask, so only "
-        f"{100 * left / most:.2g} % of the elements are left: interpolate single missing voxels from their neighbours "
-        "to reduce the errors"
+        f"{100 * left / most:.2g} % of the elements are left: to reduce the errors, interpolate single missing voxels "
+        "from their neighbours"
     ]
 
 
@@ -111,8 +113,8 @@ LEFT_OUT = 0.1
 
 
 def notes_on_layers(field: WaveField) -> list[str]:
-    """Return a note if many voxels lie beyond the last brick along an axis. A brick is two voxel spacings long, so the
-    last of an even number of voxels is in no brick."""
+    """Return a note if many voxels lie behind the last brick along an axis. A brick is two voxel spacings long. So if
+    the number of voxels is even, the last voxel is in no brick."""
     inside = field.mask & np.isfinite(field.displacement).all(axis=(0, 4))
     box = scipy.ndimage.find_objects(inside.astype(int))[0]
     odd = tuple(slice(0, n - 1 + n % 2) for n in inside[box].shape)
@@ -122,21 +124,21 @@ def notes_on_layers(field: WaveField) -> list[str]:
         return []
     return [
         f"{every - kept} of {every} voxels are in no element. An element needs 3 voxels along an axis and shares the "
-        f"last one with the next element, so the last layer along {', '.join(axes)} is left out: measure an odd "
+        f"last one with the next element, so the last layer along {', '.join(axes)} is ignored: measure an odd "
         "number of voxels"
     ]
 
 
 def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
-    """Return the organ of a wave field, with the equations of its body. `density` is in kg/m^3."""
+    """Return the measured waves of a field together with the body and its matrices. `density` is in kg/m^3."""
     motion = field.displacement[(slice(None), *body.voxel.T)]
     omega = 2 * np.pi * field.frequencies
     waves = MeasuredWaves(omega, motion.reshape(len(omega), -1), np.maximum(field.noise, 1e-9 * np.abs(motion).max()))
     m = balance.matrices(body, density)
     if m.balances < FEWEST_BALANCES:
         raise InputError(
-            f"the {len(body.voxel)} measured voxels of the mask give {max(0, m.balances)} equations, without those for "
-            f"the unknown pressures. At least {FEWEST_BALANCES} are needed: give a larger mask or a smaller --stride"
+            f"the {len(body.voxel)} measured voxels of the mask give {max(0, m.balances)} equations more than unknown "
+            f"pressures. At least {FEWEST_BALANCES} are needed: give a larger mask or a smaller --stride"
         )
     return Organ(field, body, m, waves, density)
 
@@ -173,16 +175,17 @@ def regions_of(
     return Found(whole, known, parts, bias, left, *_biases(organ, parts.modulus))
 
 
-#: The mesh bias is nearly proportional to the square of the wave number, so inversely proportional to the modulus. The
-#: scaled bias of one modulus is therefore used for moduli that are larger by less than this factor.
+#: The mesh bias is nearly proportional to the square of the wave number, so nearly inversely proportional to the
+#: modulus. Therefore the bias that was computed for one modulus is scaled and used for moduli that are larger by less
+#: than this factor.
 ALIKE = 1.15
 
 
 def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the relative error that the elements cause in moduli (F, R).
+    """Return the mesh bias of moduli (F, R), the relative error due to the finite elements, and its uncertainty.
 
-    The first result is the mean (F, R) over plane waves. The second result (F, R, 2 D) contains the contributions of
-    these waves to the uncertainty of the mean.
+    The result is (mean, left): mean (F, R) is the mean bias over plane waves; left (F, R, 2 D) contains the
+    contribution of each of these waves to the uncertainty of the mean.
     """
     bias, left = np.zeros(moduli.shape, complex), np.zeros((*moduli.shape, 2 * len(DIRECTIONS)), complex)
     for f, strength in enumerate(waves_of_field(organ.field)):
@@ -193,7 +196,7 @@ def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 each, weights = plane_wave_biases(G, organ.waves.omega[f], organ, strength)
                 known, mean = abs(G), each @ weights
             bias[f, r] = mean * known / abs(G)
-            # The uncertainty of the mean is the root of the sum of the squares of these contributions.
+            # The uncertainty of the mean is the square root of the sum of squares of these contributions.
             left[f, r] = weights * (each - mean) * known / abs(G)
     return bias, left
 
@@ -204,8 +207,8 @@ def _uniform(m: Matrices, body: VoxelBody, density: float) -> edges.RegionMatric
 
 
 def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.Course:
-    """Return the input of `stiffness_map.map_of`: a map relative to the moduli of the whole organ, with a prior of this
-    correlation length [m]."""
+    """Return the input of `stiffness_map.map_of`, for a map relative to the moduli of the whole organ. `length` [m]:
+    correlation length of the prior."""
     return stiffness_map.course_of(organ.body, organ.matrices, organ.waves, found.whole.modulus[:, 0], length)
 
 
@@ -224,10 +227,10 @@ def plane_waves() -> list[tuple[np.ndarray, np.ndarray]]:
 def waves_of_field(field: WaveField) -> np.ndarray:
     """Return the relative energies (F, 2 D) of `plane_waves` in the displacement. The sum at each frequency is 1.
 
-    The energy of a direction n is the sum over the axes a of n_a^2 times the mean squared derivative along axis a, to
-    the power `SHARPNESS`. This energy is divided between the two waves in proportion to the squared derivatives of the
-    components along their polarisations. Derivatives are differences between neighbours, and the contribution of the
-    noise is subtracted.
+    The energy of a direction n is (sum over the axes a of n_a^2 times the mean squared derivative along axis a) to the
+    power `SHARPNESS`. This energy is divided between the two waves of this direction, in proportion to the squared
+    derivatives of the displacement along their polarisations. Derivatives are differences between neighbours, and the
+    contribution of the noise is subtracted.
     """
     waves = plane_waves()
     rows = []
@@ -249,13 +252,14 @@ def waves_of_field(field: WaveField) -> np.ndarray:
 
 
 def plane_wave_biases(G: complex, omega: float, organ: Organ, strength: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the relative errors (2 D,) of moduli that are fitted to `plane_waves` without noise, and weights (2 D,).
+    """Return the relative errors (2 D,) of the moduli that are fitted to each of `plane_waves` without noise, and
+    weights (2 D,) of these waves.
 
-    The errors come from the elements. A weight is the strength of a wave times the information of the wave about the
-    modulus. The weighted mean of the errors is the error of one modulus that is fitted to all waves.
+    The errors are due to the finite elements. A weight is the energy of a wave times the information about the modulus
+    in this wave. The weighted mean of the errors is the error of one modulus that is fitted to all waves.
 
-    An error is one Gauss-Newton step from the true modulus. The step is computed in the body of the organ, because the
-    surface and the holes of the body add to the error of the elements.
+    An error is one Gauss-Newton step from the true modulus. The step is computed for the elements of the organ, because
+    the surface and the holes of the body increase the error.
 
     Args:
         G: modulus [Pa].

@@ -1,4 +1,4 @@
-"""Store the moduli of regions in a file, so that an interrupted run can continue without a new search for them."""
+"""Store the moduli of regions in a file. Then an interrupted run can continue without computing these moduli again."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,18 +12,18 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.versions import versions
 
-#: A function of `name` and `find`. It returns the regions that are stored under this name. If there are none, it
-#: returns the result of `find`.
+#: A function (name, find) -> regions. It returns the regions that are stored under this name. If there are none, it
+#: calls `find`, stores the result and returns it.
 Keep = Callable[[str, Callable[[], Regions]], Regions]
 _NUMBERS = tuple(name for name in Regions._fields if name != "correlations")
 
 
 def kept_in(file: Path, resume: bool, marks: dict[str, object]) -> Keep:
-    """Return a function that stores the regions of an organ in `file`, under their names.
+    """Return a function `Keep` that stores the regions of an organ in `file`, each under its name.
 
     Args:
-        file: HDF5 file, written each time new regions are found. It is written completely or not at all.
-        resume: whether regions that are already in the file are used. Otherwise a new file is made.
+        file: HDF5 file. It is written each time new regions are found, completely or not at all.
+        resume: whether regions that are already in the file are used; if not, a new file is made.
         marks: name -> mark. A mark is a digest or a value that identifies the organ and its data.
 
     Raises:
@@ -41,8 +41,8 @@ def kept_in(file: Path, resume: bool, marks: dict[str, object]) -> Keep:
 
 
 def marks_of(omega: np.ndarray, motion: np.ndarray, sd: np.ndarray, voxel: np.ndarray, **others: object) -> dict:
-    """Return a dictionary of marks (see `kept_in`): of measured waves as in `MeasuredWaves`, of the voxels of the body,
-    and of other arrays."""
+    """Return a dictionary of marks (see `kept_in`), which identify the measured waves (see `MeasuredWaves`), the voxels
+    of the body, and other arrays or values."""
     arrays = {"frequencies": omega, "displacements": motion, "noise": sd, "mask": voxel, **others}
     marks = {name: "none" if values is None else mark_of(values) for name, values in arrays.items()}
     return marks | {"versions of the programs": str(versions())}
@@ -66,7 +66,7 @@ def _read_regions(file: Path, marks: dict[str, object]) -> dict[str, Regions]:
             refuse_other(file, f.attrs, marks)
             return {name: _of_group(group) for name, group in f.items()}
     except (OSError, KeyError):
-        raise InputError(f"{file} is damaged, or from another program: leave out --resume") from None
+        raise InputError(f"{file} is damaged, or from another program: remove --resume") from None
 
 
 def _of_group(group: h5py.Group) -> Regions:

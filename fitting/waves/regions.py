@@ -1,4 +1,4 @@
-"""Complex moduli of the regions of an organ from measured waves, with the uncertainty of the moduli. Each frequency is
+"""Find the complex moduli of the regions of an organ from measured waves, with their uncertainty. Each frequency is
 fitted separately."""
 
 from collections.abc import Callable
@@ -15,8 +15,8 @@ from fitting.waves.edges import RegionMatrices
 #: STARTS: storage moduli [Pa] from which the starting point of a search is chosen. LOSS: ratio of loss to storage
 #: modulus at the starting point.
 STARTS, LOSS = np.geomspace(500.0, 40500.0, 5), 0.3
-#: ITERATIONS: maximum number of iterations. ENOUGH: the iteration ends if the step of each modulus, divided by its
-#: standard error, is below this value.
+#: ITERATIONS: maximum number of iterations. ENOUGH: the iteration ends if the change of each modulus, divided by the
+#: standard error of this modulus, is below this value.
 ITERATIONS, ENOUGH = 20, 0.1
 
 
@@ -25,15 +25,15 @@ class MeasuredWaves(NamedTuple):
 
     omega: np.ndarray  # (F,) [rad/s]
     motion: np.ndarray  # (F, 3 V) complex [m], x, y, z of a node together
-    sd: np.ndarray  # (F,) [m], standard deviation of real and imaginary part of one component
+    sd: np.ndarray  # (F,) [m], standard deviation of the noise in real and imaginary part of one component
 
 
 class Regions(NamedTuple):
     """Moduli of R regions at F frequencies."""
 
     modulus: np.ndarray  # (F, R) complex [Pa]
-    covariance: np.ndarray  # (F, 2 R, 2 R) [Pa^2]: storage of all regions, then loss
-    farther: np.ndarray  # (F, R) mean outward shift of the edges from the labels [voxels]
+    covariance: np.ndarray  # (F, 2 R, 2 R) [Pa^2]: storage moduli of all regions, then loss moduli
+    farther: np.ndarray  # (F, R) mean outward shift of the edges, relative to the labels [voxels]
     chi2: np.ndarray  # (F,)
     components: int  # number of real equations in chi^2 of one frequency
     iterations: np.ndarray  # (F,)
@@ -42,21 +42,21 @@ class Regions(NamedTuple):
 
     @property
     def noise_factor(self) -> np.ndarray:
-        """Factor (F, R), at least 1, by which the errors are larger than for white noise with the given standard
-        deviations.
+        """Errors of the moduli (F, R), divided by their errors for white noise with the given standard deviations (at
+        least 1).
 
-        The factor is sqrt(chi^2 / number of equations). If the noise is correlated, the factor is
-        `Correlation.enlarged`.
+        Without an estimate of the correlation, the factor is sqrt(chi^2 / number of equations). If the noise is
+        correlated, the factor is `Correlation.enlarged`; if it is not, the product of both.
         """
         factor = np.repeat(np.maximum(1.0, np.sqrt(self.chi2 / self.components))[:, None], self.modulus.shape[1], 1)
         for f, own in enumerate(self.correlations):
-            # Even if the noise is not correlated, parts of the body have the same noise on their common voxels.
+            # Even without correlated noise, two parts of the body have the same noise at their common voxels.
             factor[f] = np.maximum(1.0, own.enlarged if own.seen else factor[f] * own.enlarged)
         return factor
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Standard errors (F, R) [Pa]: of the storage modulus (real part) and of the loss modulus (imaginary part)."""
+        """Standard errors (F, R) [Pa] of the moduli. Real part: storage modulus; imaginary part: loss modulus."""
         R = self.modulus.shape[1]
         sd = np.tile(self.noise_factor, 2) * np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         return sd[:, :R] + 1j * sd[:, R:]
@@ -67,12 +67,13 @@ class _State(NamedTuple):
 
     G: np.ndarray
     here: Balanced
-    gradient: np.ndarray  # (2 R + P,) with respect to storage, loss and shifts of the P patches of the edges
+    gradient: np.ndarray  # (2 R + P,) with respect to storage and loss moduli, and shifts of the P patches of the edges
     hessian: np.ndarray
 
 
 def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
-    """Return the complex modulus [Pa] from `STARTS` and `LOSS` with the lowest chi^2 at the lowest frequency."""
+    """Return a starting point: the complex modulus [Pa] of a uniform body, chosen from `STARTS` and `LOSS`, with the
+    lowest chi^2 at the lowest frequency."""
     ones = np.ones(m.rows.shape[-1])
 
     def out_of_balance(G):
@@ -91,15 +92,15 @@ def moduli_of_regions(
 ) -> Regions:
     """Find the moduli by the Gauss-Newton method, separately for every frequency.
 
-    The positions of the edges are also unknowns (`edge_places`).
+    The positions of the edges between regions are also unknowns (`edge_places`).
 
     Args:
-        m: the result of `edges.region_matrices`.
+        m: matrices from `edges.region_matrices`.
         waves: the measured waves.
-        start: complex modulus of each region (R,) [Pa] at the starting point for the lowest frequency. The search at
-            the next frequency starts from the moduli of this frequency.
+        start: complex modulus of each region (R,) [Pa], from which the search at the lowest frequency starts. The
+            search at each other frequency starts from the moduli of the frequency before.
         progress: called after every iteration with the number of the iteration and chi^2 per equation.
-        voxel: voxel index of each node (V, 3), for an estimate of the correlation of the noise. If it is None, the
+        voxel: voxel index of each node (V, 3), needed to estimate the correlation of the noise. If it is None, the
             noise is assumed to be white.
     """
     found, G, correlations = [], np.asarray(start, complex), []
@@ -116,18 +117,18 @@ def moduli_of_regions(
 
 
 def _one_frequency(m, waves, f, G, progress):
-    """Return moduli (R,), covariance (2 R, 2 R), mean shifts of the edges (R,), chi^2, number of iterations, whether
-    the search converged, and the last state."""
+    """Fit one frequency. Return moduli (R,), covariance (2 R, 2 R), mean shifts of the edges (R,), chi^2, number of
+    iterations, whether the search converged, and the last state."""
     R, at = len(G), (waves.omega[f], waves.motion[f], waves.sd[f])
     now, converged, k = _state_of_regions(m, G, *at), False, 0
     labels = _of_labels(m, R)
     step, covariance = _gauss_newton(now, labels)
     for k in range(1, ITERATIONS + 1):
         both = step[:R] + 1j * step[R : 2 * R]
-        part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # a modulus changes by half of it at most
+        part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # a modulus changes by at most 50 %
         new = None
-        # The most probable positions of the edges change with the moduli, and so does chi^2. So chi^2 cannot judge a
-        # step that is shorter than a standard error.
+        # The most probable positions of the edges change with the moduli, which also changes chi^2. So chi^2 does not
+        # show whether a step shorter than a standard error is an improvement.
         close = _in_errors(step, covariance, R) < 1
         for _ in range(8):
             if np.all((now.G + part * both).real > 0):
@@ -149,17 +150,18 @@ def _one_frequency(m, waves, f, G, progress):
 
 
 def _in_errors(step: np.ndarray, covariance: np.ndarray, R: int) -> float:
-    """Return the largest ratio of step to standard error over the 2 R storage and loss moduli."""
+    """Return the largest step of the 2 R storage and loss moduli, divided by their standard errors."""
     return float(np.max(np.abs(step[: 2 * R]) / np.sqrt(np.diagonal(covariance)[: 2 * R])))
 
 
 def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the step (2 R + P,) of storage moduli, loss moduli and edges, and the covariance of these unknowns.
+    """Return the Gauss-Newton step (2 R + P,) of storage moduli, loss moduli and edge shifts, and the covariance of
+    these unknowns.
 
     In every step, the edges start from the labels, because the equations are nearly linear in the positions of the
-    edges. The derivatives with respect to the moduli are also computed with these edges. If they were computed with
-    the most probable edges, the errors of the edges would count twice, and cylinders of 2.5 voxels would become one
-    percent stiffer.
+    edges. The derivatives with respect to the moduli are also computed with these edges. With the most probable edges,
+    the errors of the edges would count twice, and the modulus of a cylinder with a radius of 2.5 voxels would be 1 %
+    larger.
     """
     H = now.hessian + labels
     silent = np.diagonal(H) == 0  # a region without any element
@@ -170,8 +172,8 @@ def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
-    """Return the inverse covariance (2 R + P, 2 R + P) from the labels alone. It is 0 for the moduli. For the edges it
-    is the inverse covariance of the patches."""
+    """Return the prior inverse covariance (2 R + P, 2 R + P) of moduli and edge shifts. It is 0 for the moduli. For the
+    shifts it is the inverse of `Patches.covariance`."""
     P = len(m.patches.region)
     out = np.zeros((2 * R + P, 2 * R + P))
     out[2 * R :, 2 * R :] = np.linalg.inv(m.patches.covariance)
@@ -179,7 +181,7 @@ def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
 
 
 def _least(now: _State, labels: np.ndarray) -> float:
-    """Return chi^2 with the best positions of the edges for these moduli."""
+    """Return the smallest chi^2 for the moduli of `now`, over all positions of the edges (quadratic approximation)."""
     R = len(now.G)
     g, H = now.gradient[2 * R :], (now.hessian + labels)[2 * R :, 2 * R :]
     return float(now.here.chi2 - g @ np.linalg.solve(H, g))

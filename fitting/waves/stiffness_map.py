@@ -1,25 +1,26 @@
-"""A map of the complex modulus from measured waves: a smooth field, with its uncertainty.
+"""Compute a map of the complex modulus from measured waves: a smooth field, and its uncertainty.
 
-At frequency f the complex modulus of an element is G = g_f exp(c + l_f). The factor g_f is the modulus that is fitted
-to a uniform organ. The real part of the exponent is ln(|G| / |g_f|), and the imaginary part is the difference of the
-loss angles of G and g_f. The term c is the mean over the element of a complex nodal field (P,), which is the same for
-all frequencies. The real and the imaginary part of this field have the prior of `fitting.methods.prior`, with the same
-standard deviation. Each frequency has a complex level l_f with mean 0 and standard deviation `LEVEL`. The levels are
-needed because the ratios of the g_f may be wrong if the organ is not uniform. With only one frequency there is no
-level, because the mean of c has the same effect.
+At frequency f the complex modulus of an element is G = g_f exp(c + l_f). Here g_f is the modulus of a uniform organ
+that is fitted to the same waves. The real part of the exponent is ln(|G| / |g_f|), and the imaginary part is the
+difference of the loss angles of G and g_f. The term c is the mean, over the element, of a complex nodal field (P,) that
+is the same for all frequencies. The real and the imaginary part of this field have the prior of
+`fitting.methods.prior`, with the same standard deviation. Each frequency has a complex unknown l_f, the level, with the
+prior mean 0 and the prior standard deviation `LEVEL`. The levels are needed because the ratios between the values g_f
+may be wrong if the organ is not uniform. With only one frequency there is no level, because a level would have the same
+effect as the mean of c.
 
-The standard deviation of c is increased step by step. This ends when chi^2 is as low as the number of equations
-(discrepancy principle; Morozov 1966), or when the evidence -(chi^2/n + |z|^2)/2 - ln det H falls. Here z is the
-whitened field, and n is chi^2 divided by its expected value. The Hessian is H = I + J^H J/n, with the derivative J of
-the unbalanced forces. The standard deviation with the highest evidence is used. For each standard deviation, the
-Gauss-Newton method minimises chi^2/2 + |z|^2/2. A search ends if the next step is shorter than `NEAR` standard
-deviations.
+The prior standard deviation of c is increased step by step. The increase ends when chi^2 is as low as the number of
+equations (discrepancy principle; Morozov 1966), or when the logarithm of the evidence, -(chi^2/n + |z|^2)/2 - ln det H,
+decreases. Here z is the whitened field, and n is chi^2 divided by its expected value (at least 1). The Hessian is H = I
++ J^H J/n, where J is the derivative of the whitened unbalanced forces with respect to z. The standard deviation with
+the highest evidence is used. For each standard deviation, the Gauss-Newton method minimises chi^2/2 + |z|^2/2. A search
+ends if the next step is shorter than `NEAR` standard deviations of the map.
 
-The uncertainty has two parts. The first part comes from the Hessian H, with the noise enlarged by the correlation
-between neighbouring voxels (`fitting.waves.correlated_noise`). The second part is needed because the position
-of a change of the modulus is not known exactly. The prior smooths a jump of the modulus over a width w: the correlation
-length, or the side of a brick if this is longer. The jump may lie anywhere within this width, so its position has the
-variance w^2/12. This adds |w dc/dx|^2/12 to the variance of c.
+The uncertainty has two parts. The first part comes from the Hessian H. It includes that correlated noise of
+neighbouring voxels causes larger errors (`fitting.waves.correlated_noise`). The second part is needed because the
+position of a jump of the modulus is not known exactly. The prior smooths a jump over a width w: the correlation length,
+or the side of a brick if the side is longer. The jump may lie anywhere within this width, so the variance of its
+position is w^2/12. This adds |w dc/dx|^2/12 to the variance of c.
 """
 
 import time
@@ -42,49 +43,50 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.struct import Content
 
-#: Standard deviations of c that are tried: from a nearly uniform organ to an organ with a strongly varying modulus.
+#: Prior standard deviations of c that are tried: from a nearly uniform organ to an organ with a strongly varying
+#: modulus.
 DEVIATIONS = (0.2, 0.4, 0.8)
-#: Standard deviation of the real and the imaginary part of the levels.
+#: Prior standard deviation of the real and the imaginary part of the levels.
 LEVEL = 0.5
 #: STEPS: maximum number of Gauss-Newton steps for each of `DEVIATIONS`. NEAR: a search ends if the next step is shorter
 #: than this. FAR: a map has converged if the next step is shorter than this (both in standard deviations of the map).
 STEPS, NEAR, FAR = 40, 0.1, 0.2
-#: The Hessian is computed again if a step is longer than this fraction of the step before: then the point of the last
-#: Hessian is too far away.
+#: The Hessian is computed again if a step is longer than this fraction of the step before: then the search has moved
+#: too far from the point of the last Hessian.
 _SLOW = 0.3
 
 
 class WaveMap(NamedTuple):
-    """The map and its uncertainty."""
+    """Map of the complex modulus at F frequencies and P corners, and its uncertainty."""
 
-    exponent: np.ndarray  # c + l_f (F, P) complex at the corners
-    sd: np.ndarray  # (F, P) complex: sd of the real part (ln of the absolute value) + i sd of the loss angle
-    posterior_sd: np.ndarray  # (F, P) sd of real and of imaginary part, without the uncertainty of positions
-    prior_sd: np.ndarray  # (F, P) the same, before the measurement
-    draws: np.ndarray  # (D, F, P) complex: samples of the posterior, displaced by random parts of the width w
+    exponent: np.ndarray  # c + l_f (F, P) at the corners, complex (module docstring)
+    sd: np.ndarray  # (F, P) complex. Real part: sd of ln |G|; imaginary part: sd of the loss angle
+    posterior_sd: np.ndarray  # (F, P) sd of real and of imaginary part of c + l_f, without uncertainty of positions
+    prior_sd: np.ndarray  # (F, P) the same, before the data are used
+    draws: np.ndarray  # (D, F, P) complex: samples of the posterior, with random shifts within the width w
     modulus: np.ndarray  # (F, P) complex [Pa]
-    deviation: float  # chosen standard deviation of the prior
+    deviation: float  # chosen prior standard deviation of c
     length: float  # correlation length of the prior [m]
     chi2: float
     components: int  # number of real equations in chi2
-    noise_factor: np.ndarray  # (F,) by which the errors are larger than for white noise with the given sd
-    reached: bool  # whether chi2 is at most this number
+    noise_factor: np.ndarray  # (F,) errors of the map, divided by those for white noise with the given sd
+    reached: bool  # whether chi2 is at most `components`
     distance: float  # distance to the minimum: length of the next step, in standard deviations of the map
     history: list[dict[str, float]]
     seconds: float
 
 
 class Course(NamedTuple):
-    """The fixed input of a search."""
+    """Input of a search, which is the same in all its steps."""
 
     m: Matrices
     waves: MeasuredWaves
     whole: np.ndarray  # (F,) complex: modulus g_f of the uniform organ at each frequency [Pa]
-    exponents: tuple[scipy.sparse.csr_array, ...]  # F matrices (E, P + L): c and L levels -> c + l_f of the elements
-    slopes: tuple[scipy.sparse.csr_array, ...]  # 3 matrices (P, P): change of c over the width w along x, y and z
+    exponents: tuple[scipy.sparse.csr_array, ...]  # F matrices (E, P + L): (c, L levels) -> c + l_f of the elements
+    slopes: tuple[scipy.sparse.csr_array, ...]  # 3 matrices (P, P): c -> change of c over the width w along x, y, z
     p: smooth.Prior
     length: float  # correlation length of the prior [m]
-    voxel: np.ndarray | None = None  # (V, 3) voxel index of each node; None: the noise counts as white
+    voxel: np.ndarray | None = None  # (V, 3) voxel index of each node; None: white noise is assumed
 
     @property
     def corners(self) -> int:
@@ -92,19 +94,19 @@ class Course(NamedTuple):
         return len(self.p.root_mass)
 
     def moduli(self, y: np.ndarray) -> list[np.ndarray]:
-        """Return the moduli (E,) [Pa] of the elements at every frequency. y (P + L,) contains c at the corners, then
-        the levels."""
+        """Return the complex moduli (E,) [Pa] of the elements for each frequency. y (P + L,) contains c at the corners,
+        then the levels."""
         return [g * np.exp(own @ y) for g, own in zip(self.whole, self.exponents, strict=True)]
 
     def at(self, y: np.ndarray) -> list[Balanced]:
-        """Return the most probable motion at every frequency, for y (P + L,)."""
+        """Return the most probable motion for each frequency, for given y (see `moduli`)."""
         w = self.waves
         each = zip(self.moduli(y), w.omega, w.motion, w.sd, strict=True)
         return [balance.balanced(self.m, *own) for own in each]
 
     def jacobians(self, y: np.ndarray, here: list[Balanced]) -> list[scipy.sparse.csc_array]:
-        """Return the derivatives (I, P + L) of the unbalanced forces with respect to y, divided by the standard
-        deviation of the noise, for every frequency."""
+        """Return for each frequency the derivatives (I, P + L) of the unbalanced forces with respect to y, divided by
+        the standard deviation of the noise."""
         each = zip(self.moduli(y), self.exponents, here, self.waves.sd, strict=True)
         return [
             (balance.by_modulus(self.m, b.motion) @ scipy.sparse.diags_array(G) @ own).tocsc() / sd
@@ -112,19 +114,21 @@ class Course(NamedTuple):
         ]
 
     def scales(self, k: int) -> np.ndarray:
-        """Return factors (P + L,): y = `natural`(z) times these factors, for the standard deviation `DEVIATIONS[k]`."""
+        """Return factors (P + L,) for the prior standard deviation `DEVIATIONS[k]`: y is `natural`(z) times these
+        factors."""
         return np.where(np.arange(self.exponents[0].shape[1]) < self.corners, DEVIATIONS[k], 1.0)
 
     def natural(self, z: np.ndarray) -> np.ndarray:
-        """Return y for a whitened complex field z, (P + L,) or (P + L, n). In the result, c has the standard deviation
-        1, and the levels have the standard deviation `LEVEL`."""
+        """Return y (c at the corners, then the levels) for a whitened complex field z, (P + L,) or (P + L, n). For this
+        y, the prior standard deviation of c is 1, and that of the levels is `LEVEL`."""
         c, levels = z[: self.corners], LEVEL * z[self.corners :]
         return np.concatenate(
             [smooth.field_at_nodes(self.p, c.real) + 1j * smooth.field_at_nodes(self.p, c.imag), levels]
         )
 
     def whitened(self, g: np.ndarray) -> np.ndarray:
-        """Return the transpose of `natural` times g, (P + L,) or (P + L, n)."""
+        """Return T^T g, (P + L,) or (P + L, n), where T is the real matrix of `natural`. This converts a gradient with
+        respect to y to one with respect to z."""
         c, levels = g[: self.corners], LEVEL * g[self.corners :]
         return np.concatenate([smooth.to_whitened(self.p, c.real) + 1j * smooth.to_whitened(self.p, c.imag), levels])
 
@@ -134,7 +138,7 @@ class Course(NamedTuple):
         return c[None] + (levels[:, None] if len(levels) else np.zeros((1, 1, *y.shape[1:])))
 
     def marks(self) -> dict[str, object]:
-        """Return a dictionary of digests and values that identify the problem."""
+        """Return a dictionary of digests and values that identify the data and the settings of this search."""
         m, w = self.m, self.waves
         return {
             "length": self.length,
@@ -149,7 +153,7 @@ class Course(NamedTuple):
 
 class _Reached(NamedTuple):
     z: np.ndarray
-    k: int  # index in `DEVIATIONS`
+    k: int  # index of the standard deviation in `DEVIATIONS`
     here: list[Balanced]
     chi2: float
     cost: float
@@ -158,13 +162,13 @@ class _Reached(NamedTuple):
 class _Begun(NamedTuple):
     """State of a search."""
 
-    point: _Reached  # for the current deviation
-    visited: list[tuple[_Reached, np.ndarray]]  # end point for each earlier deviation, with its `_information`
+    point: _Reached  # for the current standard deviation
+    visited: list[tuple[_Reached, np.ndarray]]  # end point for each earlier standard deviation, with its `_information`
     history: list[Content]
 
 
 def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndarray, length: float) -> Course:
-    """Return the fixed input of the search for a map.
+    """Return the input of the search for a map.
 
     Args:
         body, m: the body and its matrices.
@@ -187,14 +191,14 @@ def map_of(
     draws: int = 20,
     progress: Callable[[int, float], None] = lambda weight, chi2: None,
 ) -> WaveMap:
-    """Find the map from the waves.
+    """Find the map of the modulus from the waves.
 
     Args:
         course: the result of `course_of`.
         file: HDF5 file that is written after every step. If it is None, no file is written.
-        resume: whether the search begins at the point in this file, if the file exists.
+        resume: whether the search continues from the state in this file, if the file exists.
         draws: number of samples of the posterior.
-        progress: called after every step with the index in `DEVIATIONS` and with chi^2 per equation.
+        progress: function that is called after every step, with the index in `DEVIATIONS` and chi^2 per equation.
 
     Raises:
         InputError: `file` belongs to another fit.
@@ -233,16 +237,16 @@ def map_of(
 
 
 def sd_of_modulus(G: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Return standard deviations [Pa] of the storage modulus (real part) and the loss modulus (imaginary part).
+    """Return standard deviations [Pa] of the moduli. Real part: storage modulus; imaginary part: loss modulus.
 
-    `G`: complex moduli [Pa]; `sd`: as `WaveMap.sd`.
+    `G`: complex moduli [Pa]; `sd`: standard deviations in the form of `WaveMap.sd`.
     """
     return np.hypot(G.real * sd.real, G.imag * sd.imag) + 1j * np.hypot(G.imag * sd.real, G.real * sd.imag)
 
 
 def _with_place(sd: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (F, P) including the uncertainty of positions. `slopes` (3, P): changes of c over
-    the width w."""
+    """Add the uncertainty of positions (module docstring) to standard deviations `sd` (F, P), and return the result.
+    `slopes` (3, P): changes of c over the width w."""
     return np.sqrt(sd**2 + np.sum(slopes**2, axis=0) / 12)
 
 
@@ -256,8 +260,8 @@ def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
 def _changes_over_slopes(
     body: VoxelBody, mean: scipy.sparse.csr_array, length: float
 ) -> tuple[scipy.sparse.csr_array, ...]:
-    """Return for each axis a matrix (P, P) that gives the change of a nodal field over the width w. The width is the
-    given length [m], or the side of a brick if the side is longer.
+    """Return one matrix (P, P) for each axis: its product with a nodal field is the change of the field over the width
+    w. The width w is `length` [m], or the side of a brick if the side is longer.
 
     The gradient at a corner is the mean over the elements around this corner, weighted by volume.
     """
@@ -283,28 +287,31 @@ def _reached(course: Course, z: np.ndarray, k: int) -> _Reached:
 def _evidences(
     course: Course, visited: list[tuple[_Reached, np.ndarray]], components: int
 ) -> tuple[float, list[float]]:
-    """Return the factor, at least 1, by which chi^2 is too large, and the evidence of each tried standard deviation."""
+    """Return the smallest chi^2 per equation (at least 1), and the log evidence for each standard deviation of the
+    prior that was tried."""
     excess = max(1.0, min(p.chi2 for p, _ in visited) / components)
     return excess, [_evidence(course, p, information, excess) for p, information in visited]
 
 
 def _hessian(course: Course, k: int, information: np.ndarray) -> np.ndarray:
-    """Return the Hessian (P + L, P + L) with respect to whitened z, for the standard deviation `DEVIATIONS[k]`."""
+    """Return the Hessian H (P + L, P + L) of the cost with respect to the whitened field z, for the prior standard
+    deviation `DEVIATIONS[k]`."""
     scales = course.scales(k)
     return np.eye(len(information)) + scales[:, None] * information * scales
 
 
 def _evidence(course: Course, point: _Reached, information: np.ndarray, excess: float) -> float:
-    """Return the logarithm of the evidence: the probability of the data for this standard deviation of the prior. A
-    constant is left out."""
+    """Return the logarithm of the evidence, except for a constant. The evidence is the probability of the data for this
+    standard deviation of the prior."""
     H = _hessian(course, point.k, information / excess)
     logarithm = 2 * float(np.sum(np.log(np.real(np.diagonal(np.linalg.cholesky(H))))))
     return -0.5 * (point.chi2 / excess + float(np.vdot(point.z, point.z).real)) - logarithm
 
 
 def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reached, np.ndarray]]:
-    """Try one standard deviation after another, until chi^2 is as low as for noise alone, or until the evidence falls.
-    Each search begins at the result of the search before. Return the end points and their `_information`."""
+    """Try one standard deviation of the prior after another, until chi^2 is as low as for noise alone, or until the
+    evidence decreases. Each search begins at the result of the search before. Return the end point of each search and
+    its `_information`."""
     components = course.m.balances * len(course.waves.omega)
     point, visited, history = begun
     information, fresh = (visited[-1][1], False) if visited else (_information(course, point), True)
@@ -340,16 +347,17 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
 
 
 def _next_start(course: Course, point: _Reached) -> _Reached:
-    """Return the same field, expressed with the next standard deviation."""
+    """Return the map of `point`, with the whitened field z that gives this map for the next prior standard
+    deviation."""
     return _reached(course, point.z * course.scales(point.k) / course.scales(point.k + 1), point.k + 1)
 
 
 def _noise_factors(course: Course, point: _Reached, y: np.ndarray, excess: float) -> np.ndarray:
-    """Return the factors (F,) by which the noise is larger than white noise with the given sd.
+    """Return noise factors (F,): the errors of the map, divided by the errors for white noise with the given sd.
 
-    Correlated noise enlarges the errors of a map as it enlarges the error of one modulus of the whole organ. The
-    correlation is that of the residuals of the map: residuals of a uniform organ also contain its real changes of
-    modulus. `excess`: chi^2 divided by its expected value, at least 1.
+    It is assumed that correlated noise enlarges the errors of a map by the same factor as the error of one modulus of
+    the whole organ. The correlation is computed from the residuals of the map, because residuals of a uniform organ
+    also contain effects of real changes of the modulus. `excess`: chi^2 divided by its expected value, at least 1.
     """
     root, w = np.sqrt(excess), course.waves
     if course.voxel is None:
@@ -362,20 +370,21 @@ def _noise_factors(course: Course, point: _Reached, y: np.ndarray, excess: float
     return np.array(found)
 
 
-#: Factors of the frequencies count as equal if they differ by less than this.
+#: Noise factors of the frequencies are regarded as equal if their ratio is below this.
 _SAME = 1.05
 
 
 def _with_factors(course: Course, point: _Reached, information: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Return `information` for noise that is larger by `factors` (F,)."""
+    """Return the matrix of `_information` for noise whose standard deviation is multiplied by `factors` (F,)."""
     if factors.max() < _SAME * factors.min():
         return information / factors.max() ** 2
     return _information(course, point, factors)
 
 
 def _information(course: Course, point: _Reached, factors: np.ndarray | None = None) -> np.ndarray:
-    """Return J^H J (P + L, P + L), complex, where J is the derivative with respect to whitened z for a standard
-    deviation of 1. `factors` (F,): the noise is larger than the given sd by these; default: 1."""
+    """Return the information matrix J^H J (P + L, P + L), complex. J is the derivative of the whitened unbalanced
+    forces with respect to the whitened field z for a prior standard deviation of 1. `factors` (F,): noise factors;
+    default: 1."""
     y = course.natural(course.scales(point.k) * point.z)
     H, factors = np.zeros((len(y), len(y)), complex), np.ones(len(point.here)) if factors is None else factors
     for J, b, factor in zip(course.jacobians(y, point.here), point.here, factors, strict=True):
@@ -385,7 +394,7 @@ def _information(course: Course, point: _Reached, factors: np.ndarray | None = N
             known = np.flatnonzero(np.diff(own.indptr))
             X = b.of(rows).whitened(own[:, known], np.complex64)  # single precision is enough for the Hessian of a step
             H[np.ix_(known, known)] += X.conj().T @ X
-    # The result is T^T H T, where T is the real matrix of `natural`.
+    # The result is T^T H T, where T is the real matrix of the function `natural`.
     half = course.whitened(H)
     return course.whitened(half.conj().T).conj().T
 
@@ -393,8 +402,8 @@ def _information(course: Course, point: _Reached, factors: np.ndarray | None = N
 def _newton_step(course: Course, point: _Reached, information: np.ndarray, excess: float) -> tuple[np.ndarray, float]:
     """Return the Gauss-Newton step (P + L,) and its length in standard deviations of the map.
 
-    `excess` is chi^2 divided by its expected value. The standard deviations are those for a noise variance that is
-    larger by this factor.
+    `excess`: chi^2 divided by its expected value. The noise variance for these standard deviations is multiplied by
+    this factor.
     """
     scales = course.scales(point.k)
     y = course.natural(scales * point.z)
@@ -405,8 +414,8 @@ def _newton_step(course: Course, point: _Reached, information: np.ndarray, exces
 
 
 def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None:
-    """Return the point after the step, or after a part of the step, with a lower cost. Return None if no such point is
-    found."""
+    """Return a point with a lower cost than `point`, after the whole step or a fraction of the step. Return None if no
+    such point is found."""
     for part in (1.0, 0.5, 0.25, 0.1):
         new = _reached(course, point.z + part * step, point.k)
         if new.cost < point.cost:
@@ -417,19 +426,19 @@ def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None
 def _spread(
     course: Course, point: _Reached, information: np.ndarray, draws: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the standard deviations (F, P) before and after the use of the data, and the differences (D, F, P) between
-    posterior samples and the map."""
+    """Return prior and posterior standard deviations (F, P) of c + l_f, and differences (D, F, P) between posterior
+    samples and the map."""
     scales, n = course.scales(point.k)[:, None], len(point.z)
     L = np.linalg.cholesky(_hessian(course, point.k, information))
 
-    roots = course.natural(scales * np.linalg.inv(L).conj().T)  # R R^H is the covariance
+    roots = course.natural(scales * np.linalg.inv(L).conj().T)  # R R^H is the covariance, with R = `roots`
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(n, draws)) + 1j * rng.normal(size=(n, draws))
     before = course.natural(scales * np.eye(n))
 
     def each(y: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield c + l_f at the corners (P, n) for one frequency after another. All frequencies together would not fit
-        into the memory."""
+        """Yield c + l_f at the corners (P, n) for one frequency after another. All frequencies together would need too
+        much memory."""
         levels = y[course.corners :]
         return (y[: course.corners] + level for level in (levels if len(levels) else [0.0]))
 
@@ -443,7 +452,7 @@ _HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")
 
 
 def _write(file: Path | None, course: Course, begun: _Begun) -> None:
-    """Write the state of the search. The file is replaced as a whole, so the file on disk is always complete."""
+    """Write the state of the search. The whole file is replaced at once, so the file on disk is always complete."""
     if file is None:
         return
     with whole(file) as new, h5py.File(new, "w") as f:
@@ -454,8 +463,8 @@ def _write(file: Path | None, course: Course, begun: _Begun) -> None:
 
 
 def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
-    """Return the state at the beginning: a uniform organ, or the state of an earlier run in the file. The end points of
-    searches that this run has finished are evaluated again."""
+    """Return the state with which the search begins: a uniform organ, or the state of an earlier run in the file. The
+    end points of the searches that the earlier run has finished are evaluated again."""
     if file is None or not file.is_file():
         return _Begun(_reached(course, np.zeros(course.exponents[0].shape[1], complex), 0), [], [])
     try:
@@ -464,7 +473,7 @@ def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
             history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
             z, ends = f["z"][:], f["visited"][:]
     except (OSError, KeyError):
-        raise InputError(f"{file} is damaged, or from another program: leave out --resume") from None
+        raise InputError(f"{file} is damaged, or from another program: remove --resume") from None
     visited = []
     for k, end in enumerate(ends):
         point = _reached(course, end, k)

@@ -1,5 +1,5 @@
-"""A body of quadratic elements. Each node is the centre of a voxel, so the measured displacements are displacements of
-nodes."""
+"""Make a body of quadratic elements, with a node at the centre of each voxel. So the measured displacements are
+displacements of nodes."""
 
 import itertools
 from typing import NamedTuple
@@ -12,16 +12,16 @@ from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 
 class VoxelBody(NamedTuple):
-    """Bricks of 3 x 3 x 3 voxels, each divided into six quadratic tetrahedra. Neighbouring bricks have common voxels on
+    """Bricks of 3 x 3 x 3 voxels, each divided into six quadratic tetrahedra. Neighbouring bricks share the voxels on
     their common face.
 
-    A large body is divided into parts. On a voxel that is common to two parts, each part has a separate node.
+    A large body is divided into parts. At a voxel that belongs to two parts, each part has a separate node.
     """
 
     linear: TetMesh  # linear mesh of the corners
     mesh: TetMesh  # quadratic; the nodes of `linear` come first
     voxel: np.ndarray  # (V, 3) index of the voxel of each node
-    inner: np.ndarray  # (V,) bool: nodes with elements of their part on all sides; here the forces must balance
+    inner: np.ndarray  # (V,) bool: nodes with elements of their part on all sides; there the forces balance
     part: np.ndarray  # (V,) number of the part of each node
     whole: TetMesh  # linear mesh of the undivided body, for fields that are continuous between the parts
     corner: np.ndarray  # (P,) node of `whole` for each node of `linear`
@@ -30,13 +30,13 @@ class VoxelBody(NamedTuple):
 def voxel_body(
     mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None = None, side: int | None = None
 ) -> VoxelBody:
-    """Return the body of all bricks with 27 voxels in the mask.
+    """Return the body that consists of all bricks with 27 voxels in the mask.
 
     Args:
         mask: (nx, ny, nz) bool.
         spacing: spacing of the voxels (3,) [m].
-        origin: centre of the first voxel (3,) [m]. None means 0.
-        side: maximum number of bricks along the side of a part. If it is None, the body has one part.
+        origin: centre of the first voxel (3,) [m]; None: 0.
+        side: maximum number of bricks along the side of a part; None: the body has one part.
 
     Raises:
         InputError: no brick fits into the mask, or no node has bricks on all sides.
@@ -45,8 +45,8 @@ def voxel_body(
     cells = tuple(int(n) for n in (np.array(mask.shape) - 1 - first) // 2)
     if min(cells) < 1:
         raise InputError(
-            f"the mask covers only {' x '.join(map(str, np.array(mask.shape) - first))} voxels: waves need at least "
-            "3 along every axis, and 5 or more are better; measure more slices"
+            f"the mask covers only {' x '.join(map(str, np.array(mask.shape) - first))} voxels: at least "
+            "3 are needed along every axis, and 5 or more are better; measure more slices"
         )
     kept = _whole_bricks(mask[tuple(slice(f, None) for f in first)], cells)
     if not _surrounded(kept).any():
@@ -56,7 +56,7 @@ def voxel_body(
     at = 2 * np.stack(np.unravel_index(used, tuple(n + 1 for n in kept.shape)), axis=1)
     start = np.zeros(3) if origin is None else np.asarray(origin)
     whole = tet_mesh((at + first) * spacing + start, tets.reshape(-1, 4))
-    # Corners of different parts are different nodes.
+    # Different parts have different nodes, also at the same voxel.
     own, split = np.unique(np.repeat(parts[kept], 24) * len(used) + tets.ravel(), return_inverse=True)
     corner = own % len(used)
     linear = whole if len(own) == len(used) else tet_mesh(np.asarray(whole.points)[corner], split.reshape(-1, 4))
@@ -71,8 +71,8 @@ def voxel_body(
 
 
 def _part_of_each_brick(kept: np.ndarray, side: int | None) -> np.ndarray:
-    """Return the number of the part of every brick, -1 for bricks that are not kept. Parts along an axis are about
-    equally long."""
+    """Return the number of the part to which each brick belongs, or -1 for bricks that are not in the body. All parts
+    have about the same length along an axis."""
     parts = np.zeros(kept.shape, int)
     for axis, n in enumerate(kept.shape):
         number = 1 if side is None else -(-n // side)
@@ -123,8 +123,8 @@ def _whole_bricks(mask: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
 
 
 def _surrounded(kept: np.ndarray) -> np.ndarray:
-    """Return for each voxel of the grid whether all bricks at this voxel are kept and the voxel is not at the end of
-    the grid. The grid has twice as many voxels as bricks along each axis, plus one."""
+    """Return for each voxel of the grid whether all bricks that contain this voxel are kept, and the voxel is not at
+    the end of the grid. Along each axis, n bricks have 2 n + 1 voxels."""
     inside = np.ones(tuple(2 * n + 1 for n in kept.shape), bool)
     for offset in np.ndindex(3, 3, 3):
         inside[_every_second(offset, kept.shape)] &= kept
@@ -138,8 +138,8 @@ def _every_second(offset: tuple[int, ...], cells: tuple[int, ...]) -> tuple[slic
 
 
 def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
-    """Return the values (V,) at all nodes for a field that is linear in each element. `corners`: values at the nodes of
-    `body.whole`."""
+    """Interpolate a field that is linear in each element: return its values (V,) at all nodes. `corners`: its values at
+    the nodes of `body.whole`."""
     from liverjax.mesh.adjacency import PAIRS
 
     values = np.empty(body.mesh.number_of_nodes, corners.dtype)

@@ -11,7 +11,7 @@ from fitting.waves.files.unwrapping import unwrapped
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Numbers
 
-#: Units of displacements and their factors to metres.
+#: Units of displacements, and the factors that convert them to metres.
 UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "rad": 1.0}
 
 
@@ -48,7 +48,7 @@ def read_waves(
         spacing: spacing of the voxels (3,) [m], if the file does not contain the spacing or states a wrong one.
 
     Raises:
-        InputError: the file cannot be used; the message names the file, the field, the value and the remedy.
+        InputError: the file cannot be used; the message states the file, the field, the value and what to do.
     """
     name, found = str(path), formats.arrays(Path(path))
     more = {"mask": mask, "labels": labels}
@@ -63,11 +63,11 @@ def read_waves(
         phases = _instants(name, "wrapped", found["wrapped"])
         only = _whole_numbers(name, "mask", found.get("mask"), phases.shape[2:5])
         if only is not None:
-            phases = np.where((only != 0)[..., None], phases, np.nan)  # in air, the measured phase is noise
+            phases = np.where((only != 0)[..., None], phases, np.nan)  # in air, the measured phase is only noise
         found["phases"], jumps = unwrapped(name, phases)
         found["unit"] = "rad"
     U, notes = _motion(name, found)
-    notes += [*jumps, *_of_another_spacing(name, found, step)]
+    notes += [*found.get(formats.NEARLY, []), *jumps, *_of_another_spacing(name, found, step)]
     U = np.where(np.isfinite(U), U, np.nan) * _factor(name, unit or found.get("unit") or "m")
     notes += _leave_out_rest(U)
     hertz = _hertz(name, frequencies, found.get("frequencies"), len(U))
@@ -92,7 +92,7 @@ def read_waves(
 
 
 def _of_another_spacing(name: str, found: Content, step: np.ndarray) -> list[str]:
-    """Return a note if the spacing in the file differs from the spacing [m] that is used."""
+    """Return a note if the spacing in the file differs from the spacing `step` [m] that is used."""
     if found.get("spacing") is None or formats.CONFLICT in found:
         return []
     stated = _lengths(name, "spacing", found["spacing"], "its spacing")
@@ -107,14 +107,14 @@ def _of_another_spacing(name: str, found: Content, step: np.ndarray) -> list[str
 def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object, spacing_given: bool) -> np.ndarray:
     """Read the mask or the labels from a separate file, which must have the same voxels as the waves.
 
-    `place`: position of the voxels of the waves in space, as in `formats.PLACE`; None if it is unknown.
+    `place`: position in space of the voxels of the waves (see `formats.PLACE`); None if the position is unknown.
     """
     values, own, elsewhere = formats.single(file, key, spacing_given)
     if elsewhere is not None and place is not None:
         apart = np.abs(np.asarray(elsewhere) - np.asarray(place)).max()
         if apart > SAME_PLACE * float(np.min(spacing)):
             raise InputError(
-                f"{file}: the voxels are not at the positions of the voxels of the waves, or the axes have other "
+                f"{file}: the voxels are not at the positions of the voxels of the waves, or the axes have different "
                 f"directions: resample {key} to the voxels of the waves"
             )
     if own is not None:
@@ -129,13 +129,13 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object
 
 #: Two positions are regarded as equal if they differ by less than this (in voxels).
 SAME_PLACE = 0.1
-#: Components that are exactly 0 are reported if this happens in less than this fraction of the voxels.
+#: Components that are exactly 0 are reported if they occur in less than this fraction of the voxels.
 FEW = 0.2
 
 
 def _leave_out_rest(U: np.ndarray) -> list[str]:
-    """Replace the displacements U of voxels that do not move by NaN, and return notes. Many programs write 0 where
-    they did not measure."""
+    """Replace the displacements U by NaN in voxels that do not move, and return notes. Many programs write 0 where
+    nothing was measured."""
     notes, nothing = [], (U == 0) | np.isnan(U)
     still = np.all(nothing, axis=(0, 4))
     if np.any(still & np.any(U == 0, axis=(0, 4))):
@@ -151,13 +151,13 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
             )
         several = np.isfinite(u) & np.any(np.isfinite(u) & (u != 0), axis=-1, keepdims=True)
         zeros = (u == 0) & several
-        zeros &= zeros.sum(axis=(0, 1, 2)) < FEW * several.sum(axis=(0, 1, 2))  # many zeros: a plane of symmetry
+        zeros &= zeros.sum(axis=(0, 1, 2)) < FEW * several.sum(axis=(0, 1, 2))  # many zeros may be a plane of symmetry
         if zeros.any():
             notes.append(
                 f"field {f + 1} has {zeros.sum()} components that are exactly 0 in voxels that move: write NaN where a "
                 "component was not measured"
             )
-    # A wave may move in one direction only, so a component that is zero everywhere is kept.
+    # The motion may be along one axis only, so a component that is zero everywhere is kept.
     resting = np.all(nothing, axis=(0, 1, 2, 3)) & np.any(U == 0, axis=(0, 1, 2, 3))
     for axis in np.array(list("xyz"))[resting]:
         notes.append(f"component {axis} is zero everywhere: write NaN if this component was not measured")
@@ -165,21 +165,21 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
 
 
 def with_noise(field: WaveField, noise: float | None) -> WaveField:
-    """Return the field with this noise [m]. If `noise` is None, the estimated noise of the field is kept, which must be
-    above 0."""
+    """Return the field with `noise` [m] as the standard deviation of its noise. If `noise` is None, the estimated noise
+    of the field is kept, which must be above 0."""
     if noise is not None:
         return field._replace(noise=np.full(len(field.frequencies), noise))
     unknown = ~(field.noise > 0)
     if unknown.any():
         hertz = ", ".join(f"{f:g}" for f in field.frequencies[unknown])
         blank = not np.isfinite(field.displacement[unknown]).any()
-        remedy = "remove this field, which contains no numbers" if blank else "give --noise, in metres"
+        remedy = "remove this displacement field, which contains no numbers" if blank else "give --noise, in metres"
         raise InputError(f"{field.source}: the noise at {hertz} Hz cannot be estimated from the data: {remedy}")
     return field
 
 
 def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
-    """Return the complex displacements (F, nx, ny, nz, 3) in the unit of the file, and notes."""
+    """Return the complex displacements (F, nx, ny, nz, 3) of the file in its unit, and notes."""
     told: list[str] = []
     if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, equally spaced
         u = _instants(name, "phases", found["phases"])
@@ -197,9 +197,10 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
         known = ", ".join(sorted(k for k, v in found.items() if v is not None and k[0] != "(")) or "nothing"
         if "labels" in found and "displacement" not in found:
             known += " (real numbers are read as labels)"
+        near = "".join(f" ({note})" for note in found.get(formats.NEARLY, []))
         raise InputError(
             f"{name}: the file contains {known}, but no waves: store the waves as displacement (complex), as real and "
-            "imag, or as phases"
+            f"imag, or as phases{near}"
         )
     shape = U.shape
     if U.ndim == 4:
@@ -224,14 +225,14 @@ def _is_image(name: str) -> bool:
 
 
 def _layout(name: str) -> str:
-    """Return the array layout of the waves in a file, for messages."""
+    """Return a phrase for messages: the array layout that waves must have in this kind of file."""
     if _is_image(name):
         return "complex numbers (nx, ny, nz, 3), or (nx, ny, nz, F, 3) for several frequencies"
     return "(F, nx, ny, nz, 3), frequencies first, components last"
 
 
 def _instants(name: str, field: str, values: Numbers) -> np.ndarray:
-    """Return the checked motion (F, T, nx, ny, nz, 3) at T instants of one period."""
+    """Check an array with the motion at T instants of one period, and return it (F, T, nx, ny, nz, 3)."""
     u = _array_of_numbers(name, field, values)
     if u.ndim not in (5, 6) or u.shape[-5] < 3 or u.shape[-1] not in (1, 3) or np.iscomplexobj(u):
         raise InputError(
@@ -240,8 +241,8 @@ def _instants(name: str, field: str, values: Numbers) -> np.ndarray:
     return u if u.ndim == 6 else u[None]
 
 
-#: A note is given if T instants fit a period of T - 1 steps much better than a period of T steps. "Much better" means
-#: that the residual is smaller by this factor.
+#: A note is given if a period of T - 1 steps fits T instants much better than a period of T steps: if the residual is
+#: below this fraction of the other residual.
 _REPEATED = 0.5
 
 
@@ -262,7 +263,7 @@ def _of_a_last_instant(u: np.ndarray) -> list[str]:
         return []
     return [
         f"the {T} instants fit a period of {T - 1} steps better. If the last instant is the end of the period, it "
-        "repeats the first instant: leave the last instant out"
+        "repeats the first instant: remove the last instant"
     ]
 
 
@@ -293,7 +294,7 @@ def _hertz(name: str, asked: list[float] | None, held: Any, number: int) -> np.n
     hertz = _plain(name, "frequencies", held if asked is None else asked)
     own = hertz if held is None else _plain(name, "frequencies", held)
     if asked is not None and (len(own) != len(hertz) or not np.allclose(hertz, own)):
-        raise InputError(f"{name}: the file states {np.ravel(held).tolist()} Hz: leave out --frequencies")
+        raise InputError(f"{name}: the file states {np.ravel(held).tolist()} Hz: remove --frequencies")
     if len(hertz) != number:
         raise InputError(
             f"{name}: {len(hertz)} frequencies for {number} displacement fields: give {number} frequencies"
@@ -333,12 +334,12 @@ _FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 
 
 def noise_of(field: WaveField) -> np.ndarray:
-    """Estimate the standard deviation (F,) [m] of the noise in real and imaginary part of one component.
+    """Estimate the standard deviation (F,) [m] of the noise in the real and the imaginary part of one component.
 
     The estimate is the scaled median of fourth differences along the axis with the smallest differences. A few bad
-    voxels do not change a median. A smooth wave contributes only (k h)^4 / 8 of its amplitude, with the wave number k
-    and the voxel spacing h: 0.12 % at 20 voxels per wavelength and 4 % at 8. The result is NaN if the mask has too few
-    rows of five voxels.
+    voxels hardly change a median. A smooth wave contributes only (k h)^4 / 8 of its amplitude, with the wave number k
+    and the voxel spacing h. This is 0.12 % for 20 voxels per wavelength, and 4 % for 8. The result is NaN if the mask
+    has too few rows of five voxels.
     """
     out = np.full(len(field.frequencies), np.nan)
     for f, U in enumerate(field.displacement):
@@ -360,8 +361,8 @@ def noise_of(field: WaveField) -> np.ndarray:
 
 
 def coarsened(field: WaveField, stride: int) -> WaveField:
-    """Return the field of means over blocks of stride^3 voxels. A block is in the new mask if all its voxels are in the
-    mask. In a uniform organ, the means form a wave of the same wavelength."""
+    """Return a field with fewer voxels: the means over blocks of stride^3 voxels. A block is in the new mask if all its
+    voxels are in the mask. In a uniform organ, the means are a wave with the same wavelength."""
     if stride == 1:
         return field
     n = np.array(field.mask.shape) // stride

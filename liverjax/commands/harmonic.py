@@ -43,7 +43,7 @@ def _refuse_options(options: argparse.Namespace) -> None:
     given = {"fields": options.fields, "reactions": options.reactions, "png": options.png, "resume": options.resume}
     for name, value in given.items():
         if value:
-            raise InputError(f"--{name} cannot be used with [solve] kind = 'harmonic': leave it out")
+            raise InputError(f"--{name} cannot be used with [solve] kind = 'harmonic': remove this option")
 
 
 def _tell(scene: "Scene", ran: "Waves") -> None:

@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     for option, of_results in (("field", True), ("step", True), ("stretch", False)):
         if getattr(options, option) is not None and bool(results) != of_results:
             raise InputError(
-                f"--{option} is for {'results' if of_results else 'laws'}, not for {options.law[0]}: leave it out"
+                f"--{option} is for {'results' if of_results else 'laws'}, not for {options.law[0]}: remove this option"
             )
     if results:
         if len(options.law) > 1:

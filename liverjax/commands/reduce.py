@@ -18,14 +18,18 @@ def add(parsers: argparse._SubParsersAction) -> None:
     )
     command.add_argument("--out", type=Path, default=Path("model.h5"), metavar="MODEL.h5", help="the model (model.h5)")
     command.add_argument(
-        "--tolerance", type=float, default=1e-4, metavar="X", help="fraction of the motions that may be left out (1e-4)"
+        "--tolerance",
+        type=float,
+        default=1e-4,
+        metavar="X",
+        help="neglected fraction of the motions (1e-4)",
     )
     command.add_argument("--modes", type=int, default=40, metavar="N", help="maximum number of modes (40)")
     command.add_argument(
         "--runs",
         type=int,
         metavar="N",
-        help="number of full runs: two thirds are the first rows, the others have the largest stated errors (all rows)",
+        help="number of full runs (all rows): two thirds are the first rows, the others those with the largest errors",
     )
     command.set_defaults(run=run)
 

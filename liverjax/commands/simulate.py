@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     if scene.solve.kind == "harmonic":
         return harmonic.run(options, scene, text)
     if options.about:
-        raise InputError("--about is only for [solve] kind = 'harmonic': leave it out")
+        raise InputError("--about is only for [solve] kind = 'harmonic': remove --about")
     given = scene.points_are
     if given == "loaded":
         scene = unloaded(scene).scene
@@ -118,8 +118,8 @@ def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[
 
 
 def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:
-    """Return the run with a reduced model, or None if the full model has to run. The second result is the scene without
-    the reduced model."""
+    """Return (run, scene): run is the run with a reduced model, or None if the full model has to run. scene is the
+    scene without the reduced model."""
     if not scene.solve.reduced:
         return None, scene
     from liverjax.core.struct import replace
@@ -142,8 +142,8 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
 
 
 def _sizes_of_places(scene: "Scene") -> list[str]:
-    """Return lines with the area of each traction and the volume of each region. The user can check them, because only
-    whole triangles and whole elements are selected."""
+    """Return lines with the area of each traction and the volume of each region. The user should check
+    these sizes, because only whole triangles and whole elements are selected."""
     import numpy as np
 
     from liverjax.mesh.surface import areas
@@ -160,8 +160,8 @@ def _sizes_of_places(scene: "Scene") -> list[str]:
 
 
 def _write_and_tell(given: tuple["Scene", str, list[str]], ran: "Ran", target: Path, found: dict) -> None:
-    """Write the results with the text of the scene and the cautions. Print the cautions and the statistics of the
-    run."""
+    """Write the results with the content of the scene file and the warnings. Print the warnings and the statistics of
+    the run."""
     import numpy as np
 
     from liverjax.core.versions import versions

@@ -104,7 +104,7 @@ def _of_crushed(rows: dict[int, float]) -> list[str]:
 
 
 def _is_address(text: str) -> bool:
-    """Return whether the text is HOST:PORT. With an invalid port JAX would end with a segmentation fault."""
+    """Return whether a string is HOST:PORT. With an invalid port JAX would end with a segmentation fault."""
     host, _, port = text.rpartition(":")
     return bool(host) and port.isdigit() and 1 <= int(port) <= 65535
 
@@ -131,7 +131,7 @@ def _share(given: list[str]) -> tuple[int, int]:
         else:
             jax.distributed.initialize()
         process = (jax.process_index(), jax.process_count())
-        # Rows need no communication. The runtime is shut down at once, so a failed process does not stop the others.
+        # Runs need no communication. The runtime is shut down at once, so a failed process does not stop the others.
         jax.distributed.shutdown()
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]

@@ -22,7 +22,7 @@ def check_fields(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> Non
     """Raise `InputError` if a value of a struct is out of bounds, not finite or not a number. Nothing is compiled.
 
     Args:
-        thing: any struct; structs inside it are also checked. Values that are None or traced are skipped.
+        thing: any struct; structs inside it are also checked. Values that are None, or unknown inside jit, are skipped.
         name: name of the struct. It is put before the names of its fields: ``law`` gives ``law.mu``.
         leave: fields to skip, because they are checked elsewhere.
 
@@ -57,7 +57,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
     Args:
         where: name of the value, for the message.
         metadata: metadata of the field, from `param` or `static` of `liverjax.core.struct`.
-        value: a number, an array, or a sequence of numbers or arrays. Traced values are not checked.
+        value: a number, an array, or a sequence of numbers or arrays. Values inside jit, grad or vmap are not checked.
 
     Raises:
         InputError: the value is not a number, not finite, out of bounds, or not one of the words of a static field.
@@ -94,7 +94,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
 
 
 def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -> None:
-    """Raise an error that names the first bound which one of the numbers (n,) violates."""
+    """Raise an error for the first bound that one of the numbers (n,) violates."""
     unit, typical = metadata.get("unit", "1"), metadata.get("typical")
     if not np.isfinite(numbers).all():
         raise InputError(
@@ -126,12 +126,12 @@ def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> n
 
 
 def _in(unit: str) -> str:
-    """Return " in " and the unit, or an empty text for a number without a unit."""
+    """Return " in " and the unit, or an empty string for a number without a unit."""
     return "" if unit == "1" else f" in {unit}"
 
 
 def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> str:
-    """Return name and value as text. If there are many numbers, show only the first wrong number."""
+    """Return name and value as a string. If there are many numbers, show only the first wrong number."""
     if numbers.size > _FEW:
         first = int(np.argmax(wrong))
         return f"{where}, number {first + 1} of {numbers.size}, = {numbers[first]:g}"
@@ -162,7 +162,7 @@ def finite(value: float) -> bool:
 def array_of(value: object) -> np.ndarray | None:
     """Convert a number or lists of numbers from a scene file to a float array.
 
-    Returns None for texts, booleans, numbers that are not finite, and lists of unequal length.
+    Returns None for strings, booleans, numbers that are not finite, and lists of unequal length.
     """
     if not _is_numbers(value):
         return None
@@ -181,7 +181,7 @@ def _is_numbers(value: object) -> bool:
         return finite(value)
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError):  # a traced value cannot come from a file
+    except (TypeError, ValueError):  # a JAX tracer, which has no value, cannot come from a file
         return False
     return array.dtype.kind in "fiu" and bool(np.all(np.isfinite(array)))
 

@@ -1,8 +1,8 @@
-"""Compile a function for given arguments, and keep the compiled program on disk.
+"""Compile a function for given arguments, and keep the compiled program (here: program) on disk.
 
-A program on disk is found without tracing the function. JAX's own cache saves only the compilation: JAX must trace a
-function to find its program, which takes seconds for a large program. Here the key of a program is computed from the
-structure and the shapes of the arguments. The files are in the folder of `liverjax.core.program_cache`.
+To find a compiled program in JAX's own cache, JAX must first trace the function: it runs the Python code without
+numbers, which takes seconds for a large function. Here a program is found without tracing, because its key is computed
+from the structure and the shapes of the arguments. The files are in the folder of `liverjax.core.program_cache`.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ class _Unknown(Exception):
 def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False) -> Callable[..., Any]:
     """Compile `function` for arguments with these types and shapes, on one device.
 
-    A call of the result with such arguments only runs the program.
+    A call of the result with such arguments only runs the compiled program.
 
     Args:
         function: a function at the top level of a module, or `functools.partial` of such a function. The keywords of

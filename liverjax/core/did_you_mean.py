@@ -20,15 +20,15 @@ def hint(word: str, known: Iterable[str], before: str = "") -> str:
 
 
 def as_word(value: object, where: str) -> str:
-    """Return the value if it is text. This check is needed before the word is looked up.
+    """Return the value if it is a string. This check is needed before the word is looked up.
 
     Args:
         value: a value of a scene file.
         where: its name, for the message.
 
     Raises:
-        InputError: the value is not text.
+        InputError: the value is not a string.
     """
     if not isinstance(value, str):
-        raise InputError(f"{where} = {value!r} is not text: write one word in quotes")
+        raise InputError(f"{where} = {value!r} is not a string: write one word in quotes")
     return value

@@ -53,7 +53,7 @@ def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
 
 
 def mark_of(*arrays: object) -> str:
-    """Return a text that is equal only for equal arrays (SHA-256 of type, shape and bytes)."""
+    """Return a string that is equal only for equal arrays (SHA-256 of type, shape and bytes)."""
     found = hashlib.sha256()
     for a in map(np.asarray, arrays):
         found.update(f"{a.dtype} {a.shape}".encode() + np.ascontiguousarray(a).tobytes())
@@ -65,6 +65,6 @@ def refuse_other(file: Path, held: Mapping[str, object], marks: Mapping[str, obj
     other = [name for name, own in marks.items() if held.get(name) != own]
     if other:
         raise InputError(
-            f"{file} belongs to another fit ({', '.join(other)} differ{'s' * (len(other) == 1)}): leave out --resume "
+            f"{file} belongs to another fit ({', '.join(other)} differ{'s' * (len(other) == 1)}): remove --resume "
             "or name another --out"
         )

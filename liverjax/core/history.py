@@ -56,7 +56,7 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     except OSError as error:
         raise InputError(f"{name} history {path} cannot be read ({error.strerror}): give columns {wanted}") from None
     except UnicodeDecodeError:
-        raise InputError(f"{name} history {path} is not text: give columns {wanted}") from None
+        raise InputError(f"{name} history {path} is not a text file: give columns {wanted}") from None
     # NumPy would read a comment on the first line as the names of the columns.
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
@@ -75,7 +75,7 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
 
 
 def check_times(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> None:
-    """Raise `InputError` if a history made in Python cannot be used. The values of traced times are not checked.
+    """Raise `InputError` if a history made in Python cannot be used. Times inside jit are not checked.
 
     Raises:
         InputError: times without a history or a history without times, shapes that do not match, times that do not

@@ -1,4 +1,4 @@
-"""Find and replace values by their dotted names as in scene files, for example `law.1.mu`."""
+"""Find and replace values by the dotted names that scene files use, for example `law.1.mu`."""
 
 import dataclasses
 import itertools
@@ -42,7 +42,7 @@ def get(thing: Any, name: str, refusal: str) -> Any:
 
 
 def put(thing: Any, name: str, value: object, refusal: str) -> Any:
-    """Return a copy of `thing` with `value` at a dotted name. The value may be traced. See `walk` for the arguments."""
+    """Return a copy of `thing` with `value` at a dotted name (it may be a JAX tracer). See `walk` for the arguments."""
     for step in reversed(walk(thing, name, refusal)):
         value = step.with_inside(value)
     return value
@@ -59,8 +59,8 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
 
     Args:
         thing: a struct. Static fields, and fields that are None, cannot be named.
-        name: names of fields, indices of tuples and arrays, keys of dictionaries. Fields declared `unnamed` are left
-            out of the name.
+        name: names of fields, indices of tuples and arrays, keys of dictionaries. Fields declared `unnamed` do
+            not appear in the name.
         refusal: beginning of the error message.
 
     Raises:
@@ -147,4 +147,4 @@ def _is_place(word: str) -> bool:
 
 
 def _nowhere(word: str, places: int) -> str:
-    return f"{word!r} leads nowhere" + (f": use an index from 0 to {places - 1}" if places else "")
+    return f"{word!r} is not a name or index here" + (f": use an index from 0 to {places - 1}" if places else "")

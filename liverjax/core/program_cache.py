@@ -1,4 +1,4 @@
-"""Keep compiled programs on disk, so that a machine compiles each program only once.
+"""Keep compiled programs (here: programs) on disk, so that a machine compiles each program only once.
 
 This is JAX's cache in a separate folder of the user's cache directory. The name of the folder depends on the releases,
 the sources and the processor, so no other release, checkout or machine uses its programs. The environment variable
@@ -76,7 +76,8 @@ def _switch_on(folder: Path) -> None:
 def _folder() -> Path | None:
     """Return the folder for these releases, these sources and this processor.
 
-    The folder is made if it does not exist. Returns None without a cache.
+    The folder is made if it does not exist. Returns None if this cache is not used: it
+    is switched off, JAX uses another folder, or the folder cannot be written.
     """
     chosen = os.environ.get(SWITCH, "")
     if chosen.lower() == "off" or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
@@ -126,7 +127,10 @@ def _processor() -> str:
 
 
 def _forgotten(folder: Path, message: str) -> bool:
-    """Return whether a warning is about the cache. If it names a broken entry, remove it, since JAX would keep it."""
+    """Return whether a warning is about the cache.
+
+    If the warning names a broken entry, this entry is removed, since JAX would keep it.
+    """
     if "persistent compilation cache" not in message:
         return False
     if "reading" in message:

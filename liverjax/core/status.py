@@ -12,13 +12,13 @@ ONE_STEP = 8
 
 ADVICE = {
     CONVERGED: "converged",
-    STALLED: "the residual stopped falling above the tolerance: use a looser tolerance (in float32, with very stiff "
+    STALLED: "the residual stopped decreasing above the tolerance: use a looser tolerance (in float32, with very stiff "
     "springs or with very short time steps, rounding may allow no smaller residual), float64 or smaller steps",
     NOT_FINITE: "a residual was not finite, usually because of an inverted element: use smaller loads or steps, or a "
     "law with continued_below; check a law that you wrote with `python -m liverjax check`",
     INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (the body buckles, collapses, "
-    "or is stiff in bulk): use linear_solver = 'direct' or volumetric = 'mixed' if bulk is far above mu, otherwise "
-    "smaller steps, robust = 'projected' or, for a static scene, kind = 'dynamic'",
+    "or is nearly incompressible): use linear_solver = 'direct' or volumetric = 'mixed' if bulk is far above mu, "
+    "otherwise smaller steps, robust = 'projected' or, for a static scene, kind = 'dynamic'",
     INVERTED: "equilibrium was reached, but with inverted elements, which are not physical: use smaller loads, a "
     "stiffer volumetric energy or a finer mesh",
     STEP_CUT: "the step was halved as often as allowed and still failed: use smaller steps, robust = 'projected', "

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 T = TypeVar("T")
-#: One number, or an array with one number per element or sample; it may be traced.
+#: One number, or an array with one number per element or sample. It may be unknown (inside jit, grad or vmap).
 Number = float | np.ndarray | jax.Array
 #: Numbers as a user writes them: one number, a sequence of numbers, or an array.
 Numbers = Number | Sequence[float] | Sequence[Sequence[float]]
@@ -26,7 +26,7 @@ def static(
 ) -> Any:
     """Declare a field that is part of the structure, for example a tag or a count.
 
-    The field has no gradient, and a new value compiles a new program.
+    The field has no gradient, and a new value needs a new compilation.
 
     With `lower`, the value must be a whole number, `lower` or more. With `words`, the value must be one of these words
     (see `liverjax.core.bounds`).
@@ -61,7 +61,7 @@ def param(
         each: whether the value is a sequence with one number per term (or the components of a direction).
         typical: value for a soft tissue with a shear modulus of about 1 kPa. It is used if only the name of a law is
             given.
-        default: as in `dataclasses.field`.
+        default: see `dataclasses.field`.
         limits: ``lower`` and ``upper`` are inclusive bounds; ``above`` is a strict lower bound; ``nonzero=True`` means
             that 0 is not allowed.
     """
@@ -79,13 +79,13 @@ def param(
 
 
 def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.MISSING) -> Any:
-    """Declare a field that contains structs. Dotted names leave out its name: `law.mu`, not `law.law.mu`.
+    """Declare a field that contains structs. Dotted names do not contain its name: `law.mu`, not `law.law.mu`.
 
     Args:
         about: one line about the field.
         places: name of a method that returns the indices in this field for a word. For example, `support.0` is at the
             first index of ``named("support")``.
-        default: as in `dataclasses.field`.
+        default: see `dataclasses.field`.
     """
     return dataclasses.field(default=default, metadata={"about": about, "unnamed": places or True})
 

@@ -1,7 +1,7 @@
 """MJED (Multiplicative Jacobian Energy Decomposition): force and stiffness of tetrahedra from hand-derived formulas.
 
 The formulas follow section 4.1.2 of the chapter, with J as one of the invariants I_a. W_a and W_ab are the first and
-second derivatives of the energy W with respect to I_a, I_b. They are summed over all terms of W before the assembly:
+second derivatives of the energy density W with respect to I_a and I_b, summed over all terms of W before the assembly:
 
     f_i  = V0 sum_a W_a v_a,i                                             v_a,i = dI_a/dx_i
     K_ij = V0 [ sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j ]
@@ -56,7 +56,7 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
     Args:
         mesh: `TetMesh`.
-        law: any law; parameters may be traced.
+        law: any law. Derivatives with respect to its parameters are possible.
         x: positions (V, 3) [m].
     """
     return nodal_force(mesh, first_piola(mesh.at_points(law), deformation_gradient(mesh, x)))
@@ -167,9 +167,9 @@ def stiffness_matrix(
     """Second derivative of the total energy, a sparse matrix (3V, 3V) [N/m]. Degree of freedom: 3 * node + component.
 
     Args:
-        mesh, law, x: as in `internal_force`.
-        regularised: use the regularisation of section 4.1.2 iii, with an unchanged trace. It changes the path of
-            Newton's iterations, but not their solution.
+        mesh, law, x: the same arguments as for `internal_force`.
+        regularised: use the regularisation of section 4.1.2 iii, with an unchanged trace. The regularisation changes
+            the path of Newton's iterations, but not their solution.
         terms: "contracted", or "chapter" for the six terms per product g(I1, I2) h(J) of the chapter. Both give
             the same matrix up to roundoff.
     """

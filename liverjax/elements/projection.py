@@ -6,9 +6,10 @@ the 2 x 2 matrix are a - b (twist) and a + b (flip) (Smith, De Goes, Kim 2019, A
 distortion energies). Negative eigenvalues are replaced by their absolute values (Chen et al. 2024). Then the blocks are
 rotated back.
 
-The terms of fibres, of Green's strain and of the viscous memory have other axes. For Green's strain and viscosity, the
-geometric stiffness uses the stress S, with its eigenvalues replaced by their absolute values. The negative part of the
-stiffness of a fibre is left out. Then no term has a negative eigenvalue, and the sum of the terms has none.
+The terms of fibres, of Green's strain and of the history variables of viscosity have other axes. For Green's strain and
+viscosity, the geometric stiffness uses the stress S, with its eigenvalues replaced by their absolute values. The
+negative part of the stiffness of a fibre is omitted. Then no term has a negative eigenvalue, and their sum has none
+either.
 """
 
 from typing import Any, NamedTuple
@@ -91,7 +92,7 @@ def blocks(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """Stiffness blocks as in `invariant_terms.blocks`, but the element matrix has no negative eigenvalue.
+    """Stiffness blocks in the form of `invariant_terms.blocks`, for an element matrix without negative eigenvalues.
 
     Args:
         parts: pairs (weight, law); the energy is the weighted sum.
@@ -136,7 +137,8 @@ def blocks(
 def _by_subset(
     parts: list[tuple[Number, Law]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple, volume: Scalars | None
 ) -> list[Matrix]:
-    """Compute `blocks` for laws of several kinds, each only in the elements of its region."""
+    """Return the same as `blocks` if the regions have laws of different kinds. Each law is evaluated only in the
+    elements of its region."""
     groups = next(law.subsets for _, law in parts if law.subsets is not None)
 
     def own(k: int) -> list[Matrix]:
@@ -178,9 +180,9 @@ def _diagonal_matrix(value: Any) -> Matrix:
 
 
 def _fibre(W4: Number, W44: Number, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """Fibre stiffness 2 W_4 (a.D_i)(a.D_j) Id + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa; negative eigenvalues are set to 0.
+    """Fibre stiffness 2 W_4 (a.D_i)(a.D_j) I + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa; negative eigenvalues are set to 0.
 
-    W_4 and W_44 are derivatives with respect to I4, and a is the fibre direction.
+    W_4 and W_44 are derivatives with respect to the invariant I4, a is the fibre direction, and D are shape vectors.
     """
     Fa = matvec(F, a)
     across = jnp.maximum(2 * W4, 0.0)

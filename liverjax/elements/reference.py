@@ -33,13 +33,13 @@ _VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Total strain energy [J] at positions x (V, 3) [m], from deformation gradients (..., E, 3, 3)."""
+    """Total strain energy [J] at positions x (V, 3) [m], computed from arrays of deformation gradients."""
     return jnp.sum(mesh.weights * mesh.at_points(law).energy(_gradient(mesh, x)))
 
 
 @jax.jit
 def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Gradient (V, 3) [N] of the total energy, by reverse-mode differentiation."""
+    """Gradient (V, 3) [N] of the total energy with respect to the positions, by reverse-mode differentiation."""
     return jax.grad(energy, argnums=2)(mesh, law, x)
 
 

@@ -16,7 +16,7 @@ def number_of(text: str) -> float:
     """Convert a cell of a table to a number. Unlike in Python, underscores and non-ASCII digits are not allowed.
 
     Raises:
-        ValueError: the text is not such a number.
+        ValueError: the string is not such a number.
     """
     if "_" in text or not text.isascii():
         raise ValueError(text)
@@ -24,10 +24,10 @@ def number_of(text: str) -> float:
 
 
 def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
-    """Convert texts such as ``law.mu=500:1000`` to {name: (low, high)}.
+    """Convert strings such as ``law.mu=500:1000`` to {name: (low, high)}.
 
     Raises:
-        InputError: a text is not a range of numbers, a range has low >= high, or a name occurs twice.
+        InputError: a string is not a range of numbers, a range has low >= high, or a name occurs twice.
     """
     ranges: dict[str, tuple[float, float]] = {}
     for text in given:

@@ -1,4 +1,4 @@
-"""Run a scene in parts of some steps. Finished parts stay on disk, so that a killed run can continue from there.
+"""Run a scene in parts of some steps each. Finished parts stay on disk, so that a killed run can continue from them.
 
 A folder next to the output has one file per part, with the results of its steps and the state after its last step.
 Every part begins with a new tangent matrix, even if the run was not stopped before this part. So a resumed run gives

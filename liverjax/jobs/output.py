@@ -20,7 +20,7 @@ from liverjax.simulation.run import Result
 if TYPE_CHECKING:
     import h5py
 
-#: Parts of a result with one number per step.
+#: Fields of a `Result` with one number per step.
 BY_STEP = ("status", "iterations", "linear_iterations", "cuts", "residual")
 #: Maximum size of an attribute [bytes]. HDF5 allows 64 kB, including name and shape of the attribute.
 _MOST_IN_ATTRIBUTE = 65_000
@@ -82,7 +82,7 @@ def read_by_step(file: "h5py.File", name: str) -> np.ndarray:
 
 
 def write_reactions(file: Path, scene: Scene, result: Result) -> None:
-    """Write the forces of the fixed, moved and supported parts over time to a CSV file."""
+    """Write the support forces over time (`liverjax.jobs.reactions`) to a CSV file."""
     names, rows = reaction_table(scene, result)
     lines = [",".join(names), *(",".join(f"{number:.10g}" for number in row) for row in rows)]
     with whole(file) as new:

@@ -13,7 +13,7 @@ from liverjax.mesh.tetrahedra import tet_mesh
 
 
 class Surface(NamedTuple):
-    """The surface to draw, with the text of the picture."""
+    """The surface to draw, with the labels of the picture."""
 
     before: np.ndarray  # (V, 3) [m]
     after: np.ndarray  # (V, 3) [m]

@@ -1,4 +1,4 @@
-"""Support forces on the body over time, for each fixed, moved or supported part: the table of `reactions.csv`."""
+"""Support forces on the body over time, for each fixed, displaced or support condition: table of `reactions.csv`."""
 
 from typing import Any
 
@@ -42,11 +42,11 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
 
 
 def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
-    """Return {name: force (T, 3) [N]} of every fixed, displaced and sliding part, from the nodal forces (T, V, 3).
+    """Return {name: force (T, 3) [N]} of each fixed, displaced or sliding condition, from nodal forces (T, V, 3).
 
-    The force of a part acts along the axes that the part constrains; the force of a sliding part acts along its normal.
-    If two parts constrain the same axis of a node, the force along this axis counts only for the first part. So the sum
-    over all parts is the total force on the body.
+    The force of a fixed or displaced condition acts along the axes that it constrains. The force of a sliding support
+    acts along its normal. If two conditions constrain the same axis of a node, the force along this axis counts only
+    for the first condition. So the sum over all conditions is the total force on the body.
     """
     taken, found = np.zeros(reactions.shape[1:], bool), {}
 
@@ -69,7 +69,8 @@ def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
         if physics.axis:
             found[f"support.{k}"] = along(nodes, [AXES.index(physics.axis)])
             continue
-        # Where other parts already constrain all axes of an oblique normal, the sliding support carries no force.
+        # If fixed or displaced conditions already constrain a node along every axis in which the normal has a
+        # component, the sliding support gets no force at this node.
         normal = np.asarray(physics.normal)
         loose = nodes[~held[nodes][:, np.abs(normal) > 1e-12].all(axis=1)]
         found[f"support.{k}"] = (reactions[:, loose] @ normal).sum(axis=1)[:, None] * normal

@@ -29,7 +29,7 @@ def learnt(model: ReducedModel) -> str:
     if model.correction is None:
         return "no correction: too few training runs, or no correction reduced the errors"
     left = np.asarray(model.correction.left)
-    return f"corrected; runs left out have errors of {np.median(left):.2g} of their motion (largest {left.max():.2g})"
+    return f"corrected; cross-validated errors {np.median(left):.2g} of the motion (median; largest {left.max():.2g})"
 
 
 class Tried(NamedTuple):

@@ -73,7 +73,7 @@ class Done(NamedTuple):
     file: Path | None  # None: other processes still have chunks to compute
     failed: dict[int, int]  # row number -> status code
     computed: int  # number of runs that this process computed now
-    crushed: dict[int, float]  # row number of a converged run -> its volume ratio J outside of the range of tissues
+    crushed: dict[int, float]  # row number of a converged run -> its final volume ratio J, if no tissue can reach it
 
 
 def read_sweep(
@@ -148,7 +148,7 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     try:
         text = file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not text"
+        reason = getattr(error, "strerror", None) or "it is not a text file"
         raise InputError(f"{file} cannot be read ({reason}): give a CSV file of parameters") from None
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     for mark, name in ((";", "semicolons"), ("\t", "tabs")):
@@ -161,7 +161,7 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     if "" in names:
         raise InputError(f"{file}: column {names.index('') + 1} has no name: give it a name, or remove its comma")
     if len(set(names)) < len(names):
-        raise InputError(f"{file} names {max(names, key=names.count)} twice: leave one column out")
+        raise InputError(f"{file} names {max(names, key=names.count)} twice: remove one column")
     rows = []
     for k, row in enumerate(table[1:]):
         if len(row) != len(names):

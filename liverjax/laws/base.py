@@ -41,7 +41,7 @@ class Law(Energies):
         raise InputError(f"law {type(self).__name__} has no ground-state shear modulus: define shear_modulus(self)")
 
     def bulk_modulus(self) -> Any:
-        """Ground-state bulk modulus [Pa]: `bulk`, if all other energies of the law are isochoric."""
+        """Ground-state bulk modulus [Pa]. This is `bulk` if all other energies of the law are isochoric."""
         if type(self).strain_energy is not Energies.strain_energy or self.green_energy is not None:
             raise InputError(f"law {type(self).__name__} has no ground-state bulk modulus: define bulk_modulus(self)")
         return 0.0 if self.bulk is None else self.bulk
@@ -51,7 +51,7 @@ class Law(Energies):
         self.check_directions()
 
     def check_directions(self) -> None:
-        """Raise `InputError` if a fibre has length 0. Traced fibres are not checked."""
+        """Raise `InputError` if a fibre has length 0. Fibres inside jit, grad or vmap are not checked."""
         if self.fibre is None or any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(self.fibre)):
             return
         if not np.all(np.linalg.norm(np.asarray(self.fibre, float), axis=-1) > 0):
@@ -60,7 +60,7 @@ class Law(Energies):
     # -- parts of a law -----------------------------------------------------------------------------------------------
 
     def each(self, change: Callable[["Law"], "Law"]) -> "Law":
-        """Apply `change` to the law of every part of the body."""
+        """Return `change(law)`. If the body has laws of several kinds, `change` is applied to each of them."""
         return change(self)
 
     def isochoric_part(self) -> Any:
@@ -92,7 +92,7 @@ class Law(Energies):
         return pack(invariant_terms.first_piola(self, unpack(_floating(F))))
 
     def tangent(self, F: jax.Array) -> jax.Array:
-        """Tangent d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), from the hand-derived stiffness blocks for unit vectors."""
+        """Tangent d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), from hand-derived stiffness blocks for unit vectors."""
         A = invariant_terms.tangent(invariant_terms.state(self, unpack(_floating(F))))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
         # pack gives (..., i, k). Stacking L as last axis, and then J as second axis, gives (..., i, J, k, L).
@@ -118,7 +118,7 @@ def _floating(F: Number) -> jax.Array:
 class Sum(Law):
     """Several laws acting in parallel. The energy is the sum of their energies."""
 
-    laws: tuple = unnamed("laws that add up")
+    laws: tuple = unnamed("laws whose energies are added")
 
     def summands(self):
         """Return the laws of the sum."""
@@ -127,7 +127,7 @@ class Sum(Law):
     def isochoric_part(self):
         """Return the sum of the isochoric parts.
 
-        Laws that are only volumetric are left out. Returns None if another law has no isochoric part.
+        Laws with only a volumetric energy do not contribute. Returns None if another law has no isochoric part.
         """
         parts = [law.isochoric_part() for law in self.laws if not isinstance(law, Volumetric)]
         return None if any(part is None for part in parts) else _added(parts)
@@ -146,7 +146,7 @@ class Sum(Law):
             law.check()
 
     def measures(self, F):
-        """Return one set of invariants for each law of the sum. Invariants that laws share are computed once."""
+        """Return one set of invariants for each law of the sum. Invariants that several laws need are computed once."""
         return tuple(law.measures(F) for law in self.laws)
 
     def strain_energy(self, I):
@@ -170,11 +170,11 @@ class Sum(Law):
         return first, second
 
     def shear_modulus(self):
-        """The sum of the laws' shear moduli [Pa]."""
+        """Sum of the ground-state shear moduli of the laws [Pa]."""
         return sum(law.shear_modulus() for law in self.laws)
 
     def bulk_modulus(self):
-        """The sum of the laws' bulk moduli [Pa]."""
+        """Sum of the ground-state bulk moduli of the laws [Pa]."""
         return sum(law.bulk_modulus() for law in self.laws)
 
 
@@ -217,7 +217,7 @@ class Volumetric(Law):
         return 0.0
 
     def bulk_modulus(self):
-        """Bulk modulus K [Pa]: at rest, the second derivative of every form of U is K."""
+        """Bulk modulus K [Pa]. At rest, the second derivative of every form of U is K."""
         return self.bulk
 
 

@@ -1,4 +1,4 @@
-"""A body with laws of several kinds. Each element is computed only with the law of its region."""
+"""A body with laws of several kinds. In each element, only the law of its region is evaluated."""
 
 from collections.abc import Callable
 from typing import Any

@@ -37,7 +37,7 @@ class Continued(Law):
         return None if part is None else Volumetric(bulk=part.bulk, volumetric=part.volumetric, below=self.below)
 
     def without_volume(self) -> Law | None:
-        """Return the original law without its volumetric energy, continued."""
+        """Return the continued law without its volumetric energy."""
         part = self.law.without_volume()
         return self if part is self.law else None if part is None else Continued(law=part, below=self.below)
 
@@ -102,8 +102,8 @@ def continued(law: Law, below: float) -> Law:
         below: c, between 0 and 1, e.g. 0.1.
 
     Raises:
-        InputError: c is out of bounds; or the law has an energy of stretches, fibres or Green's strain (which is always
-            finite).
+        InputError: c is out of bounds; or the law has an energy of principal stretches, of fibres or of Green's strain
+            (which is always finite).
     """
     if isinstance(below, bool) or not isinstance(below, (int, float)) or not 0 < below < 1:
         raise InputError(f"law continued_below = {below!r} must lie between 0 and 1: give e.g. 0.1")

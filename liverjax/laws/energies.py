@@ -19,22 +19,22 @@ class Energies:
     invariants: ClassVar[tuple[str, ...]] = ("I1", "J")
     #: Every law is a struct, so `dataclasses.replace` works on it.
     __dataclass_fields__: ClassVar[Content]
-    #: The energies of a law; None: the law has no energy of this kind.
+    #: The energies of a law. None means that the law has no energy of this kind.
     isochoric_energy: Any = None
     stretch_energy: Any = None
     green_energy: Any = None
-    #: Hand-derived derivatives of these energies; None: automatic differentiation.
+    #: Hand-derived derivatives of these energies. None means automatic differentiation.
     isochoric_derivatives: Any = None
     stretch_derivatives: Any = None
     green_derivatives: Any = None
     #: Method that returns the exponents alpha_k of a `stretch_energy`.
     exponents: Any
-    #: Fields of the volumetric energy U(J), and fields for directions; None: the law has no such energy or direction.
+    #: Fields of the volumetric energy U(J), and fields for directions. None means no such energy or direction.
     bulk: Number | None = None
     volumetric: str
     fibre: Numbers | None = None
     sheet: Numbers
-    #: Elements of each law (`liverjax.tensors.subsets.Subsets`); None: the whole body has one law.
+    #: Elements of each law (`liverjax.tensors.subsets.Subsets`). None means that the whole body has one law.
     subsets: Any = None
 
     def strain_energy(self, I: Invariants) -> Any:
@@ -72,11 +72,11 @@ class Energies:
         return (self,)
 
     def pieces(self) -> tuple[Any, ...]:
-        """Return the laws of the parts of the body. This is the law itself, unless regions have laws of other kinds."""
+        """Return the laws of the body. This is only the law itself, unless regions have laws of other kinds."""
         return (self,)
 
     def piece(self, k: int) -> Any:
-        """Return the law of part k of the body, with the parameters of the elements in this part."""
+        """Return law k of `pieces`, with the parameters of the elements that have this law."""
         return self
 
     # -- arguments of the energies -------------------------------------------------------------------------------------
@@ -94,7 +94,7 @@ class Energies:
         return I if self.bulk is None else I._replace(J=determinant(F))
 
     def material_axes(self, like: Number) -> Matrix:
-        """Return columns fibre, sheet and normal in the precision of `like`; without a fibre, the coordinate axes."""
+        """Return fibre, sheet and normal as columns, in the precision of `like`. Without a fibre: coordinate axes."""
         return orthogonal_axes(self.fibre, None if self.fibre is None else self.sheet, like)
 
 

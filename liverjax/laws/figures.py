@@ -1,4 +1,4 @@
-"""Draw figures of laws: stress over stretch, and the gradient check."""
+"""Draw figures of laws: stress-stretch curves, and the gradient check."""
 
 from pathlib import Path
 
@@ -46,7 +46,7 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
 
 
 def gradient_check(result: Check, name: str, file: Path) -> None:
-    """Draw the errors of difference quotients over the step, and stress-stretch curves within their stable ranges."""
+    """Draw the errors of difference quotients as a function of the step, and the stress within the stable ranges."""
     figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 3.8), layout="constrained")
     for (label, errors), colour in zip(result.difference_errors.items(), (BLUE, ORANGE), strict=True):
         left.loglog(result.steps, errors, "o-", ms=3, color=colour, label=label)

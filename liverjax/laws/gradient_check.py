@@ -50,12 +50,12 @@ class Check(NamedTuple):
 
     @property
     def failed(self) -> list[Row]:
-        """Rows that did not pass."""
+        """Return the rows that did not pass."""
         return [row for row in self.rows if row.passed is False]
 
 
 def load(name: str) -> Law:
-    """Load an included law by its name, or the law FILE.py:LAW of a Python file. A class gets its typical parameters.
+    """Return an included law by its name, or the law FILE.py:LAW of a Python file. A class gets its typical parameters.
 
     Raises:
         InputError: the law or file does not exist, the file does not run, or a parameter has no typical value.
@@ -146,7 +146,10 @@ def _typical_law(cls: type, name: str) -> Law:
     values = {f.name: f.metadata.get("typical") for f in laws.parameters(cls)}
     missing = [n for n, v in values.items() if v is None]
     if missing:
-        raise InputError(f"{name}: parameter {missing[0]} has no typical value: give param(…, typical=…) or an object")
+        raise InputError(
+            f"{name}: parameter {missing[0]} has no typical value: write param(…, typical=…) in the class, or name an "
+            "object of this class instead of the class (FILE.py:OBJECT)"
+        )
     try:
         return cls(**values)
     except TypeError as error:
@@ -156,7 +159,7 @@ def _typical_law(cls: type, name: str) -> Law:
 
 
 def check(law: Law) -> Check:
-    """Run all checks, one per row. A wrong law raises no error, but some of its rows fail."""
+    """Run all checks and return one row for each check. A wrong law raises no error, but some of its rows fail."""
     programs = [jax.jit(lambda law, F, what=what: getattr(law, what)(F)) for what in _PROGRAMS]
     energy, stress, tangent = (partial(program, law) for program in programs)
     more, stable = _stability(law, tangent)
@@ -183,8 +186,8 @@ def check(law: Law) -> Check:
 def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarray, Row]:
     """Return deformation gradients, directions, and a row with their range of stretches.
 
-    The range is `_MODERATE`. If the law is not finite there, it is the widest of the narrower ranges with finite
-    values.
+    The range is `_MODERATE`, or, if the law is not finite there, the widest range of `_NARROWER` in which the law is
+    finite.
     """
     for low, high in (_MODERATE, *_NARROWER):
         F, D = _samples(low, high)
@@ -207,10 +210,10 @@ def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarr
 
 
 def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], programs: Sequence[Callable]) -> list[Row]:
-    """Return rows that compare stress and tangent with automatic differentiation.
+    """Return two rows that compare stress and tangent with automatic differentiation.
 
-    There are three comparisons: at moderate stretches, over the stable range, and with other parameters, none of which
-    is 0. The row shows the first comparison that fails.
+    Each row stands for three comparisons: at moderate stretches, over the stable range, and with changed parameters,
+    none of which is 0. The row shows the first comparison that fails.
     """
     low, high = max(stable[0], 0.5), min(stable[1], 2.0)
     sets = [("", law, F)]
@@ -232,12 +235,12 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
 
 
 def _with_other_parameters(law: Law) -> Law:
-    """Return the law with other parameters, none of which is 0."""
+    """Return the law with changed parameters, none of which is 0."""
     return jax.tree.map(lambda v: jnp.where(jnp.asarray(v) == 0, 0.1, 0.8 * jnp.asarray(v)), law)
 
 
 def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]:
-    """Check whether the energy is the sum of its two parts. Viscosity and mixed elements use only the parts."""
+    """Return a row: is the energy the sum of its parts? Viscosity and mixed elements use only the parts."""
     isochoric, volumetric = law.isochoric_part(), law.volumetric_part()
     if isochoric is None or volumetric is None:
         return []
@@ -246,7 +249,7 @@ def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]
 
 
 def _idle_parameters_row(law: Law, programs: Sequence[Callable], F: np.ndarray) -> list[Row]:
-    """Return a row with the parameters that change neither energy nor stress, or no row without such parameters."""
+    """Return a row with the parameters that change neither energy nor stress. Returns no row if there are none."""
     law = _with_other_parameters(law)
     leaves, structure = jax.tree_util.tree_flatten_with_path(law)
     before, idle = [_as_numbers(partial(f, law), F) for f in programs], []
@@ -268,7 +271,7 @@ def _as_numbers(function: Callable, F: np.ndarray) -> np.ndarray:
 
 
 #: To find a jump of the stiffness at rest, the stiffness is computed at the distance `NEAR` from rest. Without a jump,
-#: its relative change is less than `JUMP`.
+#: the relative change of the stiffness is less than `JUMP`.
 NEAR, JUMP = 1e-7, 1e-4
 
 
@@ -288,7 +291,8 @@ def _samples(low: float = _MODERATE[0], high: float = _MODERATE[1]) -> tuple[np.
 
 
 def _difference(function: Callable, F: np.ndarray, D: np.ndarray, h: float, exact: np.ndarray) -> float:
-    """Return the maximum relative error of the central difference with step h."""
+    """Return the maximum difference between the central difference of `function` in the direction D, with step h, and
+    the derivative `exact`, divided by the maximum of |exact|."""
     quotient = (_as_numbers(function, F + h * D) - _as_numbers(function, F - h * D)) / (2 * h)
     return float(np.abs(quotient - exact).max() / max(np.abs(exact).max(), 1e-300))
 
@@ -384,7 +388,7 @@ def _limits_of_energy(energy: Callable) -> list[Row]:
 
 
 def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
-    """Return rows with the ranges around rest with increasing stress and strong ellipticity.
+    """Return rows with the ranges around rest in which the stress increases and the law is strongly elliptic.
 
     A row fails if the rest state is not stable. A law without stiffness at rest, for example a law with only fibres, is
     neither stable nor unstable there, so its row does not fail.
@@ -413,8 +417,8 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
 
 
 #: In a step with a jump, the change of the energy differs from the work of the stress. If the difference is above the
-#: fraction `_MISSED`, the step is cut into `_PARTS` parts, and the worst part again (`_CUTS` times). A jump stays in
-#: one part. Without a jump, the difference decreases.
+#: fraction `_MISSED`, the step is divided into `_PARTS` substeps, and the worst substep again (`_CUTS` times). A jump
+#: stays in one substep. Without a jump, the difference decreases.
 _MISSED, _PARTS, _CUTS = 0.05, 32, 3
 
 
@@ -456,7 +460,7 @@ def _jumps(law: Law, energy: Callable) -> list[Row]:
 
 
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Return whether the nominal stress increases (n,). One-sided differences are used at the ends."""
+    """Return for each state (n,) whether the nominal stress increases. One-sided differences are used at the ends."""
     stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
     with np.errstate(all="ignore"):
         return np.gradient(stress, driven) > 0
@@ -484,7 +488,7 @@ def _range(driven: np.ndarray, stable: np.ndarray, start: int) -> tuple[float, f
 
 
 def table(result: Check) -> str:
-    """Return the rows as text, below the first line of the law's docstring."""
+    """Return the table as a string: the first line of the law's docstring, then the rows."""
     width = max(len(row.name) for row in result.rows)
     mark = {True: "ok", False: "FAILED", None: ""}
     lines = [(type(result.law).__doc__ or type(result.law).__name__).strip().splitlines()[0]]

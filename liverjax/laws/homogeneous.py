@@ -41,11 +41,11 @@ def deformation_gradient(test: str, driven: Number, stretch: Any = 1.0) -> jax.A
 
 
 def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
-    """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample with a free face 3, so that P_33 = 0.
+    """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample without traction along axis 3.
 
-    P = dW/dF - p cof F. The volumetric energy of a law does not contribute. A law without a separate volumetric energy
-    is evaluated at det F = 1. `constant` means that F is data and that no derivative with respect to F is needed. For a
-    law of principal stretches, derivatives with respect to its parameters then need much less time.
+    P = dW/dF - p cof F with P_33 = 0. The volumetric energy of a law does not contribute. A law without a separate
+    volumetric energy is evaluated at det F = 1. `constant` means that F is data and that no derivative with respect to
+    F is needed. For a law of principal stretches, derivatives with respect to its parameters then need much less time.
     """
     split = law.isochoric_part()
     if constant and split is not None and split.stretch_energy is not None:
@@ -62,5 +62,5 @@ def measured(test: str, P: jax.Array) -> jax.Array:
 
 
 def response(law: Law, test: str, driven: Number, stretch: Number = 1.0) -> jax.Array:
-    """Nominal stress [Pa] of a test at stretches or amounts of shear (...)."""
+    """Return the nominal stress [Pa] that a test measures, at stretches or amounts of shear `driven` (...)."""
     return measured(test, nominal_stress(law, deformation_gradient(test, driven, stretch)))

@@ -1,4 +1,4 @@
-"""Isotropic laws in thin parts of a body: layers without stress through the thickness, and bars."""
+"""Isotropic laws of layers without stress through the thickness, and of bars."""
 
 import dataclasses
 from typing import Any
@@ -16,7 +16,7 @@ _ITERATIONS, _LONGEST = 30, 0.5
 
 
 def read_layer(table: object, name: str) -> Law:
-    """Read the law of a thin part from its table. The bulk modulus has no effect and may be left out.
+    """Read the law of a layer or bar from its table. The bulk modulus has no effect and need not be given.
 
     Raises:
         InputError: a law or parameter is unknown. The message begins with `name`.
@@ -40,7 +40,7 @@ def check(law: Law, name: str) -> None:
         InputError: the message begins with `name` if the law has directions.
     """
     if any(one.fibre is not None or one.green_energy is not None for one in law.summands()):
-        raise InputError(f"{name}.law has directions, which a thin part cannot use: use an isotropic law")
+        raise InputError(f"{name}.law has directions, which a layer or bar cannot use: use an isotropic law")
     law.check()
 
 
@@ -66,7 +66,8 @@ def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
 
 
 def _thinned(density: Any, start: jax.Array) -> jax.Array:
-    """Return the logarithm (Q, m) of the thickness stretch with the minimum energy. Its derivatives are exact."""
+    """Return the logarithm (Q, m) of the thickness stretch with the minimum energy. The derivatives of this
+    result are exact."""
 
     def slope(u: jax.Array) -> jax.Array:
         return jax.jvp(density, (u,), (jnp.ones_like(u),))[1]

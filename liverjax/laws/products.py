@@ -1,4 +1,4 @@
-"""Laws as in the book chapter (section 4.1.2 i): sums of products g(I1, I2) h(J), and functions of such sums."""
+"""Laws as sums of products g(I1, I2) h(J), and functions of such sums (book chapter, section 4.1.2 i)."""
 
 from collections.abc import Callable
 from math import comb
@@ -31,7 +31,7 @@ class Product(NamedTuple):
 
 
 class Group(NamedTuple):
-    """A function phi(sum_k W^k) of products. `slopes` returns phi' and phi'' for a sum; None: phi is the identity."""
+    """A function phi(sum_k W^k) of products. `slopes` returns phi' and phi''; None means phi(s) = s."""
 
     products: list[Product]
     slopes: Callable[[Number], tuple[Number, Number]] | None = None

@@ -79,7 +79,7 @@ def create(name: str, **values: Numbers) -> Law:
             raise InputError(f"law {name} needs parameter {key} [{field.metadata.get('unit', '')}]: give {key} = …")
     for key, value in values.items():
         if value is None and known[key].default is None:
-            continue  # an optional coefficient left out
+            continue  # an optional coefficient that is not given
         check_value(f"law {name}: {key}", known[key].metadata, value)
     law = cls(**{k: _sequence(v) if known[k].metadata.get("each") else v for k, v in values.items()})
     if not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(law)):
@@ -88,7 +88,7 @@ def create(name: str, **values: Numbers) -> Law:
 
 
 def _sequence(value: Any) -> Any:
-    """Return the parameters of the terms as a tuple, so that each is a leaf. Directions per element stay an array."""
+    """Return the parameters of the terms as a tuple, so that each is a leaf. An array of directions is not changed."""
     if isinstance(value, (list, tuple)) and not any(isinstance(v, (list, tuple)) for v in value):
         return tuple(value)
     if jnp.ndim(value) == 0:

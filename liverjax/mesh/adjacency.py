@@ -27,22 +27,23 @@ NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
 
 @struct
 class Clusters:
-    """Groups (clusters) of near nodes in thin cells, and the sources of the entries of their matrices.
+    """Groups (clusters) of near nodes in thin elements, and the pairs of nodes that give the entries of their matrices.
 
     The matrix of a cluster with M nodes has M x M blocks. The block of its members a < b has the index a M + b.
     """
 
     nodes: jax.Array = param("1", "members of every cluster (G, M), padded with 0")
     there: jax.Array = param("1", "1 for a member, 0 for padding (G, M)")
-    places: jax.Array = param("1", "index of every source (n,) in all blocks (G M M)")
+    places: jax.Array = param("1", "index (n,) of the block of each pair of nodes, among all blocks (G M M)")
     sources: tuple[jax.Array, ...] = param(
-        "1", "arrays (n,): the edge of two vertices; or element, two functions, and the sign of their product"
+        "1",
+        "arrays (n,), one entry for each pair: its edge; or its element, two functions, and the sign of their product",
     )
 
 
 @struct
 class Pattern:
-    """Edges, and the neighbours of every node in rows of equal length W (ELL format). The assembly needs no search."""
+    """Edges, and the neighbours of every node in rows of equal length W (ELL format): the assembly needs no search."""
 
     edges: jax.Array = param("1", "node numbers (2, N), the lower first")
     element_edges: jax.Array = param("1", "edge number of each node pair in `PAIRS` (6, E)")
@@ -51,15 +52,15 @@ class Pattern:
     edge_slots: jax.Array = param("1", "index of each edge (N,) in the flattened rows, in the row of its lower node")
     patches: jax.Array = param("1", "number of the patch of every node (V,), for the coarse space")
     patch_functions: jax.Array = param("1", "for every node: 1, and its scaled position in its patch (-1 to 1), (V, 4)")
-    patch_width: jax.Array = param("m", "largest extent of a patch, mean over all patches")
-    clusters: Any = param("1", "`Clusters` of the vertices, where cells are thin", default=None)
+    patch_width: jax.Array = param("m", "mean of the largest extents of the patches")
+    clusters: Any = param("1", "`Clusters` of the vertices, where elements are thin", default=None)
     number_of_patches: int = static(default=1, about="P")
 
 
 def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
     """Return the pattern of elements (E, 4) with points (V, 3) [m]. Equal meshes give equal patterns.
 
-    The points may be traced (for derivatives with respect to the shape). Then all nodes are in one patch.
+    The points may be unknown (inside jit, grad or vmap). Then all nodes are in one patch.
     """
     number_of_nodes = points.shape[0]
     traced = isinstance(points, jax.core.Tracer)
@@ -100,7 +101,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
 
 
 def node_numbers(of: Any) -> jax.Array:
-    """Return a copy as 32-bit integers. NumPy converts them, since JAX would compile a program for each shape."""
+    """Return a copy as 32-bit integers, made by NumPy because JAX would compile a program for each shape."""
     return jax.device_put(np.asarray(of).astype(np.int32))
 
 
@@ -136,7 +137,7 @@ def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, j
 
 
 def vertex_clusters(points: np.ndarray, edges: np.ndarray) -> Clusters | None:
-    """Return the clusters of vertices (V, 3) [m] with edges (2, N). Returns None if few cells are thin."""
+    """Return the clusters of vertices (V, 3) [m] with edges (2, N). Returns None if few elements are thin."""
     return _clustered(near_groups(points, edges), edges, (np.arange(edges.shape[1]),))
 
 
@@ -179,7 +180,7 @@ def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _packed(group: np.ndarray) -> np.ndarray:
-    """Join groups of several nodes up to the size of the largest group, so that equal blocks need little padding."""
+    """Join small groups, up to the size of the largest group, so that blocks of equal size need little padding."""
     size = np.bincount(group)
     largest, free, last = int(size.max()), 0, 0
     new = np.arange(len(size))

@@ -34,7 +34,7 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
     stops = np.unique([0.0, *cells, length])
     parts = [np.zeros(1)]
     for low, high in itertools.pairwise(stops):
-        # Geometric spacing at both ends, so that cells much shorter than the part are resolved.
+        # Geometric spacing at both ends, so that cells much shorter than the interval are resolved.
         half = np.concatenate([np.zeros(1), np.geomspace(1e-6, 0.5, 500)])
         x = low + (high - low) * np.concatenate([half, 1 - half[-2::-1]])
         cell = np.full_like(x, largest)
@@ -88,7 +88,7 @@ def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1
     of its circle.
 
     Args:
-        radii, heights: as in `graded_cylinder`.
+        radii, heights: see `graded_cylinder`.
         corners: number of corners of every ring of the whole cylinder, at least 3.
         slices: number of edges of a ring in the sector; `corners` / 4 gives a quarter of the cylinder.
 
@@ -163,8 +163,8 @@ def _rings(radii: np.ndarray, corners: np.ndarray, match_area: bool) -> tuple[np
 def _ring_of_triangles(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
     """Return the triangles between two rings.
 
-    Each triangle contains the next edge of the inner or of the outer ring. Of these two edges, the edge is used whose
-    middle has the smaller angle about the axis.
+    Each triangle contains the next edge of the inner or of the outer ring: the edge whose middle has the smaller angle
+    about the axis.
     """
     n, m = len(inner), len(outer)
     if n == 1:

@@ -143,7 +143,7 @@ _FOREIGN = {
 
 
 def _read_quietly(path: Path) -> Any:
-    """Read with meshio without its printed messages. If it fails, the message of `InputError` gives the reason."""
+    """Read a file with meshio, and hide what meshio prints. If this fails, the `InputError` gives the reason."""
     import meshio
 
     try:
@@ -253,7 +253,7 @@ def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str, np.ndarray]:
     """Return {name of a group: numbers of its cells}, counted over all blocks of the types `cells`.
 
-    A group of tetrahedra without a name is named by its number. A group of surface cells without a name is left out.
+    A group of tetrahedra without a name is named by its number. A group of surface cells without a name is ignored.
     """
     kinds = [block.type for block in data.cells]
     first = np.cumsum([0, *(len(block.data) if block.type in cells else 0 for block in data.cells)])

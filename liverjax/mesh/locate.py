@@ -12,7 +12,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 _INSIDE = 1e-9
 #: Two vertices coincide if their distance is below this fraction of the body's size.
 SAME_PLACE = 1e-9
-#: A piece of a line is left out if it is shorter than this fraction of the line.
+#: A piece of a line is ignored if it is shorter than this fraction of the line.
 _SHORTEST = 1e-9
 
 
@@ -26,7 +26,7 @@ class Pieces(NamedTuple):
 
 
 def doubled_vertices(mesh: TetMesh) -> int:
-    """Return the number of vertices that coincide with another vertex. There, parts of the mesh are not connected."""
+    """Return the number of vertices that coincide with another vertex. There, the mesh is not connected."""
     points = np.asarray(mesh.points)
     steps = np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * float(np.ptp(points, axis=0).max())))
     return mesh.number_of_vertices - len(np.unique(steps, axis=0))
@@ -91,7 +91,8 @@ def straight_corners(mesh: TetMesh, x: np.ndarray) -> np.ndarray:
 
 
 def _all_alike(parts: np.ndarray) -> np.ndarray:
-    """Return whether the parts (n, E) of an element have the same sign, (E,). It is False if their sum is 0."""
+    """Return for each element (E,) whether its n numbers (n, E) have the same sign, except for roundoff. The result is
+    False if the sum of these numbers is 0."""
     whole = parts.sum(axis=0)
     return (whole != 0) & ((np.sign(whole) * parts).min(axis=0) >= -_INSIDE * np.abs(whole))
 
@@ -103,7 +104,7 @@ def weights(mesh: TetMesh, element: np.ndarray, L: np.ndarray) -> tuple[np.ndarr
 
 
 def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
-    """Cut straight lines from `begin` to `end` (n, 3) [m] at the faces of tetrahedra. Parts outside are left out."""
+    """Cut straight lines from `begin` to `end` (n, 3) [m] at the faces of tetrahedra. Pieces outside are removed."""
     found = []
     first, last = barycentric(mesh, begin), barycentric(mesh, end)
     for line in range(len(begin)):
@@ -117,7 +118,7 @@ def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
         least = (a[:, None] + b[:, None] * middle[None, :, None]).min(axis=0)
         element = least.argmax(axis=1)
         inside = least[np.arange(len(middle)), element] > -_INSIDE
-        # Planes of distant elements also cut the lines, so neighbouring parts in the same element are joined.
+        # Planes of distant elements also cut the lines, so neighbouring pieces in the same element are joined.
         start = np.flatnonzero(inside & ~np.concatenate([[False], (element[1:] == element[:-1]) & inside[:-1]]))
         for k in start:
             stop = k

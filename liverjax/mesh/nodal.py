@@ -23,7 +23,7 @@ def to_nodes(mesh: TetMesh, share: jax.Array) -> jax.Array:
 
 
 def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Integrate a density times the linear shape function of every vertex over the reference volume: (V,).
+    """Integrate a density times the linear shape function of every vertex over the reference volume. Returns (V,).
 
     Args:
         density: one number for each integration point, (E,) or (Q, E), or one number for each element (E,).
@@ -86,7 +86,7 @@ def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
 
 @cache
 def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Split the consistent mass matrix of an element, divided by its mass, into a diagonal (n,) and a rest (n, n).
+    """Split the consistent mass matrix of an element, divided by its mass, into a diagonal (n,) and a remainder (n, n).
 
     The diagonal is the lumped mass. Functions of order 3 have no lumped mass, so their diagonal entries are the
     integrals of their squares.
@@ -121,5 +121,6 @@ def products(order: int) -> np.ndarray:
 
 
 def _exponents(vertex: list[tuple], *which: int) -> tuple:
-    """Return the exponents of the product of the linear functions with the indices `which`."""
+    """Return the exponents of the product of the linear functions with the indices `which`. `vertex`: exponents of each
+    linear function."""
     return tuple(sum(v) for v in zip(*(vertex[k] for k in which), strict=True))

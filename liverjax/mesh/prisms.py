@@ -22,7 +22,7 @@ def _split(prisms: np.ndarray) -> np.ndarray:
 
     Diagonals start at the node with the lowest number, so the faces of neighbouring prisms match.
     """
-    # Rotate each prism so that the bottom node with the lowest number comes first. Then only one diagonal has a choice.
+    # Rotate each prism so that the bottom node with the lowest number is first. Then only one diagonal can be chosen.
     shift = np.argmin(prisms[:, :3], axis=1)
     turn = (np.arange(3)[None] + shift[:, None]) % 3
     a, b, c = np.take_along_axis(prisms[:, :3], turn, axis=1).T

@@ -31,7 +31,7 @@ def quadratic(mesh: TetMesh) -> TetMesh:
     return replace(made, clusters=_all_clusters(made))
 
 
-@jax.jit  # one program for all operations, not one for each
+@jax.jit  # one compiled program for all operations, not one for each
 def _points_and_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
     low, high = edges
     return jnp.concatenate([points, 0.5 * (points[low] + points[high])])
@@ -61,10 +61,10 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     A region consists of element faces with all their vertices in `nodes`, for example a fixed side of the body. Two
     regions may meet at an edge of the body. A face there can have all its vertices in the two regions without belonging
     to one of them. On the surface, such a face is at an angle to the faces of the regions, and nearly parallel to a
-    neighbour outside them. If the positions of the mesh are traced, angles are unknown, and all faces on the surface
-    belong to a region. Inside the body, a face belongs to a region only if it has a vertex below the surface, or next
-    to a vertex of `nodes` below the surface. Where the body is only one element thick, there are no such vertices, and
-    all faces belong to a region.
+    neighbour outside them. If the positions of the mesh are unknown (inside jit, grad or vmap), all faces on the
+    surface belong to a region. Inside the body, a face belongs to a region only if it has a vertex below the surface,
+    or next to a vertex of `nodes` below the surface. Where the body is only one element thick, there are no such
+    vertices, and all faces belong to a region.
     """
     V = mesh.number_of_vertices
     inside = np.zeros(V, bool)

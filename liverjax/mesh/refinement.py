@@ -17,9 +17,9 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
 
     The old vertices keep their numbers, and the middles of the edges follow in the order of `pattern.edges`. So the new
     vertices are the nodes of `quadratic(mesh)`, and a node set gets the same new nodes as in `quadratic(mesh)`. The
-    parts of element e are the elements 8 e … 8 e + 7, and an element set contains the parts of its elements. The
+    eight parts of element e are the elements 8 e … 8 e + 7, and an element set contains the parts of its elements. The
     surface keeps its flat triangles, so refinement does not bring it nearer to the real surface of the organ. Positions
-    may be traced if `near` is not given and the mesh has no triangle sets.
+    may be unknown (inside jit, grad or vmap) if `near` is not given and the mesh has no triangle sets.
 
     Args:
         near: node numbers (n,). If given, only edges at these nodes are halved, and other edges that must be halved to
@@ -97,7 +97,8 @@ def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
 
 
 def _eighths(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
-    """Return the refined elements (8 E, 4), from the node numbers (N,) of the edges' middles."""
+    """Cut each element into eight, and return the new elements (8 E, 4). `middle` (N,): number of the node at the
+    middle of each edge."""
     parts = _corners_of_parts(*np.asarray(mesh.tetrahedra).T, *middle[np.asarray(mesh.pattern.element_edges)])
     return parts.transpose(2, 0, 1).reshape(-1, 4)
 
@@ -127,7 +128,8 @@ def _by_length(mesh: TetMesh) -> np.ndarray:
 def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
     """Return which edges (N,) are halved.
 
-    These are the edges at the nodes `near`, and the longest edge of each element and face with a halved edge.
+    These are first the edges at the nodes `near`. Then the longest edge of each element and each face that has a halved
+    edge is halved too, until no edge is added.
     """
     edges, place = np.asarray(mesh.pattern.element_edges), _by_length(mesh)
     groups = [edges, *(edges[[k for k, pair in enumerate(PAIRS) if set(pair) <= set(face)]] for face in FACES)]
@@ -142,7 +144,10 @@ def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
 
 
 def _bisected(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
-    """Return elements (m, 4). Each old element is cut in two at its longest halved edge, until no such edge is left."""
+    """Cut each element in two at its longest halved edge, until no such edge is left. Return the elements (m, 4).
+
+    `middle` (N,): number of the node at the middle of each edge, negative for edges that are not halved.
+    """
     V, place = mesh.number_of_vertices, _by_length(mesh)
     low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
     code = low * V + high  # in ascending order

@@ -101,8 +101,8 @@ def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> 
     kept = triangles[[tuple(corners) in group for corners in np.sort(triangles, axis=1).tolist()]]
     if 0 < len(kept) < len(group):
         warnings.warn(
-            f"{len(group) - len(kept)} of {len(group)} triangles of {set!r} are not on the surface and are left out: "
-            "draw the set only on the surface",
+            f"{len(group) - len(kept)} of {len(group)} triangles of {set!r} are not on the surface and are ignored: "
+            "define the set only with triangles of the surface",
             stacklevel=2,
         )
     return kept

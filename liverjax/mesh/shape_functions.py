@@ -1,9 +1,9 @@
 """Shape functions of straight tetrahedra, and their integration points.
 
 L_k are the barycentric coordinates. Their gradients D_k are constant; these are the shape vectors of the linear
-element. Then, with y_k = sum_a c_ak x_a,
+element. With the shape functions N_a, the positions x_a of the nodes, c_ak = dN_a/dL_k and y_k = sum_a c_ak x_a,
 
-    grad N_a = sum_k c_ak D_k,    c_ak = dN_a/dL_k,    so    F = sum_a x_a (x) grad N_a = sum_k y_k (x) D_k
+    grad N_a = sum_k c_ak D_k,    so    F = sum_a x_a (x) grad N_a = sum_k y_k (x) D_k
 
 So at each point, an element of any order behaves like a linear element with corners y_k. The terms of force and
 stiffness (`liverjax.elements.mjed`) therefore hold at every point, and no matrix is inverted.

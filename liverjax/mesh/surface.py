@@ -39,7 +39,8 @@ def _middle(mesh: TetMesh, a: Indices, b: Indices) -> jax.Array:
     return mesh.number_of_vertices + jnp.sum(edge, axis=0)
 
 
-@partial(jax.jit, inline=True)  # called outside of a compiled program, all operations form one program
+# If this function is called outside a compiled program, jit compiles all its operations as one program.
+@partial(jax.jit, inline=True)
 def areas(points: jax.Array, triangles: Indices) -> jax.Array:
     """Return area times unit normal (m, 3) [m^2] of flat triangles."""
     corner = points[triangles]
@@ -83,7 +84,7 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
 
 
 def _signs_of_functions(triangles: Indices, dtype: DTypeLike) -> jax.Array:
-    """Return signs (10, m, 1) of the ten functions of triangles (m, 4) with vertices counter-clockwise to the normal.
+    """Return signs (10, m, 1) of the ten functions of triangles (m, 4), counter-clockwise about the normal.
 
     A function of order 3 on an edge points to the vertex with the higher number. If the triangle goes along this edge
     to the vertex with the lower number, the sign is -1.
@@ -116,7 +117,7 @@ def triangle_functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
 
 
 def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return six functions (6, Q) at barycentric coordinates l (3, Q), and derivatives as in `triangle_slopes`."""
+    """Return six functions (6, Q) at barycentric coordinates l (3, Q), and derivatives (see `triangle_slopes`)."""
     N = [l[k] * (2 * l[k] - 1) for k in range(3)] + [4 * l[a] * l[b] for a, b in _EDGES]
     zero = np.zeros_like(l[0])
     by = [[4 * l[k] - 1 if m == k else zero for m in range(3)] for k in range(3)]

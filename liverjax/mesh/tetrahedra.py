@@ -42,7 +42,7 @@ class TetMesh:
         "1", "named arrays of triangles' vertices (m, 3); None if the file has no triangle sets", default=None
     )
     faces: Any = param("1", "numbers of every element's faces (4, E), for order 3", default=None)
-    clusters: Any = param("1", "`Clusters` of all nodes, if cells are thin and the order is above 1", default=None)
+    clusters: Any = param("1", "`Clusters` of all nodes, if elements are thin and the order is above 1", default=None)
     order: int = static(default=1, about="order of the shape functions: 1 linear, 2 quadratic", lower=1)
 
     @property
@@ -86,7 +86,7 @@ class TetMesh:
 
     @property
     def element_nodes_on_host(self) -> np.ndarray:
-        """`element_nodes` as a NumPy array (n, E). JAX would compile a program for each of the n arrays."""
+        """Return `element_nodes` as a NumPy array (n, E). JAX would compile a program for each of the n arrays."""
         faces = None if self.faces is None else np.asarray(self.faces)
         return np.stack(self._nodes(np.asarray(self.tetrahedra), np.asarray(self.pattern.element_edges), faces))
 
@@ -137,7 +137,7 @@ class TetMesh:
         return columns
 
     def _slopes(self) -> jax.Array:
-        """Return c_ak - c_a0 as a matrix (3 Q, n) for `edges`. A product with one matrix keeps the program small."""
+        """Return c_ak - c_a0 as a matrix (3 Q, n) for `edges`. One matrix product keeps the compiled program small."""
         c = basis(self.order).c
         return jnp.asarray((c[:, 1:] - c[:, :1]).reshape(len(c), -1).T, self.volumes.dtype)
 
@@ -161,11 +161,11 @@ def tet_mesh(
 ) -> TetMesh:
     """Make a mesh from positions (V, 3) [m] and node numbers (E, 4). Nothing is checked (see `check_mesh`).
 
-    The positions may be traced, but not the node numbers.
+    The positions may be unknown (inside jit, grad or vmap), but the node numbers must be known.
     """
     if isinstance(tetrahedra, jax.core.Tracer):
-        raise InputError("tet_mesh: the node numbers are traced: make the mesh outside jit, grad and vmap")
-    # Copies are made: `asarray` may share memory with the caller's arrays. NumPy makes them, since it compiles nothing.
+        raise InputError("tet_mesh: the node numbers are unknown inside jit, grad or vmap: make the mesh outside")
+    # `asarray` may share memory with the caller's arrays, so copies are made. NumPy compiles nothing for this.
     points = jnp.array(points, float) if isinstance(points, jax.core.Tracer) else _float_copy(points)
     neighbours = pattern(tetrahedra, points)
     tetrahedra = node_numbers(tetrahedra)
@@ -187,9 +187,10 @@ def _float_copy(points: Numbers) -> jax.Array:
 
 
 def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:
-    """Return the mesh with other reference positions (V, 3) [m], which may be traced. The patches do not change.
+    """Return the mesh with other reference positions (V, 3) [m]. The patches do not change.
 
-    Edges stay straight: in a quadratic mesh the middles of edges are computed from the vertices.
+    The positions may be unknown (inside jit, grad or vmap). Edges stay straight: in a quadratic mesh the middles of
+    edges are computed from the vertices.
     """
     points = jnp.array(points, mesh.points.dtype)
     if points.shape != mesh.points.shape:

@@ -1,16 +1,18 @@
 """The base class of all physics, and the base classes of the force terms of a step.
 
 A physics is one object that adds forces or constraints to a body: a law, viscosity, loads, contact or a support. It is
-a frozen struct of numbers. A scene has a tuple of physics. A physics may have a memory, which passes from step to step.
-In a step it acts through a force term, which stores everything that is constant during the step:
+a frozen struct of numbers. A scene has a tuple of physics. A physics may have internal variables, which it passes from
+step to step; the argument `memory` contains them. In a step, a physics acts through a force term, which stores
+everything that is constant during the step. The main methods are:
 
-* `begin(start)` -> memory: the memory at the beginning of a run, any pytree;
-* `freeze(memory, step)` -> force term of the step;
-* `advance(memory, acting, end)` -> memory after an accepted step; `acting` is the force term;
-* `check(...)` raises InputError for numbers that no step can use.
+* `begin(start)` -> memory: return the internal variables at the beginning of a run, any pytree;
+* `freeze(memory, step)`: return the force term of the step;
+* `advance(memory, acting, end)` -> memory: return the internal variables after an accepted step with the force term
+  `acting`;
+* `check(...)`: raise InputError for numbers that no step can use.
 
-Loads and prescribed motions change during a step. They are evaluated at a fraction s of the step (0 at the beginning, 1
-at the end).
+Loads and prescribed motions change during a step. Methods evaluate them at a fraction s of the step (0 at its
+beginning, 1 at its end).
 
 There are three kinds of force terms. The forces, the tangent and the energy of a step are sums over these terms.
 
@@ -75,7 +77,7 @@ class Tied(Protocol):
 
 
 class Free(NamedTuple):
-    """The directions in which the body can move, as a projection of nodal vectors."""
+    """The directions in which the nodes can move. `vectors` projects nodal vectors onto these directions."""
 
     mask: jax.Array  # (V, 3) 0 along fixed or prescribed axes, else 1
     normals: jax.Array | None = None  # (V, 3) unit normals along which nodes cannot move; 0 at other nodes
@@ -126,7 +128,7 @@ class Step(NamedTuple):
     inertia: bool  # whether there is inertia; then the full loads act from the first step on
     tolerance: Any  # tolerance of the residual, not differentiated
     free: Free
-    averaged: bool = False  # True for Newmark's method: the forces at both ends of a step count half each
+    averaged: bool = False  # True for Newmark's method: the step uses the mean of the forces at its beginning and end
 
 
 class End(NamedTuple):
@@ -162,9 +164,9 @@ class Solid:
 
 
 class VolumeStress:
-    """A force term of one step with a stress from the volume ratio of the elements, and with pressures at the nodes."""
+    """A force term of one step. Its stress depends on the volume ratio of elements and on pressures at nodes."""
 
-    #: Whether the pressures depend on the positions at the end of the step. Then they are part of the mixed system.
+    #: Whether the pressures depend on the positions at the end of the step. Then the mixed system contains them.
     coupled: ClassVar[bool] = True
     #: Whether the pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`) and not eliminated.
     unknown: ClassVar[bool] = False
@@ -186,7 +188,7 @@ class VolumeStress:
         raise TypeError(f"{type(self).__name__} lacks energy(mesh, J)")
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """Matrix [m^3/Pa] of the pressure equation. If `positive` is true, it has no negative eigenvalues."""
+        """Matrix [m^3/Pa] of the pressure equation. If `positive` is true, the matrix has no negative eigenvalues."""
         raise TypeError(f"{type(self).__name__} lacks matrix(mesh, J, positive)")
 
     #: The pressure equation of a flowing fluid (`liverjax.physics.darcy.Flow`). None: nothing flows between nodes.
@@ -239,7 +241,7 @@ class NodalForce:
         return without_negative(own) if isinstance(own, Attached) else own
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
-        """Loss of stiffness from the elimination of an unknown, for example of the displacement of an obstacle.
+        """Loss of stiffness due to the elimination of an unknown, for example the displacement of an obstacle.
 
         If `definite` is true, the loss belongs to the stiffness of the method `definite`. Returns None if there is no
         such unknown.
@@ -288,42 +290,42 @@ class Physics:
         raise TypeError(f"{cls.__name__} has no table in scene files")
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Check the numbers on the host.
+        """Check the numbers of this physics.
 
         Raises:
             InputError: numbers that no step can use. The message begins with `name`.
         """
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Check on the host that a run can begin with this mesh. Meshes of a loaded shape are not checked.
+        """Check that a run can begin with this mesh. The mesh of a loaded shape is not checked.
 
         Raises:
             InputError: the run cannot begin. The message begins with `name`.
         """
 
     def in_body(self, mesh: TetMesh, law: Any) -> "Physics":
-        """The same physics, with default numbers computed from the law of the body."""
+        """Return the same physics, with default numbers computed from the law of the body."""
         return self
 
     def at_beginning(self) -> "Physics":
-        """The same physics at the beginning of a run, before anything moves."""
+        """Return the same physics as it is at the beginning of a run, before anything moves."""
         return self
 
     def begin(self, start: Start) -> Any:
-        """Memory at the beginning of a run, or None if this physics has no memory."""
+        """Internal variables at the beginning of a run, or None if this physics has no internal variables."""
         return None
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """Whether `freeze` accepts None as the memory, for a body at rest at the beginning of a run."""
+        """Whether `freeze` accepts None as `memory`, for a body at rest at the beginning of a run."""
         return cls.begin is Physics.begin
 
     def freeze(self, memory: Any, step: Step) -> Any:
-        """Force term of a step, or None if nothing acts."""
+        """Force term of a step, or None if this physics adds no force."""
         return None
 
     def advance(self, memory: Any, acting: Any, end: End) -> Any:
-        """Memory after an accepted step."""
+        """Internal variables after an accepted step."""
         return memory
 
     def constrain(self, free: Free) -> Free:
@@ -343,7 +345,7 @@ class Physics:
         return False
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Physics":
-        """The same physics on a mesh with elements of higher order.
+        """Return the same physics on a mesh with elements of higher order.
 
         `more` takes node numbers (n,) and adds the numbers of the new nodes that lie between these nodes.
         """
@@ -354,10 +356,10 @@ class Physics:
         return None
 
     def output(self, memory: Any) -> dict[str, jax.Array]:
-        """Fields (V,) of the vertices by name, which the result contains in addition to positions and reactions."""
+        """Return more fields of the result, by name: one value per vertex (V,), for example the pressure of a fluid."""
         return {}
 
 
 def diagonal(value: jax.Array) -> Block:
-    """3 x 3 blocks of a diagonal matrix, with the same value (V,) for every axis."""
+    """Return the 3 x 3 blocks of a diagonal matrix, with the same value (V,) for every axis."""
     return ((value, None, None), (None, value, None), (None, None, value))

@@ -2,7 +2,7 @@
 
     (1/K_lim) dP/dt = kappa lap P - (dJ/dt)/J
 
-J is the volume ratio, kappa the permeability, lap the Laplacian, and 1/K_lim the fluid volume stored per volume and
+J is the volume ratio, kappa the permeability, lap the Laplacian, and 1/K_lim the stored fluid volume per volume and
 pressure. The equation uses the volumes at the beginning of a step, so that it is linear in P. Its discrete form is the
 pressure equation A P = b, with the pressure matrix A.
 """
@@ -85,13 +85,14 @@ def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: j
         # The minimum belongs to the elements with the fastest flow, so their rate is used for the whole body.
         fastest, mean = jnp.max(rate), jnp.sum(jnp.ravel(rate) * mesh.volumes) / jnp.sum(mesh.volumes)
         total, rate = stored + (total - stored) * fastest / jnp.where(mean > 0, mean, 1.0), fastest
-    # Storage plus flow at the wave number 5 / width (measured: 4.9 to 5.4). The coarse space treats longer waves.
+    # Storage plus Darcy flow of a pressure wave with wave number 5 / (patch width). In numerical tests the factor was
+    # 4.9 to 5.4. The coarse space treats longer waves.
     waves = rate * (5 / mesh.pattern.patch_width) ** 2 * jnp.sum(mesh.volumes)
     return (stored + waves) / total
 
 
 def right_side(flow: Flow, b: jax.Array) -> jax.Array:
-    """Right-hand side (V,) for the unknown pressures: b plus the inflow, minus the effect of the given pressures."""
+    """Right-hand side (V,) [m^3] for the unknown pressures: b plus inflow, minus the effect of the given pressures."""
     if flow.enters is not None:
         b = b + flow.enters
     return flow.mask * (b if flow.given is None else b - flow_product(flow, flow.given))

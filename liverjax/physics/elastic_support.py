@@ -2,7 +2,7 @@
 
 Springs on a surface (a Winkler foundation) have two stiffnesses per area: one normal and one tangential to the
 reference surface. In the reference shape the springs have no tension. A history of factors changes the stiffness of the
-springs with time. A history of displacements moves the wall, and with it one end of the springs. In linear elements
+springs over time. A history of displacements moves the wall, and with it one end of the springs. In linear elements
 each node of a triangle gets a third of the triangle's stiffness. In elements of higher order the springs are integrated
 over the triangle.
 """
@@ -40,7 +40,7 @@ class ElasticSupport(Physics):
     stiffness: Number = param("N/m", "stiffness of each node, equal in all directions", lower=0.0, default=0.0)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param(
-        "1", "factors of the stiffness (T,), or displacements of the wall (T, 3) [m]", default=None
+        "1", "factors (T,) that multiply the stiffness, or displacements of the wall (T, 3) [m]", default=None
     )
 
     section: ClassVar[str] = "support"
@@ -104,13 +104,13 @@ class ElasticSupport(Physics):
         return self.triangles is None
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "ElasticSupport":
-        """The support on the same triangles or nodes of the mesh of higher order."""
+        """Return the support on the same triangles or nodes of the mesh of higher order."""
         if self.triangles is None:
             return self
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes, and the principal axes along which their block has a stiffness."""
+        """Return the nodes, and the principal axes along which the springs of each node have a stiffness."""
         K = np.moveaxis(np.array([[np.asarray(e) for e in row] for row in blocks(self, mesh)]), -1, 0)
         size, axes = np.linalg.eigh(K)
         node, axis = np.nonzero(size > 1e-9 * max(size.max(), 1e-300))
@@ -186,7 +186,7 @@ class Springs(NodalForce):
         return 0.5 * jnp.sum(self._stretch(mesh, x, 1.0) * self.force(mesh, x, 1.0))
 
     def stiffness(self) -> Block:
-        """Stiffness blocks, which are constant during the step."""
+        """Stiffness blocks (V,) [N/m] of the springs. They are constant during the step."""
         return self.blocks
 
 

@@ -1,4 +1,4 @@
-"""A hyperelastic solid: the stress in every element follows from the law, without memory."""
+"""A hyperelastic solid: the law gives the stress in every element from the current deformation alone."""
 
 from typing import Any
 

@@ -3,7 +3,7 @@
 Newmark's method uses the mean of the forces at both ends of a step. The forces of an obstacle with a given position are
 an exception: only their value at the end of the step is used (Kane et al. 1999, Comput. Methods Appl. Mech. Eng. 180,
 1). An obstacle at rest then never adds energy to the body. With the mean it would add energy where contact begins or
-ends within a step. The acceleration in the memory comes from all other forces.
+ends within a step. The stored acceleration (`Motion`) is the part due to all other forces.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -27,7 +27,7 @@ _EXACT = 1e-12
 
 
 class Motion(NamedTuple):
-    """Velocity and acceleration at the end of a step: the memory of inertia."""
+    """Internal variables of inertia: velocity and acceleration at the end of a step."""
 
     velocity: jax.Array  # (V, 3) [m/s]
     acceleration: jax.Array | None  # (V, 3) [m/s^2]; only for Newmark's method
@@ -42,7 +42,7 @@ class Inertia(Physics):
     mass: str = static(default="lumped", about="lumped (at the nodes) or consistent")
 
     def begin(self, start: Start) -> Motion:
-        """Memory of a body at rest.
+        """Internal variables of a body at rest.
 
         For Newmark's method the initial acceleration a solves m a = f, with masses m and forces f. The first step then
         has the full order of accuracy.
@@ -55,11 +55,11 @@ class Inertia(Physics):
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """Return True: without memory the body is at rest, so its inertia force is 0."""
+        """Return True: if `memory` is None, the body is at rest, so its inertia force is 0."""
         return True
 
     def freeze(self, memory: Motion | None, step: Step) -> "Moving":
-        """Force term of inertia, with the masses and with the motion at the beginning of the step."""
+        """Return the force term. It stores the masses and the motion at the beginning of the step."""
         if memory is None:
             still = jnp.zeros_like(step.x)
             memory = Motion(still, still if self.integrator == "newmark" else None)
@@ -92,7 +92,10 @@ class Inertia(Physics):
 
 
 def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: jax.Array) -> jax.Array:
-    """Solve m a = f in the free directions for f (V, 3) [N]. Return a (V, 3) [m/s^2], 0 in other directions."""
+    """Solve m a = f in the free directions, with masses m and forces f (V, 3) [N].
+
+    Return the accelerations a (V, 3) [m/s^2], which are 0 in other directions.
+    """
     if shared is None and not free.tied:
         return force / mass[:, None]
 
@@ -171,16 +174,19 @@ class Moving(NodalForce):
         return _inertia(self.mass, self.shared, acceleration)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Incremental energy m a . a dt^2/(2k) [J]; the inertia force is its gradient."""
+        """Incremental energy m a . a dt^2/(2k) [J], with masses m, accelerations a, time step dt and k of `FACTOR`.
+
+        The inertia force is the gradient of this energy.
+        """
         a = self.kinematics(x)[1]
         return 0.5 * self.dt**2 / FACTOR[self.integrator] * jnp.sum(_inertia(self.mass, self.shared, a) * a)
 
     def stiffness(self) -> Block:
-        """Stiffness k m/dt^2 [N/m] of every node along every axis."""
+        """Stiffness k m/dt^2 [N/m] of every node along every axis, with mass m, time step dt and k of `FACTOR`."""
         return diagonal(FACTOR[self.integrator] / self.dt**2 * self.mass)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Masses | None:
-        """Remaining part of the consistent mass matrix, between the nodes of an element, times k/dt^2."""
+        """Return the remaining part of the consistent mass matrix times k/dt^2 (see `stiffness`), or None if lumped."""
         if self.shared is None:
             return None
         return self.shared._replace(size=FACTOR[self.integrator] / self.dt**2 * self.shared.size)

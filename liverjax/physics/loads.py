@@ -20,12 +20,16 @@ class Traction:
 
     triangles: Indices = param("1", "node numbers (m, 3), normals outwards", lower=0)
     value: Any = param("Pa", "force per reference area (3,), in a fixed direction", default=None)
-    pressure: Number | None = param("Pa", "per current area, along the current normal; inwards if > 0", default=None)
+    pressure: Number | None = param(
+        "Pa", "force per current area, along the current normal; inwards if > 0", default=None
+    )
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
-    history: Any = param("1", "factors of value or pressure (T,), or the value itself (T, 3) [Pa]", default=None)
+    history: Any = param(
+        "1", "factors (T,) that multiply value or pressure, or the value itself (T, 3) [Pa]", default=None
+    )
 
     def at(self, time: Number) -> "Traction":
-        """The load at a time [s], as a load without history."""
+        """Return the load at a time [s], as a load without history."""
         if self.history is None:
             return self
         now = history.value_at(self.value if self.pressure is None else self.pressure, time, self.times, self.history)
@@ -56,7 +60,7 @@ def follows(tractions: tuple) -> bool:
 def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
     """Nodal forces (V, 3) [N] of the follower pressures p at positions x (V, 3) [m].
 
-    They are integrals of -p n da, with the normal n and the area element da. Without `mesh` the elements are linear.
+    These are integrals of -p n da, with the normal n and the area element da. Without `mesh` the elements are linear.
     """
     force = jnp.zeros_like(x)
     for load in tractions:
@@ -83,18 +87,20 @@ class Loads(Physics):
     density: Any = param("kg/m^3", "None: no weight", default=None)
     gravity: Any = param("m/s^2", "(3,)", default=None)
     times: Numbers | None = param("s", "times of a history of gravity (T,)", default=None)
-    history: Numbers | None = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
+    history: Numbers | None = param(
+        "1", "factors (T,) that multiply gravity, or gravity itself (T, 3) [m/s^2]", default=None
+    )
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
 
     def freeze(self, memory: None, step: Step) -> "Loading":
-        """Force term of the loads. Dead loads are summed once; the step and s determine the fraction that acts."""
+        """Return the force term of the loads. It stores the sum of all dead loads."""
         if self.history is not None or any(load.history is not None for load in self.traction):
             begin, end = (self.at(n * step.dt)._loading(step, "none") for n in (step.k - 1, step.k))
             return replace(end, before=begin)
         return self._loading(step, "steps" if step.dt is None else "none" if step.inertia else "first")
 
     def at(self, time: Number) -> "Loads":
-        """The loads at a time [s], as loads without histories."""
+        """Return the loads at a time [s], as loads without histories."""
         traction = tuple(load.at(time) for load in self.traction)
         gravity = history.value_at(self.gravity, time, self.times, self.history)
         return replace(self, gravity=gravity, traction=traction, times=None, history=None)

@@ -47,10 +47,10 @@ class Inlet:
     triangles: Any = param("1", "triangles with the given flux, node numbers (m, 3)", lower=0, default=None)
     flux: Number | None = param("m/s", "volume that enters per reference area and time", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
-    history: Numbers | None = param("1", "factors of pressure or flux (T,)", default=None)
+    history: Numbers | None = param("1", "factors (T,) that multiply pressure or flux", default=None)
 
     def at(self, value: object, time: Number) -> jax.Array:
-        """Pressure or flux at a time [s]."""
+        """Given pressure [Pa] or flux [m/s] of this inlet at a time [s]; `value` is its constant value."""
         return history.value_at(value, time, self.times, self.history)
 
 
@@ -80,7 +80,10 @@ class Porosity(Physics):
         return initial_fluid(self, start.mesh)
 
     def freeze(self, memory: "Fluid", step: Step) -> "Sponge":
-        """Assemble the pressure equation. The lagged scheme solves it here: it does not depend on the step's end."""
+        """Return the force term, with the assembled pressure equation of the step.
+
+        The lagged scheme solves this equation here, because in this scheme it does not depend on the step's end.
+        """
         F = deformation_gradient(step.mesh, step.x)
         found = darcy.flow(self, step.mesh, memory.J, F, step.dt, 1e-2 * step.tolerance)
         if self.inlet:
@@ -104,7 +107,7 @@ class Porosity(Physics):
 
 
 class Fluid(NamedTuple):
-    """Pressure and volume ratios at the end of a step: the memory of the fluid."""
+    """Internal variables of the fluid: pressure and volume ratios at the end of a step."""
 
     pressure: jax.Array  # P at the vertices (V,) [Pa]
     J: jax.Array  # volume ratios at every integration point
@@ -112,7 +115,7 @@ class Fluid(NamedTuple):
 
 
 def check_porosity(porosity: Porosity) -> None:
-    """Check on the host that a step can use the values.
+    """Check that a step can use the values of a porous body.
 
     Raises:
         InputError: unknown scheme, values out of bounds, K_lim not above K0, an inlet with an incomplete condition.
@@ -128,7 +131,7 @@ def check_porosity(porosity: Porosity) -> None:
 
 
 def check_sponge(porosity: Porosity) -> None:
-    """Check the parameters of the porous body. Traced parameters pass.
+    """Check the parameters of the porous body. Parameters inside jit, grad or vmap are not checked.
 
     Raises:
         InputError: values out of bounds, K_lim not above K0.
@@ -138,7 +141,7 @@ def check_sponge(porosity: Porosity) -> None:
 
 
 def check_limit(porosity: Porosity) -> None:
-    """Check that the porous body stiffens under compression. Traced parameters pass.
+    """Check that the porous body stiffens under compression. Parameters inside jit, grad or vmap are not checked.
 
     Raises:
         InputError: K_lim not above K0.
@@ -154,10 +157,10 @@ def check_limit(porosity: Porosity) -> None:
 
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:
-    """The law that acts in parallel to the porous body.
+    """Return the law that acts in parallel to the porous body.
 
-    The volumetric energy U(J) of the law is removed, since the bulk modulus would count twice. It stays if `keep_bulk`
-    is true. A law that does not separate volume change from shear is not changed.
+    The volumetric energy U(J) of the law is removed, since the bulk modulus would count twice. If `keep_bulk` is true,
+    this energy stays. A law that does not separate volume change from shear is not changed.
     """
     if porosity is None or porosity.keep_bulk:
         return law
@@ -165,7 +168,7 @@ def law_in_force(porosity: Porosity | None, law: Law) -> Law:
 
 
 def bulk_in_force(porosity: Porosity, law: Law) -> str:
-    """One sentence that says which bulk modulus acts."""
+    """Return a sentence for the report: the bulk modulus in use, and the parts of the law that are not used."""
     sponge = f"bulk modulus in use: that of the porous body, {float(porosity.bulk):g} Pa"
     if porosity.keep_bulk:
         return f"{sponge}, plus that of the law (keep_bulk)"
@@ -197,7 +200,7 @@ def volumetric_slope(porosity: Porosity, J: Number) -> jax.Array:
 def volumetric_energy(porosity: Porosity, J: Number) -> Number:
     """Volumetric energy density [Pa]: the integral of sigma_Heq from 1 to J.
 
-    It is K0 r_w^2 (u ln u - u + 1) with u = (r_w + J - 1)/r_w, and a parabola below J0.
+    This energy is K0 r_w^2 (u ln u - u + 1) with u = (r_w + J - 1)/r_w, and a parabola below J0.
     """
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
@@ -250,7 +253,7 @@ def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_
 
 
 def first_piola(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Matrix:
-    """First Piola-Kirchhoff stress (sigma_Heq(J) - P) cof F [Pa], with P linear in every element."""
+    """First Piola-Kirchhoff stress (sigma_Heq(J) - P) cof F [Pa], with the pressure P linear in every element."""
     sigma = volumetric_stress(porosity, determinant(F)) - interpolated(mesh, P)
     return tuple(tuple(sigma * c for c in row) for row in cofactor(F))
 
@@ -281,7 +284,7 @@ class CoupledSponge(Sponge):
     flow: Flow = param("1", "pressure equation of the step")
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: darcy.Guess | None = None) -> jax.Array:
-        """Pressures (V,) [Pa] from the volume change of this step."""
+        """Pressures (V,) [Pa] at the end of the step, from the volume change of this step."""
         return pressure(self.porosity, mesh, self.fluid, self.flow, J, guess)
 
     def in_force(self, pressure: jax.Array) -> jax.Array:

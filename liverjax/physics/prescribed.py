@@ -27,7 +27,7 @@ class Displaced:
     by: Numbers | None = param("m", "displacement (3,), or one per node (n, 3), reached at the last step", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param(
-        "m", "displacements at these times (T, 3), or factors of by (T,); linear in between", default=None
+        "m", "displacements at these times (T, 3), or factors (T,) that multiply `by`; linear in between", default=None
     )
     axes: str = static(default="xyz", about="prescribed axes")
 
@@ -36,7 +36,7 @@ def check_axes(axes: object, name: str) -> None:
     """Check that a value names axes.
 
     Raises:
-        InputError: another value. The message begins with `name`.
+        InputError: the value names no axes. The message begins with `name`.
     """
     if not isinstance(axes, str) or not axes or set(axes) - set(AXES) or len(set(axes)) != len(axes):
         raise InputError(f"{name} axes = {axes!r} is not known: give some of the letters xyz")
@@ -45,7 +45,7 @@ def check_axes(axes: object, name: str) -> None:
 def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
     """Mask (V, 3) of the degrees of freedom: 1 if unknown, 0 if fixed or prescribed."""
     if not any(isinstance(condition.nodes, jax.core.Tracer) for condition in (*fixed, *displaced)):
-        return jnp.asarray(free_places(mesh, fixed, displaced), mesh.points.dtype)  # avoids compiling small programs
+        return jnp.asarray(free_places(mesh, fixed, displaced), mesh.points.dtype)  # compiles no small programs
     mask = jnp.ones(mesh.points.shape, mesh.points.dtype)
     for condition in (*fixed, *displaced):
         axes = np.array([AXES.index(axis) for axis in condition.axes])
@@ -54,7 +54,7 @@ def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
 
 
 def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
-    """Mask (V, 3) of the degrees of freedom as a host array, for checks: True if unknown."""
+    """Mask (V, 3) of the degrees of freedom as a NumPy array: True if unknown, False if fixed or prescribed."""
     free = np.ones(mesh.points.shape, bool)
     for condition in (*fixed, *displaced):
         for axis in condition.axes:

@@ -34,7 +34,7 @@ NAMED: tuple[type[Physics], ...] = (
 
 
 def law_at_rest(scene: Any) -> Law:
-    """The law of the body without viscosity. With porosity it has no volumetric energy, except with `keep_bulk`."""
+    """Return the law without viscosity. With porosity, its volumetric energy is removed, unless `keep_bulk` is true."""
     return porosity.law_in_force(scene.porosity, scene.law)
 
 

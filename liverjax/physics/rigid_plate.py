@@ -88,7 +88,7 @@ class RigidPlate(Physics):
         return replace(self, nodes=nodes) if mesh.order < 3 else replace(self, still=nodes[len(self.nodes) :])
 
     def constrain(self, free: Free) -> Free:
-        """The cubic functions of the plate are fixed."""
+        """Fix the cubic functions of the plate."""
         return free if self.still is None else free._replace(mask=free.mask.at[self.still].set(0.0))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -141,7 +141,8 @@ class Plate(NamedTuple):
         return jnp.mean((x[self.plate.nodes] - self.reference) @ self._axis(x))
 
     def torque(self, x: jax.Array, f: jax.Array) -> jax.Array:
-        """Moment [N m] about the axis of forces f (V, 3) [N] on the plate's nodes at positions x (V, 3)."""
+        """Moment [N m], about the plate's axis, of the forces f (V, 3) [N] on the plate's nodes. x (V, 3): positions of
+        the nodes."""
         return jnp.sum(self.arms(x) * f[self.plate.nodes])
 
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
@@ -176,14 +177,17 @@ class Plate(NamedTuple):
         return velocity, acceleration.at[nodes].set(growth * arms + towards + up)
 
     def spread(self, field: jax.Array, turn: Number, lift: Number) -> jax.Array:
-        """The field (V, 3), with the rows of the plate's nodes computed from the amplitudes of the two motions."""
+        """Write the rows of the plate's nodes, from the amplitudes of the plate's two motions, into a field (V, 3)."""
         rows = turn * self._arms(self.carrier) / self.radius
         if self.plate.lifts:
             rows = rows + lift * self._axis(field)[None] / len(self.reference) ** 0.5
         return field.at[self.plate.nodes].set(rows)
 
     def amplitudes(self, field: jax.Array, arms: jax.Array) -> tuple[Number, Number]:
-        """R times the rotation (with `arms` (n, 3)) and sqrt(n) times the axial displacement of a field (V, 3)."""
+        """Return R times the rotation, and sqrt(n) times the axial displacement, of a field (V, 3) on n nodes.
+
+        `arms` (n, 3) are the vectors e x (x - c) of the nodes.
+        """
         rows = field[self.plate.nodes]
         turn = jnp.sum(arms * rows) / self.radius if self.plate.by == "torque" else 0.0
         return turn, jnp.sum(rows @ self._axis(field)) / len(self.reference) ** 0.5
@@ -193,7 +197,7 @@ class Plate(NamedTuple):
         return self.spread(field, *self.amplitudes(field, self._arms(self.carrier) if x is None else self.arms(x)))
 
     def given(self, s: Number) -> jax.Array:
-        """Angle or torque at fraction s of the step."""
+        """Given angle [rad] or torque [N m] at fraction s of the step."""
         return self.before + s * (self.after - self.before)
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
@@ -208,7 +212,7 @@ class Plate(NamedTuple):
         return self.moved(field, angle, lift / len(self.reference) ** 0.5)
 
     def moved(self, field: jax.Array, angle: Number, lift: Number) -> jax.Array:
-        """The field (V, 3) with the positions of the plate's nodes at an angle [rad] and an axial displacement [m]."""
+        """Write the positions of the plate's nodes, at an angle [rad] and an axial displacement [m], into a field."""
         axis, arms = self._axis(field)[None], self._arms(self.reference)
         # Rotation by the angle a (Rodrigues): r = x - c changes by sin(a) e x r, plus cos(a) - 1 times the part of r
         # perpendicular to the axis e.

@@ -56,7 +56,7 @@ class SlidingSupport(Physics):
         return free._replace(normals=normals.at[self.nodes].set(loose * normal))
 
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "SlidingSupport":
-        """The support with the nodes that the mesh of higher order adds between the nodes of the support."""
+        """Return the support with the nodes that the mesh of higher order adds between the nodes of the support."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:

@@ -1,16 +1,18 @@
 """Prony viscohyperelasticity (book chapter, section 4.2): S_v = S_h - sum_k gamma_k.
 
-S_v is the second Piola-Kirchhoff stress of the viscoelastic body, and S_h is the stress of the law. The memory of mode
-k is the symmetric tensor gamma_k. The recursion is the update of this memory from step n-1 to step n: gamma^n = a S^n +
-c S^(n-1) + b gamma^(n-1), with the stress S that relaxes. There are two schemes, with the time step dt, and with the
-ratio g and the relaxation time tau of the mode:
+S_v is the second Piola-Kirchhoff stress of the viscoelastic body, and S_h is the stress of the law. Each mode k has one
+internal (history) variable, the symmetric tensor gamma_k. It is the stress that this mode has relaxed. The recursion is
+the update of the history variables from step n-1 to step n: gamma^n = a S^n + c S^(n-1) + b gamma^(n-1), with the
+stress S that relaxes. There are two schemes, with the time step dt, and with the ratio g and the relaxation time tau of
+the mode:
 
-* ``"exponential"``: exact if the stress is linear over the step. e = exp(-dt/tau), q = (1 - e) tau/dt, a = g (1 - q),
-  c = g (q - e), b = e. This scheme is of second order in dt.
+* ``"exponential"``: exact if the stress changes linearly during the step. e = exp(-dt/tau), q = (1 - e) tau/dt,
+  a = g (1 - q), c = g (q - e), b = e. This scheme is of second order in dt.
 * ``"backward_euler"``: as printed in the chapter, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). This scheme is of
   first order in dt. The old name "chapter" is accepted.
 
-The memory is updated once per accepted step. Its contribution to the stress (`recall`) is constant during a step.
+The history variables are updated once per accepted step. Their contribution to the stress (`recall`) is constant
+during a step.
 """
 
 from typing import Any, NamedTuple
@@ -66,35 +68,35 @@ class Prony:
 
 
 class History(NamedTuple):
-    """Memory of every element at the end of a step. Arrays are (…, Q, E) if elements have Q integration points."""
+    """History variables at the end of a step. Arrays are (…, Q, E) if elements have Q integration points."""
 
     gamma: jax.Array  # (N, 6, E) [Pa]
     stress: jax.Array | None  # S^n (6, E) [Pa]; backward Euler does not need it
 
 
 class Recall(NamedTuple):
-    """Contribution of the memory to the stress in a step. It is constant during Newton's iterations."""
+    """Contribution of the history variables to the stress in a step, constant during Newton's iterations."""
 
     past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
     now: jax.Array  # 1 - sum_k a_k: one number (), or an array that broadcasts over the integration points
 
 
 def check_viscosity(prony: Prony, law: Law) -> None:
-    """Check on the host that a step can use this viscosity.
+    """Check that a step can use this viscosity.
 
     Raises:
-        InputError: unknown scheme or part, lengths that differ, values out of bounds, a sum of ratios of 1 or more,
-            isochoric relaxation of a law without an isochoric part.
+        InputError: the scheme or part is unknown; the numbers of ratios and relaxation times differ; a value is out of
+            bounds; the ratios add up to 1 or more; or part is "isochoric" and the law has no isochoric part.
     """
     check_series(prony)
     check_part(prony.part, law, "viscosity")
 
 
 def check_part(part: str, law: Law, section: str) -> None:
-    """Check that the law has the part that relaxes. Numbers are not checked.
+    """Check that the law has the part that relaxes. The values of the numbers are not checked.
 
     Raises:
-        InputError: isochoric relaxation of a law without an isochoric part.
+        InputError: part is "isochoric" and the law has no isochoric part.
     """
     if part == "isochoric" and isochoric_part(law) is None:
         raise InputError(
@@ -104,10 +106,11 @@ def check_part(part: str, law: Law, section: str) -> None:
 
 
 def check_series(prony: Prony) -> None:
-    """Check on the host that ratios and times form a Prony series. If they are traced, only their number is checked.
+    """Check that ratios and times form a Prony series. Inside jit, grad or vmap, only their number is checked.
 
     Raises:
-        InputError: lengths that differ, values out of bounds, a sum of ratios of 1 or more.
+        InputError: the numbers of ratios and relaxation times differ, a value is out of bounds, or the ratios add up to
+            1 or more.
     """
     bounds.check_fields(prony, "viscosity")
     both = (prony.ratios, prony.relaxation_times)
@@ -115,21 +118,27 @@ def check_series(prony: Prony) -> None:
         if not isinstance(values, (tuple, list)) and not np.ndim(values):
             raise InputError(f"viscosity.{key} = {values} is one number: give one per mode, e.g. [{values}]")
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(both)):
-        # NumPy cannot find the shape of a tuple of traced numbers.
+        # NumPy cannot find the shape of a tuple of numbers without known values.
         ratios, times = (len(v) if isinstance(v, (tuple, list)) else (*np.shape(v), 1)[0] for v in both)
         if ratios != times:
-            raise InputError(f"viscosity has {ratios} ratios and {times} relaxation_times: give one each per mode")
+            raise InputError(
+                f"viscosity has {ratios} ratios and {times} relaxation_times: give one ratio and one relaxation time "
+                "for each mode"
+            )
         return
     g, tau = (np.atleast_1d(np.asarray(v, float)) for v in both)
     if g.shape != tau.shape:
-        raise InputError(f"viscosity has {g.size} ratios and {tau.size} relaxation_times: give one each per mode")
+        raise InputError(
+            f"viscosity has {g.size} ratios and {tau.size} relaxation_times: give one ratio and one relaxation time "
+            "for each mode"
+        )
     if not np.all(g.sum(axis=0) < 1):
         shown = g if g.ndim == 1 else g[:, int(np.argmax(g.sum(axis=0)))]
         raise InputError(f"viscosity.ratios = {shown.tolist()} must add up to less than 1: lower them")
 
 
 def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Coefficients a, b, c of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1), in the shape of the ratios; dt in s."""
+    """Coefficients a, b, c of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1), in the shape of the ratios, for dt [s]."""
     g, tau = jnp.asarray(prony.ratios), jnp.asarray(prony.relaxation_times)
     r = dt / tau
     if prony.scheme == "backward_euler":
@@ -187,20 +196,20 @@ def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax
 
 
 def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: DTypeLike = float) -> History:
-    """Memory of a body at rest: zeros, for E integration points or for points of the shape (Q, E)."""
+    """History variables of a body at rest: zeros, for E integration points or for points of the shape (Q, E)."""
     shape = (points,) if isinstance(points, int) else points
     gamma = jnp.zeros((jnp.asarray(prony.ratios).shape[0], 6, *shape), dtype)
     return History(gamma, None if prony.scheme == "backward_euler" else jnp.zeros((6, *shape), dtype))
 
 
 def relaxed_history(prony: Prony, stress: jax.Array) -> History:
-    """Memory of a body after complete relaxation. `stress` (6, …) [Pa] is the relaxing part of the law's stress."""
+    """History variables after complete relaxation. `stress` (6, …) [Pa] is the relaxing part of the law's stress."""
     gamma = _beside(jnp.asarray(prony.ratios), 1 + stress.ndim) * stress[None]
     return History(gamma, None if prony.scheme == "backward_euler" else stress)
 
 
 def recall(prony: Prony, history: History, dt: Array) -> Recall:
-    """Contribution of the memory to the stress in the next step, from the memory at the beginning of this step."""
+    """Contribution of the history variables to the stress in the next step, from their values at its beginning."""
     a, b, c = coefficients(prony, dt)
     if a.ndim == 2:
         return _recall_by_element(a, b, c, history)
@@ -211,7 +220,7 @@ def recall(prony: Prony, history: History, dt: Array) -> Recall:
 
 
 def _recall_by_element(a: jax.Array, b: jax.Array, c: jax.Array, history: History) -> Recall:
-    """Contribution of the memory as in `recall`, with one value (N, E) of the coefficients per element."""
+    """Do the same as `recall`, for coefficients with one value per element (N, E)."""
     ndim = history.gamma.ndim
     past = jnp.sum(_beside(b, ndim) * history.gamma, axis=0)
     if history.stress is not None:
@@ -221,7 +230,7 @@ def _recall_by_element(a: jax.Array, b: jax.Array, c: jax.Array, history: Histor
 
 
 def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Number) -> History:
-    """Memory at the end of an accepted step with deformation gradient F."""
+    """History variables at the end of an accepted step, with the deformation gradient F at the end of the step."""
     a, b, c = coefficients(prony, dt)
     S = relaxing_stress(prony, law, F)
     a, b, c = (_beside(each, 1 + S.ndim) for each in (a, b, c))
@@ -239,8 +248,9 @@ def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
 
 
 def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
-    """First Piola-Kirchhoff stress P_v = (1 - sum a) P_h - F past [Pa], with `past` from the memory.
+    """First Piola-Kirchhoff stress P_v = (1 - sum a) P_h - F past [Pa], with the stress P_h of the law.
 
+    1 - sum a and `past` are the fields `now` and `past` of the argument `memory`.
     With part = "isochoric", P_h is the isochoric stress of the law, and the complete volumetric stress is added.
     """
     P = invariant_terms.first_piola(relaxing(prony, law), F)
@@ -256,7 +266,10 @@ def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
 def blocks(
     prony: Prony, memory: Recall, law: Law, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
 ) -> list[Matrix]:
-    """Stiffness blocks of `first_piola`: (1 - sum a) K_h - (D_i . past D_j) Id. The form is as in `invariant_terms`."""
+    """Stiffness blocks (1 - sum a) K_h - (D_i . past D_j) I of the stress `first_piola`.
+
+    K_h are the blocks of the law (`invariant_terms.blocks`), D the gradients of the shape functions, I the identity.
+    """
     K = invariant_terms.blocks(invariant_terms.state(relaxing(prony, law), F), D, pairs)
     K = [scale_matrix(memory.now, block) for block in K]
     result = []
@@ -273,7 +286,7 @@ def blocks(
 
 
 def relaxing(prony: Prony, law: Law) -> Law:
-    """The part of a law that relaxes: all of it, or its isochoric part."""
+    """Return the part of a law that relaxes: the whole law, or its isochoric part."""
     return law if prony.part == "all" else isochoric_part(law)
 
 
@@ -285,9 +298,9 @@ class Viscoelasticity(Physics):
     prony: Prony = param("1", "how it relaxes")
 
     def begin(self, start: Start) -> History:
-        """Memory at the beginning of a run: zeros.
+        """History variables at the beginning of a run: zeros.
 
-        If the body was just moved to its positions, the stress S^n in the memory is the stress at these positions.
+        If the body was just moved to its positions, the stored stress S^n is the stress at these positions.
         """
         memory = initial_history(self.prony, start.mesh.weights.shape, start.x.dtype)
         if memory.stress is None or not start.moved:
@@ -303,7 +316,7 @@ class Viscoelasticity(Physics):
         return Viscoelastic(law=self.law, prony=self.prony, recall=recall(self.prony, memory, step.dt), dt=step.dt)
 
     def advance(self, memory: History, acting: "Viscoelastic", end: End) -> History:
-        """The memory, updated with the stress at the end of the step."""
+        """Return the history variables, updated with the stress at the end of the step."""
         return advance(self.prony, memory, self.law, end.F, acting.dt)
 
 
@@ -313,7 +326,7 @@ class Viscoelastic(Solid):
 
     law: Law = param("1", "the instantaneous law")
     prony: Prony = param("1", "how it relaxes")
-    recall: Recall = param("1", "contribution of the memory")
+    recall: Recall = param("1", "contribution of the history variables")
     dt: jax.Array = param("s", "time step")
 
     def stress(self, F: Matrix) -> Matrix:
@@ -337,7 +350,7 @@ class Viscoelastic(Solid):
         return W if rest is None else W + rest.strain_energy(rest.measures(F))
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix]:
-        """The relaxing part with its weight, the part that does not relax, and the memory with a minus sign."""
+        """Pairs (weight, law) of the relaxing part and of the part that does not relax, and the stress -`past` [Pa]."""
         rest = volumetric_part(self.law) if self.prony.part == "isochoric" else None
         weighted = [(self.recall.now, relaxing(self.prony, self.law))]
         return weighted if rest is None else [*weighted, (1.0, rest)], scale_matrix(-1.0, self.recall.past)

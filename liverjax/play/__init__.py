@@ -1,1 +1,1 @@
-"""A body in a browser that the user can pull while it moves."""
+"""Show a moving body in a browser, where the user can pull the body with the mouse."""

@@ -1,6 +1,7 @@
-"""A scene that is run step by step, while a spring pulls on one of its nodes.
+"""Run a scene step by step, while a spring pulls on one of the nodes.
 
-The spring is a `Ligament`. Only its numbers change from step to step, so that one compiled program is enough.
+The spring is a `Ligament`. Only the numbers of the spring change from step to step, so the program is compiled only
+once.
 """
 
 from collections.abc import Callable
@@ -21,11 +22,11 @@ from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import State, initial_state
 from liverjax.simulation.run import prepared, simulate_part
 
-#: Number of steps of a run that has no planned end.
+#: Number of steps, so large that the run never ends.
 STEPS = 10**9
 #: Rest length of the spring, divided by the size of the body. A spring of length 0 would have no direction.
 SLACK = 1e-3
-#: Stiffness of the spring while nobody pulls, divided by its stiffness during a pull.
+#: Stiffness of the spring while the user does not pull, divided by its stiffness during a pull.
 NOTHING = 1e-12
 
 
@@ -55,8 +56,8 @@ class Playing(NamedTuple):
 
 
 def at_rest(scene: Scene) -> Playing:
-    """Return the body before the first step, and its compiled program. A scene with time starts in its initial state;
-    a scene without time starts after its load steps.
+    """Return the body before the first step, with the compiled program for a step. A scene with time steps dt starts in
+    its initial state. A scene without dt starts at the end of its load steps.
 
     Raises:
         InputError: the scene is harmonic, or `simulate` cannot run it.
@@ -82,8 +83,8 @@ def at_rest(scene: Scene) -> Playing:
 
 
 def _with_histories(scene: Scene) -> Scene:
-    """Return the scene with a history for motions and forces that otherwise grow until the last step, because here
-    there is no last step."""
+    """Return the scene with a history for prescribed motions and forces that grow until the last step. With this
+    history, these motions and forces grow in the planned time of the scene, and are constant afterwards."""
     if scene.solve.dt is None:
         return scene
     table = {"times": scene.solve.steps * scene.solve.dt * jnp.array([0.0, 1.0]), "history": jnp.array([0.0, 1.0])}
@@ -112,12 +113,12 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
 
     Args:
         playing: the body before the step.
-        node: mesh number of the node that is pulled. If it is None, no node is pulled.
-        to: end of the spring (3,) [m].
+        node: number of the node that is pulled; None: no node is pulled.
+        to: position (3,) [m] of the free end of the spring.
         stiffness: stiffness of the spring [N/m].
 
     Raises:
-        InputError: the node does not exist, or the end or the stiffness cannot be used.
+        InputError: the node does not exist, or `to` or `stiffness` cannot be used.
     """
     *others, spring = playing.scene.physics
     if node is None:
@@ -130,7 +131,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
         spring = replace(
             spring, nodes=jnp.full((1, 1), node, jnp.int32), to=jnp.asarray(end), stiffness=jnp.asarray(stiffness)
         )
-    # The compiled program needs arrays of its own precision.
+    # The compiled program needs arrays with the precision for which it was compiled.
     spring = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), spring, playing.scene.physics[-1])
     scene = replace(playing.scene, physics=(*others, spring))
     first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # STEPS means the full load
@@ -143,7 +144,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
 
 
 def _end_of_spring(playing: Playing, node: int, to: Any, stiffness: float) -> np.ndarray:
-    """Check node, end and stiffness, and return the end (3,) [m] of the spring."""
+    """Check the arguments, and return the position (3,) [m] of the free end of the spring."""
     if not isinstance(node, int) or not 0 <= node < len(playing.positions):
         raise InputError(f"node = {node!r} is not in the mesh: give 0 to {len(playing.positions) - 1}")
     try:

@@ -1,5 +1,5 @@
-"""A local web server that shows the body in a browser. It serves a page and the surface of the body, and computes one
-step per picture. Other machines have no access."""
+"""A local web server that shows the body in a browser. The server sends a page and the surface of the body, and
+computes one step for each picture. Other computers cannot connect to it."""
 
 import json
 import threading
@@ -16,7 +16,7 @@ from liverjax.play.pulling import Playing, pulled
 
 
 class PlayServer(ThreadingHTTPServer):
-    """Serves one body to all open pages."""
+    """Web server that shows the same body in all open pages."""
 
     daemon_threads = True
 
@@ -27,14 +27,14 @@ class PlayServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """Address of the page."""
+        """Address (URL) of the page."""
         return f"http://127.0.0.1:{self.server_address[1]}/"
 
 
 class Answer(BaseHTTPRequestHandler):
-    """GET / and /surface; POST /step {node, to, stiffness} and /rest."""
+    """Handler of the requests GET / and /surface, and POST /step {node, to, stiffness} and /rest."""
 
-    protocol_version = "HTTP/1.1"  # one connection for all steps
+    protocol_version = "HTTP/1.1"  # keeps one connection for all steps
     server: PlayServer
 
     def do_GET(self) -> None:
@@ -48,7 +48,8 @@ class Answer(BaseHTTPRequestHandler):
             self._send(404, "text/plain", b"there is /, /surface, /step and /rest")
 
     def do_POST(self) -> None:
-        """Compute a step, or go back to the beginning. Send the positions (n, 3) of the surface nodes as float32."""
+        """Compute a step, or go back to the first state. Send the positions (n, 3) [m] of the surface nodes as
+        float32."""
         try:
             asked = json.loads(self.rfile.read(int(self.headers.get("Content-Length") or 0)) or b"{}")
         except ValueError:
@@ -73,21 +74,22 @@ class Answer(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Print nothing. Otherwise the server would print thirty lines per second."""
+        """Print nothing: the standard method would print thirty lines per second."""
 
 
 def stepped(playing: Playing, asked: Content) -> Playing:
-    """Return the body after a step that a page has requested."""
+    """Return the body after one step. `asked`: the JSON object of the request."""
     return pulled(playing, asked.get("node"), asked.get("to"), asked.get("stiffness", playing.stiffness))
 
 
 def on_surface(playing: Playing) -> np.ndarray:
-    """Return the positions of the surface nodes (n, 3), float32 [m]."""
+    """Return the positions (n, 3) [m] of the surface nodes as float32."""
     return playing.positions[playing.nodes].astype("<f4")
 
 
 def surface(playing: Playing) -> dict[str, object]:
-    """Return the data that a page needs once: nodes, triangles and positions of the surface, size, and stiffness."""
+    """Return the data that a page needs once: nodes, triangles and positions of the surface, size of the body, and
+    stiffness of the spring."""
     return {
         "nodes": playing.nodes.tolist(),
         "triangles": playing.triangles.ravel().tolist(),

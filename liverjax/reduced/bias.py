@@ -1,9 +1,9 @@
 """Bias of parameters that were identified with a reduced model instead of the full model.
 
-Let p be the parameters for which the result u(p) of the reduced model is closest to the data. At p the full model has
-the result u(p) + d, and one full run gives d. The full model fits the same data best at p - b. To first order, b is the
-least-squares solution of J b = d, with the derivative J of u with respect to p. So b is the bias that the reduced model
-causes, and p - b has no such bias to first order.
+Let p be the parameters for which the result u(p) of the reduced model is closest to the data. For p, the result of the
+full model is u(p) + d. The difference d is known from one full run. The full model fits the same data best at p - b. To
+first order, b is the least-squares solution of J b = d, with the derivative J of u with respect to p. So b is the bias
+that the reduced model causes, and p - b has no such bias to first order.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,15 +25,17 @@ def reduced_bias(
 ) -> dict[str, np.ndarray]:
     """Return the bias of identified parameters, in the units and shapes of the parameters.
 
-    Subtract the bias from the parameters to correct them. The function needs one full run and cannot be traced.
+    Subtract the bias from the identified parameters to correct them. The function does one full run. It cannot be used
+    inside jit, grad or vmap.
 
     Args:
-        model, scene: as in `simulate_reduced`.
-        values: dotted names -> values that were identified with the model.
-        observed: the function of positions (T, V, 3) [m] that was fitted to data, including the weights of the fit.
+        model, scene: the same arguments as for `simulate_reduced`.
+        values: dotted names of parameters -> their values that were identified with the model.
+        observed: function of the positions (T, V, 3) [m] of the nodes. It returns the quantities that were fitted to
+            the data, multiplied by the weights of the fit.
 
     Raises:
-        InputError: `simulate_reduced` cannot be used.
+        InputError: `simulate_reduced` cannot run this scene.
         RuntimeError: the full run fails.
     """
     flat, shaped = ravel_pytree({name: jnp.asarray(value, float) for name, value in values.items()})

@@ -1,17 +1,18 @@
-"""Correction of the error of modes and points (a closure of the reduced model), learnt from the full training runs.
+"""Correction of the error due to modes and sampled points (a closure of the reduced model). It is learnt from the full
+training runs.
 
 The reduced model is run with the parameter sets of its training, for which full runs exist. The difference between the
 full and the reduced motion is approximated by a sum of fields. The coefficient of each field is a polynomial of the
-reduced coordinates: linear in all coordinates, and quadratic in the first few. In scenes with time, the time
-derivatives of the coordinates are also terms of the polynomial. The factors of the terms are found by least squares
-with a small ridge penalty (closures of reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys. Fluids
-33, 091301). The differences of each run are divided by the largest displacement of this run.
+reduced coordinates: linear in all coordinates, and quadratic in the first few coordinates. In scenes with time, the
+time derivatives of the coordinates are also terms of the polynomial. The factors of the terms are found by least
+squares with a small ridge penalty (closures of reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys.
+Fluids 33, 091301). The differences of each run are divided by the largest displacement of this run.
 
-In a cross-validation, groups of runs are left out in turn. The errors of the left-out runs determine how many
-coordinates have quadratic terms. These errors also give a model of the error of the corrected motion. In this model,
-the logarithm of the error is linear in the logarithms of three numbers, which are known without a full run: the size of
-the correction, the largest displacement, and the leverage of the terms. The leverage is the variance of the
-least-squares prediction divided by the variance of the data (Hoaglin, Welsch 1978).
+In a cross-validation, one group of runs after another is left out of the fit. The errors of the left-out runs determine
+how many coordinates have quadratic terms. These errors also give a model of the error of the corrected motion. In this
+model, the logarithm of the error is linear in the logarithms of three numbers, which are known without a full run: the
+size of the correction, the largest displacement, and the leverage of the terms. The leverage is the variance of the
+least-squares prediction, divided by the variance of the data (Hoaglin, Welsch 1978).
 """
 
 from functools import partial
@@ -24,18 +25,18 @@ import numpy as np
 from liverjax.core.struct import Number, param, static, struct
 from liverjax.tensors.principal_fields import principal_fields
 
-#: Number of groups of runs that are left out in turn, and minimum number of runs for a correction.
+#: GROUPS: number of groups of runs in the cross-validation. FEWEST_RUNS: minimum number of runs for a correction.
 GROUPS, FEWEST_RUNS = 12, 6
 #: PRODUCTS: numbers of coordinates with quadratic terms that are tried. RATES: maximum number of coordinates that are
 #: multiplied by time derivatives.
 PRODUCTS, RATES = (0, 6, 12, 20), 8
 #: RIDGE: ridge penalty, relative to the mean squares of the terms. OUTSIDE: fraction of the differences that the fields
-#: may leave out. MOST_FIELDS: maximum number of fields.
+#: may neglect. MOST_FIELDS: maximum number of fields.
 RIDGE, OUTSIDE, MOST_FIELDS = 1e-6, 0.02, 150
-#: Maximum number of differences from which the fields are made.
+#: Maximum number of states whose differences are used to compute the fields.
 FIELD_STATES = 1500
-#: Prior values of the exponents of the stated error, for too few runs. Then the stated error is a constant times the
-#: square root of the leverage.
+#: Prior values of the three exponents of the stated error, used if there are too few runs. With these exponents, the
+#: stated error of the motion is a constant times the square root of the leverage.
 FEW_RUNS_EXPONENTS = np.array([0.0, -1.0, 0.5])
 #: Weight of these prior values, expressed as a number of runs.
 FEW_RUNS = 10.0
@@ -46,10 +47,10 @@ class Correction:
     """Polynomials with k terms for the coefficients of m fields, and numbers that determine the stated error."""
 
     fields: jax.Array = param("1", "(m, V, 3), orthonormal with the lumped volumes of the nodes")
-    factors: jax.Array = param("m^2.5", "factors of every term in every field (k, m)")
+    factors: jax.Array = param("m^2.5", "factor of each term in the coefficient of each field (k, m)")
     inverse: jax.Array = param("1", "inverse of the normal matrix of the terms (k, k)")
     scale: jax.Array = param("m", "size of the first coordinate")
-    statement: jax.Array = param("1", "constant and exponents (4,) of the stated error, see `_logarithms`")
+    statement: jax.Array = param("1", "constant and 3 exponents (4,) of the stated error, see `_logarithms`")
     left: jax.Array = param("1", "error of each left-out run, divided by its largest displacement (R,)")
     ratios: jax.Array = param("1", "stated error divided by true error of each left-out run (R,)")
     products: int = static(default=0, about="number of coordinates with quadratic terms")
@@ -66,7 +67,7 @@ class Learnt(NamedTuple):
 
 
 def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.Array:
-    """Return the terms (T, k) of the polynomial at the coordinates q (T, n) of a run that begins at rest.
+    """Return the values (T, k) [1] of the k terms of the polynomial at every step of a run that begins at rest.
 
     Args:
         q: coordinates (T, n) [m].
@@ -85,12 +86,13 @@ def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.
 
 
 def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Return the correction (T, V, 3) [m] of the motion of the nodes."""
+    """Return the correction (T, V, 3) [m] of the node positions, for reduced coordinates q (T, n) [m] and the time step
+    dt [s]."""
     return jnp.tensordot(terms(q, own.scale, own.products, dt) @ own.factors, own.fields, axes=1)
 
 
 def size_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Return the maximum distance (T,) [m] by which the correction moves a node, up to each step."""
+    """Return the maximum length (T,) [m] of the correction of a node, up to each step."""
     return jax.lax.cummax(_largest_of_steps(correction_at(own, q, dt)))
 
 
@@ -124,20 +126,20 @@ def _largest_of_steps(u: jax.Array) -> jax.Array:
 
 
 def _leverage(a: jax.Array, inverse: jax.Array) -> jax.Array:
-    """Return the variance (T,) of the least-squares prediction at terms a (T, k), divided by the variance of the
-    data."""
+    """Return the leverage (T,) [1] of terms a (T, k): the variance of the least-squares prediction, divided by the
+    variance of the data."""
     return jnp.sum((a @ inverse) * a, axis=1)
 
 
 def _logarithms(corrected: jax.Array, moved: jax.Array, leverage: jax.Array) -> jax.Array:
-    """Return the logarithms (R, 3) of relative correction, displacement and leverage, from which the stated error is
-    computed."""
+    """Return three logarithms (R, 3), from which the stated error is computed: of the correction divided by the
+    displacement, of the displacement `moved` [m], and of the leverage."""
     tiny = jnp.finfo(moved.dtype).tiny
     return jnp.log(jnp.maximum(jnp.stack([corrected / moved, moved, leverage], axis=1), tiny))
 
 
 class _LeftOut(NamedTuple):
-    """Errors of every run (R,) with a correction that is learnt without the group of this run."""
+    """Errors of every run (R,), with a correction that was learnt without the group of this run."""
 
     off: np.ndarray  # maximum error [m]
     corrected: np.ndarray  # maximum correction [m]
@@ -145,8 +147,8 @@ class _LeftOut(NamedTuple):
 
 
 def learnt_correction(runs: Learnt) -> Correction | None:
-    """Return the correction with the smallest errors of left-out runs. Return None if there are too few runs or if no
-    correction reduces these errors."""
+    """Learn corrections with different numbers of quadratic terms, and return the one with the smallest errors of
+    left-out runs. Return None if there are too few runs, or if no correction reduces these errors."""
     R = len(runs.q)
     if R < FEWEST_RUNS or not np.any(runs.q):
         return None
@@ -160,7 +162,7 @@ def learnt_correction(runs: Learnt) -> Correction | None:
     for products in PRODUCTS:
         of_run = partial(terms, scale=scale, products=products, dt=runs.dt)
         A = np.asarray(jax.vmap(of_run)(jnp.asarray(runs.q)))
-        if 2 * A.shape[2] > A.shape[0] * A.shape[1]:  # too many terms for this number of states
+        if 2 * A.shape[2] > A.shape[0] * A.shape[1]:  # too many terms for this number of training states
             break
         sums = _least_squares(A, parts, runs.moved, group)
         out = _left_out(A, sums, group, runs.missing, fields.reshape(-1, *runs.missing.shape[2:]) / roots)
@@ -185,11 +187,11 @@ def learnt_correction(runs: Learnt) -> Correction | None:
 def _left_out(
     A: np.ndarray, sums: "_LeastSquares", group: np.ndarray, missing: np.ndarray, fields: np.ndarray
 ) -> _LeftOut:
-    """Return the errors of every run, with a correction that is learnt without the group of this run.
+    """Return the errors of every run, with a correction learnt without the group of this run.
 
     Args:
-        A: terms (R, T, k).
-        sums: normal equations of all groups.
+        A: values of the terms of the polynomial (R, T, k).
+        sums: normal equations of each group of runs.
         group: group of each run (R,).
         missing: full minus reduced motion (R, T, V, 3) [m].
         fields: fields of the correction (m, V, 3).
@@ -205,12 +207,12 @@ def _left_out(
 
 
 def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return constant and exponents (4,) of the stated error, and the ratios (R,) of stated to true error for the
-    left-out runs.
+    """Return the constant and the exponents (4,) of the stated error, and the stated error divided by the true error
+    (R,) for the left-out runs.
 
     The exponents come from a least-squares fit of the logarithms. With few runs they stay close to
-    `FEW_RUNS_EXPONENTS`. The constant is chosen so that the 1 % and 99 % quantiles of the ratio have the same distance
-    from 1 in the logarithm.
+    `FEW_RUNS_EXPONENTS`. The constant is chosen so that the logarithms of the 1 % and 99 % quantiles of this ratio have
+    the same absolute value.
     """
     x = np.asarray(_logarithms(*(jnp.asarray(a) for a in (out.corrected, moved, out.leverage))))
     y = np.log(np.maximum(out.off / moved, np.finfo(float).tiny)) - x @ FEW_RUNS_EXPONENTS
@@ -228,13 +230,13 @@ def _farthest(u: np.ndarray) -> np.ndarray:
 
 
 def _error_fields(weighted: np.ndarray) -> np.ndarray:
-    """Return orthonormal fields (m, 3 V) for differences (N, 3 V). Both are multiplied by the square roots of the nodal
-    volumes."""
+    """Return orthonormal fields (m, 3 V) that approximate the differences `weighted` (N, 3 V) of full and reduced
+    motion. Fields and differences are multiplied by the square roots of the nodal volumes."""
     return principal_fields(weighted[:: max(1, len(weighted) // FIELD_STATES)], OUTSIDE)[:MOST_FIELDS]
 
 
 class _LeastSquares(NamedTuple):
-    """Normal equations for the factors, one set for each of g groups of runs."""
+    """Normal equations for the factors of the terms. There is one set of equations for each of g groups of runs."""
 
     squares: np.ndarray  # normal matrices (g, k, k)
     products: np.ndarray  # right sides (g, k, m)
@@ -242,8 +244,8 @@ class _LeastSquares(NamedTuple):
     states: int  # number of states in all runs
 
     def without(self, *groups: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the factors (k, m) from all runs except some groups, and the inverse (k, k) of the normal matrix of
-        these runs."""
+        """Return the factors (k, m) from all runs except the given groups, and the inverse (k, k) of the normal matrix
+        of the runs that are used."""
         kept = np.setdiff1d(np.arange(len(self.squares)), groups)
         H = self.squares[kept].sum(axis=0) + RIDGE * self.states * np.eye(len(self.size))
         inverse = np.linalg.inv(H) / np.outer(self.size, self.size)

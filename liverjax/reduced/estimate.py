@@ -1,19 +1,21 @@
-"""Estimated error of a reduced run, from the out-of-balance forces on the full mesh and the motion that they cause.
+"""Estimate the error of a reduced run from the out-of-balance forces on the full mesh.
 
-The equations of the full model are evaluated for the reduced motion, step by step, with the viscous memory of all
-elements. The out-of-balance forces r determine the error e of the motion. To first order, e follows the linear
-equations of the same body,
+The equations of the full model are evaluated for the reduced motion, step by step, with the history variables of
+viscosity in all elements. The out-of-balance forces r determine the error e of the motion. To first order, e is the
+solution of the linear equations of the same body,
 
     M a(e) + K e - memory(e) = -r,
 
-with the mass matrix M, the acceleration a, the stiffness K of the reference shape and the same recursion (the update of
-the viscous memory from step to step). The matrix of the left side is factorised once per run. So a step needs the
-forces of the full mesh and one linear solve, but no Newton iterations. In statics the energy norm of e is the dual norm
-of r. The estimate neglects terms of second order in e and the change of the stiffness with the deformation.
+with the mass matrix M, the acceleration a(e), the stiffness K of the reference shape, and the forces memory(e) of the
+history variables. These variables are updated from step to step by the same recursion as in the full model. The matrix
+of the left-hand side is factorised once per run. So a step needs the forces of the full mesh and one linear solve, but
+no Newton iterations. In statics the energy norm of e is the dual norm of r. The estimate neglects terms of second order
+in e and the change of the stiffness with the deformation.
 
-In a porous scene, the pressures of the full mesh are computed for the reduced motion, so that only the forces are out
-of balance. These forces correspond to errors of motion and pressure (`liverjax.reduced.physics.fluid_error`). The error
-of the reduced pressure is the reduced pressure minus the computed pressure, minus the change of pressure due to e.
+In a porous scene, the fluid pressures on the full mesh are computed from the reduced motion. Then the volume balance of
+the fluid is fulfilled, and only the forces are out of balance. These forces cause the errors of motion and pressure
+(`liverjax.reduced.physics.fluid_error`). The error of the reduced pressure is the reduced pressure minus the computed
+pressure, minus the change of pressure due to e.
 """
 
 from collections.abc import Callable
@@ -53,7 +55,7 @@ if TYPE_CHECKING:
 
 
 class _Body(NamedTuple):
-    """Sparse matrices (f, f) of the linear equations for the error, for the f free degrees of freedom."""
+    """Sparse matrices (f, f) of the linear equations for the error; f is the number of free degrees of freedom."""
 
     relaxing: jax.Array  # stiffness of the part that relaxes [N/m]
     rest: Any  # stiffness of the part that does not relax, or None
@@ -61,12 +63,13 @@ class _Body(NamedTuple):
 
 
 def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ReducedResult:
-    """Return the result with estimated errors (T,) of motion [m] and pressure [Pa], and with reactions (T, V, 3) [N].
+    """Add to the result the estimated errors (T,) of motion [m] and pressure [Pa], and the reactions (T, V, 3) [N].
+    Return the new result.
 
-    The function is for one run and cannot be traced.
+    The function is for one run. It cannot be used inside jit, grad or vmap.
 
     Args:
-        model, scene, result: as in `simulate_reduced`.
+        model, scene, result: arguments and result of `simulate_reduced`.
     """
     own = prepared(scene)
     residuals, reactions, P = _out_of_balance(own, reduced_positions(model, scene, result))
@@ -80,9 +83,10 @@ def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> R
 
 @jax.jit
 def _out_of_balance(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Return out-of-balance forces and reactions (T, V, 3) [N] of the full model for given positions x (T, V, 3) [m].
+    """Return out-of-balance forces (T, V, 3) [N], reactions (T, V, 3) [N] and fluid pressure (T, V) [Pa] of the full
+    model for given positions x (T, V, 3) [m].
 
-    The third result is the pressure (T, V) [Pa] of the fluid for these positions, or None without a fluid.
+    The pressure is None without a fluid.
     """
     sizes = force_sizes(scene)
 
@@ -119,8 +123,8 @@ def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
 
 
 def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return displacements (T, V, 3) [m] and pressures (T, V) [Pa] of the linear body under the forces -residuals
-    (T, V, 3) [N]. The pressures are None without a fluid."""
+    """Return the errors of displacement (T, V, 3) [m] and pressure (T, V) [Pa]: the response of the linear body to the
+    forces -residuals (T, V, 3) [N]. The pressures are None without a fluid."""
     import scipy.sparse
 
     free = np.flatnonzero(np.asarray(free_directions(scene).mask).ravel())
@@ -157,7 +161,8 @@ def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid | None
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """Return the solver of `coupled_solver`, or a solver for the matrix K alone if there is no fluid."""
+    """Return the function of `coupled_solver` for one step. Without a fluid, return a function that solves with the
+    matrix K alone."""
     from scipy.sparse.linalg import splu
 
     if fluid is not None:
@@ -167,7 +172,8 @@ def _solver(
 
 
 def _recursion(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the coefficients a, b, c (N,) of the recursion for N Prony terms; empty arrays without viscosity."""
+    """Return the coefficients a, b, c (N,) [1] of the recursion gamma_new = a S + b gamma + c S_before, for N Prony
+    terms. The arrays are empty without viscosity."""
     if scene.viscosity is None:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     a, b, c = coefficients(scene.viscosity, scene.solve.dt)

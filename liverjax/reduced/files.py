@@ -1,4 +1,5 @@
-"""Write and read reduced models: one HDF5 file with modes, points, weights, and data of the scene and program."""
+"""Write and read reduced models: one HDF5 file with modes, points, weights, the scene file and the versions of the
+program."""
 
 import json
 from pathlib import Path
@@ -29,7 +30,7 @@ def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") ->
     Args:
         model: `ReducedModel`.
         file: HDF5 file, which is replaced if it exists.
-        scene_text: content of the scene file from which the model was made. This text is stored in the HDF5 file.
+        scene_text: content of the scene file from which the model was made. It is stored in the HDF5 file.
     """
     import h5py
 
@@ -83,7 +84,8 @@ def load_reduced(file: str | Path) -> ReducedModel:
 
 
 def _wrong(model: ReducedModel) -> str:
-    """Return a text about the first array with a wrong shape or with values that are not finite, or an empty text."""
+    """Return an error message for the first array that has a wrong shape or values that are not finite. The string is
+    empty if all arrays are right."""
     n, V, S = *jnp.shape(model.modes)[:2], *jnp.shape(model.weights)[:1]
     shapes: dict[str, tuple] = {"modes": (n, V, 3), "slopes": (9, S, n), "weights": (S,), "points": (S,)}
     arrays = {name: getattr(model, name) for name in shapes}
@@ -106,7 +108,7 @@ def _wrong(model: ReducedModel) -> str:
 
 
 def _correction(stored: "h5py.File") -> Correction | None:
-    """Read the correction from an open file; None if the file has no correction."""
+    """Read the correction from an open file. Return None if the file has no correction."""
     if "correction" not in stored:
         return None
     own = stored["correction"]
@@ -115,7 +117,7 @@ def _correction(stored: "h5py.File") -> Correction | None:
 
 
 def _pressures(stored: "h5py.File") -> PressureModes | None:
-    """Read the pressure modes from an open file; None if the file has no pressure modes."""
+    """Read the pressure modes from an open file. Return None if the file has no pressure modes."""
     if "pressures" not in stored:
         return None
     return PressureModes(**{name: jnp.asarray(stored["pressures"][name][()]) for name in _PRESSURES})

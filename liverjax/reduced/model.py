@@ -1,11 +1,12 @@
 """A reduced model: modes of motion, and a weighted selection of integration points at which stresses are evaluated.
 
-Positions are x = X + u_D(t) + sum_k q_k phi_k, with the reference positions X, the prescribed displacement u_D and the
-reduced coordinates q_k. The modes phi_k are 0 where the body is fixed or moved. The energy is W(q) = sum_p w_p
-W(F_p(q)), the sum over the sampled points p with deformation gradients F_p and weights w_p >= 0. The derivative of W
-with respect to q_k, sum_p w_p P(F_p) : grad phi_k with the first Piola-Kirchhoff stress P, is the reduced force. So the
-reduced forces have an energy, as in the full model (energy-conserving sampling and weighting: Farhat, Avery, Chapman,
-Cortial 2014; here with points instead of elements).
+The positions of the nodes are x = X + u_D(t) + sum_k q_k phi_k, with the reference positions X, the prescribed
+displacement u_D and the reduced coordinates q_k. The modes phi_k are 0 where displacements are fixed or prescribed. The
+energy of the reduced model is sum_p w_p W(F_p(q)), with the strain energy function W, the deformation gradients F_p at
+the sampled points p, and the weights w_p >= 0. The derivative of this energy with respect to q_k is the reduced force
+of mode k, sum_p w_p P(F_p) : grad phi_k, with the first Piola-Kirchhoff stress P. So the reduced forces are
+conservative, as in the full model (energy-conserving sampling and weighting: Farhat, Avery, Chapman, Cortial 2014; here
+with points instead of elements).
 """
 
 import hashlib
@@ -38,9 +39,10 @@ from liverjax.tensors.places import taken
 
 #: A parameter may be outside of its training range by this fraction of the width of the range.
 BEYOND = 0.5
-#: Parts of a scene that contain numbers with an effect on the motion.
+#: Entries of a scene with numbers that change the motion.
 _PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction", "physics")
-#: Names of numbers that may differ from the training, because other histories can lead to states of the training.
+#: Names of numbers that may differ from the training runs, because a load with another history can lead to the same
+#: states.
 _FREE = ("times", "history")
 
 
@@ -51,7 +53,7 @@ class PressureModes:
 
     modes: jax.Array = param("1", "(m, V), orthonormal with the lumped volumes of the vertices")
     values: jax.Array = param("1", "values at the points (S, m)")
-    parts: jax.Array = param("1", "vertex values of each point's element, times roots of shape functions (m, 4, S)")
+    parts: jax.Array = param("1", "(m, 4, S) vertex values of each point's element, times roots of shape functions")
     slopes: jax.Array = param("1/m", "gradients at the points (m, 3, S)")
 
 
@@ -61,11 +63,11 @@ class ReducedModel:
     viscosity can be changed."""
 
     modes: jax.Array = param("1", "(n, V, 3), orthonormal with the lumped volumes of the nodes")
-    slopes: jax.Array = param("1/m", "gradients of the modes at the points (9, S, n), row by row")
+    slopes: jax.Array = param("1/m", "gradients of the modes at the points (9, S, n), the matrix row by row")
     weights: jax.Array = param("m^3", "reference volume that a point represents (S,), not negative")
     points: jax.Array = param("1", "number q E + e of integration point q in element e of E (S,)")
-    ranges: dict[str, Any] = param("1", "name of each training parameter -> lowest and highest value")
-    correction: Correction | None = param("1", "correction of the error of modes and points, or None", default=None)
+    ranges: dict[str, Any] = param("1", "name of each training parameter -> its lowest and highest value")
+    correction: Correction | None = param("1", "correction of the motion (`Correction`), or None", default=None)
     pressures: PressureModes | None = param("1", "pressure modes of a porous scene", default=None)
     identity: str = static(default="", about="digest of the scene for which the model is made")
     others: str = static(default="", about="digests of the numbers that are equal in all training runs, as JSON")
@@ -77,7 +79,8 @@ class ReducedModel:
 
 
 def flat_gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Return the gradient (9, Q E) of a field x (V, 3) at all integration points of the mesh, row by row."""
+    """Return the gradient (9, Q E) of a field x (V, 3) at all integration points of the mesh. The 3 x 3 gradient is
+    stored row by row."""
     F = deformation_gradient(mesh, x)
     return jnp.stack([entry for row in F for entry in row]).reshape(9, -1)
 
@@ -88,7 +91,8 @@ def as_matrix(flat: jax.Array) -> Matrix:
 
 
 def pressure_modes(mesh: TetMesh, modes: jax.Array) -> PressureModes:
-    """Return the pressure modes with these vertex values (m, V), and their values at all integration points."""
+    """Return `PressureModes` at all integration points, from the values `modes` (m, V) of the pressure modes at the
+    vertices."""
     L = jnp.full((4, 1), 0.25) if mesh.order == 1 else jnp.asarray(basis(mesh.order).L)
 
     def at_points(mode: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -108,7 +112,7 @@ def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None 
     Args:
         scene: `Scene`.
         modes: modes of the motion (n, V, 3).
-        pressures: modes of the pressure (m, V), None without a fluid.
+        pressures: modes of the pressure (m, V); None if the scene has no fluid.
     """
     mesh = scene.mesh
     slopes = jnp.moveaxis(jax.lax.map(lambda mode: flat_gradient(mesh, mode), modes), 0, -1)
@@ -125,8 +129,8 @@ def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None 
 
 
 def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
-    """Return the elasticity or viscoelasticity of the full model, with the parameters of the law at the sampled
-    points."""
+    """Return the physics object for elasticity or viscoelasticity, as in the full model, with the law's parameters at
+    the sampled points."""
     E = scene.mesh.number_of_elements
     law = law_of_elements(law_at_rest(scene), scene.region, E)
     elements = model.points % E
@@ -136,8 +140,8 @@ def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
 
 
 def reduced_identity(scene: Scene) -> str:
-    """Return a digest of the mesh, the fixed, moved and drained nodes, and the kinds of law, viscosity, porosity,
-    supports and run.
+    """Return a digest of the mesh, the fixed, displaced and drained nodes, and the kinds of law, viscosity, porosity,
+    supports and solution (static or dynamic).
 
     The digest does not depend on the parameters.
     """
@@ -158,37 +162,39 @@ def reduced_identity(scene: Scene) -> str:
 
 
 def refuse_unknown_physics(scene: Scene) -> None:
-    """Raise InputError if the scene has parts that reduced models do not support.
+    """Raise InputError if the scene has entries that reduced models do not support.
 
     Raises:
-        InputError: the scene has viscosity or other laws of regions, inlets of a fluid, physics objects other than
-            supports, a loaded mesh, or pressures that follow the surface. Or it has averaged or mixed volumes, a
-            consistent mass, a precision other than "float64", or a setting of newton other than "converged".
+        InputError: the scene has regions with a separate viscosity or another kind of law, inlets of a fluid, physics
+            objects other than supports, a loaded mesh, or pressures that follow the surface. Other reasons are averaged
+            or mixed volumes, a consistent mass matrix, viscosity without a time step, a precision other than "float64",
+            or a setting of newton other than "converged".
     """
     if any(region.viscosity for region in scene.region):
         raise InputError("a reduced model has one viscosity: remove the viscosity of regions, or run the full model")
     if len(laws_of(scene.law, scene.region)) > 1:
         raise InputError(
-            "a reduced model has one kind of law: use this law with other parameters in regions, or run the full model"
+            "a reduced model has only one kind of law: use the same law in all regions, or run the full model"
         )
     if scene.porosity is not None and scene.porosity.inlet:
-        raise InputError("a reduced model cannot have [[porosity.inlet]]: leave it out, or run the full model")
+        raise InputError("a reduced model cannot have [[porosity.inlet]]: remove it, or run the full model")
     if scene.points_are == "loaded":
         raise InputError('[mesh] is = "loaded" cannot be used with reduced models: use the scene of lj.unloaded(scene)')
     refuse_other_physics(scene)
     if follows(scene.traction):
-        raise InputError("a reduced model cannot have a pressure that follows the body: give traction.value instead")
+        raise InputError("a reduced model cannot have a pressure that follows the surface: give traction.value instead")
     if scene.solve.volumetric != "element":
         raise InputError(
-            f"[solve] volumetric = {scene.solve.volumetric!r} does not work in reduced models: use 'element'"
+            f"[solve] volumetric = {scene.solve.volumetric!r} does not work in reduced models: use "
+            "volumetric = 'element'"
         )
     if scene.body is not None and scene.body.mass != "lumped":
-        raise InputError(f"[body] mass = {scene.body.mass!r} does not work in reduced models: use 'lumped'")
+        raise InputError(f"[body] mass = {scene.body.mass!r} does not work in reduced models: use mass = 'lumped'")
     if scene.solve.newton != "converged":
         raise InputError(f"[solve] newton = {scene.solve.newton!r} does not work in reduced models: use 'converged'")
     if scene.solve.precision != "float64":
         raise InputError(
-            f"[solve] precision = {scene.solve.precision!r} does not work in reduced models: use 'float64'"
+            f"[solve] precision = {scene.solve.precision!r} does not work in reduced models: use precision = 'float64'"
         )
     if scene.solve.kind == "static" and scene.viscosity is not None and scene.solve.dt is None:
         raise InputError("[viscosity] needs dt in [solve]: give a time step in s")
@@ -198,8 +204,9 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
     """Raise InputError if the model was not made for this scene.
 
     Raises:
-        InputError: `refuse_unknown_physics` raises it, or the mesh, the fixed nodes, or the kinds of law, viscosity,
-            supports or run differ.
+        InputError: reduced models do not support the scene (`refuse_unknown_physics`), or the mesh, the fixed nodes, or
+            the kinds of law, viscosity, supports or solution differ. Inside jit, grad or vmap these data are not
+            compared.
     """
     refuse_unknown_physics(scene)
     if isinstance(scene.mesh.points, jax.core.Tracer):
@@ -213,10 +220,11 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
 
 
 def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) -> str:
-    """Return names and digests of the numbers of a scene that are the same in all training runs, as JSON text.
+    """Return a JSON string: names and digests of the numbers of a scene that are the same in all training runs, and the
+    settings of time integration.
 
     Args:
-        scene: `Scene`, not traced.
+        scene: `Scene` with known numbers (not inside jit, grad or vmap).
         varied: dotted names -> one value of each number that differs between the training runs.
     """
     scene = with_parameters(scene, {name: np.zeros_like(np.asarray(value, float)) for name, value in varied.items()})
@@ -224,7 +232,7 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
     for part in _PARTS:
         for path, leaf in jax.tree_util.tree_flatten_with_path(getattr(scene, part))[0]:
             words = [str(getattr(key, "name", getattr(key, "idx", key))) for key in path]
-            if part == "physics":  # the same names as in a scene file, for example support.0
+            if part == "physics":  # the names are those of a scene file, for example support.0
                 part_of = scene.physics[: int(words[0]) + 1]
                 section = part_of[-1].section
                 words = [str(sum(own.section == section for own in part_of) - 1), *words[1:]]
@@ -232,25 +240,26 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
             else:
                 name = ".".join([part, *words])
             if name.rsplit(".", 1)[-1] not in _FREE:
-                # Equal numbers may differ in their last digits, and in the sign of 0.
+                # Rounding, because equal numbers may differ in their last digits and in the sign of 0.
                 rounded = np.asarray(leaf, np.float32) + np.float32(0)
                 found[name] = hashlib.sha256(rounded.tobytes()).hexdigest()[:8]
     return json.dumps(found | _course(scene))
 
 
 def _course(scene: Scene) -> Content:
-    """Return names and values of the settings of time integration."""
+    """Return the time integrator and the duration [s] of the run (None without time), with their names."""
     solve = scene.solve
     duration = None if solve.dt is None else float(solve.dt) * solve.steps
     return {"solve.integrator": solve.integrator, "solve.dt x solve.steps": duration}
 
 
 def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
-    """Raise InputError if the scene has numbers that do not occur in the training runs. A traced scene is not checked.
+    """Raise InputError if the scene has numbers that do not occur in the training runs. A scene inside jit, grad or
+    vmap is not checked.
 
     Raises:
-        InputError: a number that was varied is far outside of its training range, or another number differs from the
-            training runs.
+        InputError: a number that was varied in the training is far outside its training range, or a number that was not
+            varied differs from the training runs.
     """
     parts = [*(getattr(scene, part) for part in _PARTS), scene.solve.dt]
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((parts, model.ranges))):
@@ -264,7 +273,7 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
                 "error is not valid there: use lj.reduced_error, or train the model with a wider range"
             )
     if not model.others:
-        return  # made by an earlier version
+        return  # the model was made by an earlier version of the program
     made, own = json.loads(model.others), json.loads(other_numbers(scene, {n: b[0] for n, b in model.ranges.items()}))
     for name in _course(scene):
         before, after = made.pop(name, None), own.pop(name)
@@ -276,12 +285,12 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
     changed = sorted(name for name in made.keys() | own.keys() if made.get(name) != own.get(name))
     if changed:
         raise InputError(
-            f"{changed[0]} differs from the training of the reduced model, so its error is unknown: use "
-            "lj.reduced_error, or train a model with this number as a column of the rows"
+            f"{changed[0]} differs from the training of the reduced model, so the error of the model is unknown: use "
+            "lj.reduced_error, or train a model with this number among its parameters"
         )
 
 
 def without_rows(model: ReducedModel) -> ReducedModel:
-    """Return the model without the data that only the error estimate needs. Models that differ only in these data use
-    the same compiled program."""
+    """Return the model without the data that are needed only for the correction and the stated error. Models that
+    differ only in these data use the same compiled program."""
     return replace(model, correction=None, ranges={}, others="")

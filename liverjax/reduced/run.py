@@ -52,18 +52,19 @@ from liverjax.tensors.matrices import determinant
 
 @struct
 class ReducedResult:
-    """Result of a reduced run: arrays over the T steps. `reduced_positions` gives the motion of the nodes."""
+    """Result of a reduced run: arrays over the T steps. The function `reduced_positions` returns the motion of the
+    nodes."""
 
-    times: jax.Array = param("s", "(T,); the number of the load step if there is no time")
-    coordinates: jax.Array = param("m", "coordinates of the modes (T, n)")
+    times: jax.Array = param("s", "end of each step (T,); in a scene without time: number of the load step")
+    coordinates: jax.Array = param("m", "reduced coordinates (T, n): coordinates of the modes")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
     iterations: jax.Array = param("1", "(T,) iterations of Newton's method")
     residual: jax.Array = param("1", "(T,) residual of the reduced equations, divided by the size of all forces")
     pressures: jax.Array | None = param("Pa", "coordinates of the pressure modes (T, m)", default=None)
     error: jax.Array | None = param(
-        "m", "(T,) estimated maximum distance of a node from the full model; None if not estimated", default=None
+        "m", "(T,) estimated maximum distance of a node from the full model; None if unknown", default=None
     )
-    reactions: jax.Array | None = param("N", "(T, V, 3) of the full model; None if error is None", default=None)
+    reactions: jax.Array | None = param("N", "(T, V, 3) in the full model; None if error is None", default=None)
     pressure_error: jax.Array | None = param(
         "Pa",
         "(T,) estimated maximum error of the fluid pressure; None if error is None, or without a fluid",
@@ -72,14 +73,15 @@ class ReducedResult:
 
 
 class _Given(NamedTuple):
-    """Loads and prescribed motion at the end of every step."""
+    """Reduced loads and prescribed motion at the end of every step."""
 
-    load: jax.Array  # (T, n) [N]
+    load: jax.Array  # forces on the modes (T, n) [N]
     gradient: jax.Array  # deformation gradient of the prescribed motion (T, 9, S), or (1, 9, S) without motion
 
 
 def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
-    """Return loads and prescribed motion of all steps, and the load (n,) at the beginning of the run."""
+    """Return the reduced loads and the prescribed motion of all steps, and the reduced load (n,) [N] at the beginning
+    of the run."""
     mesh, solve, body = scene.mesh, scene.solve, scene.body
     weight = {} if body is None else {k: getattr(body, k) for k in ("density", "gravity", "times", "history")}
     loads = Loads(traction=scene.traction, **weight)
@@ -112,8 +114,8 @@ def _prescribed_steps(scene: Scene) -> jax.Array:
 
 
 def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
-    """Return the deformation gradients of the prescribed motion at the points, (T, 9, S), or (1, 9, S) without
-    motion."""
+    """Return the deformation gradients of the prescribed motion at the points and at the end of every step, (T, 9, S).
+    Without prescribed motion, return unit matrices (1, 9, S)."""
     mesh, solve = scene.mesh, scene.solve
 
     def moved(k: jax.Array) -> jax.Array:
@@ -127,10 +129,11 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
-    """Return the initial state: coordinates, viscous memory, fluid, velocity and acceleration, a zero matrix in place
-    of the inverse tangent, and the mass matrix.
+    """Return the initial state: reduced coordinates, history variables of viscosity, state of the fluid, velocity and
+    acceleration, and a zero matrix instead of the inverse tangent. The last result is the reduced mass matrix (n, n)
+    [kg].
 
-    Motion and mass are None without inertia.
+    Velocity, acceleration and mass are None without inertia. `load` (n,) [N]: reduced load at the beginning.
     """
     n, S = model.number_of_modes, model.weights.shape[0]
     q = jnp.zeros(n, model.modes.dtype)
@@ -153,8 +156,8 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
 
 
 def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> jax.Array:
-    """Return the reduced forces (n,) [N] of a given initial pressure, as in
-    `liverjax.simulation.equations.initial_state`."""
+    """Return the reduced forces (n,) [N] due to a given initial pressure (see
+    `liverjax.simulation.equations.initial_state`)."""
     sponge = reduced_sponge(model, scene)
     flow = flowing(model, sponge, fluid, jnp.asarray(scene.solve.dt))
     p = pressure_coordinates(flow, flow.J)
@@ -164,7 +167,8 @@ def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
     """Return a function for one step: (state before the step, loads) -> (state after the step, results of the step).
 
-    The state consists of coordinates, viscous memory, fluid, velocity and acceleration, and inverse tangent.
+    The state consists of the reduced coordinates, the history variables of viscosity, the state of the fluid, velocity
+    and acceleration, and the inverse tangent.
     """
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
@@ -218,15 +222,15 @@ def _reduced_run(model: ReducedModel, scene: Scene) -> ReducedResult:
 
 
 def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
-    """Run a scene with its reduced model. This function may be differentiated, vmapped and jitted.
+    """Run a scene with its reduced model. This function may be used inside jit, grad and vmap.
 
     Args:
         model: `ReducedModel`, from `reduce_scene` or `load_reduced`.
-        scene: the scene for which the model was made. Loads, the time step, and the parameters of law, regions,
-            viscosity and body may differ.
+        scene: the scene for which the model was made. Its loads, its time step, and the parameters of law, regions,
+            viscosity and body may be changed.
 
     Raises:
-        InputError: the model was made for another scene, or the scene has numbers that are not allowed in `simulate`.
+        InputError: the model was made for another scene, or the scene has numbers that `simulate` does not allow.
     """
     refuse_another_scene(model, scene)
     check_before_run(scene)
@@ -234,7 +238,8 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
 
 
 def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
-    """Return the positions (T, V, 3) [m] of the nodes, with or without the learnt correction of the model."""
+    """Return the positions (T, V, 3) [m] of the nodes. `corrected`: whether the learnt correction of the model is
+    added."""
     u = _free_motion(model if corrected else replace(model, correction=None), scene, result)
     if scene.displaced:
         u = u + _prescribed_steps(scene)
@@ -253,7 +258,8 @@ def reduced_pressure(model: ReducedModel, scene: Scene, result: ReducedResult) -
 
 
 def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
-    """Return the displacements (T, V, 3) [m] of the nodes from modes and correction, without the prescribed motion."""
+    """Return the displacements (T, V, 3) [m] of the nodes due to the modes and the correction, without the prescribed
+    motion."""
     u = jnp.tensordot(result.coordinates, model.modes, axes=1)
     if model.correction is not None:
         u = u + correction_at(model.correction, result.coordinates, scene.solve.dt)
@@ -263,21 +269,21 @@ def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> ja
 def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
     """Estimate the maximum distance (T,) [m] of a node from its position in the full model, up to each step.
 
-    Unlike `reduced_error`, this function does not use the full mesh, and it may be differentiated, vmapped and jitted.
-    The error of the corrected motion is learnt from runs that were left out in a cross-validation. The uncorrected
+    Unlike `reduced_error`, this function does not solve equations on the full mesh, and it may be used inside jit, grad
+    and vmap. The error of the corrected motion is learnt from training runs, by cross-validation. The uncorrected
     motion is less accurate. Its error is estimated well by the size of the correction. `experiments/TABLES.md` compares
     the two estimates.
 
     Args:
-        model, scene, result: as in `simulate_reduced`.
+        model, scene, result: arguments and result of `simulate_reduced`.
         corrected: whether the estimate is for `reduced_positions` with the correction.
 
     Raises:
         InputError: the model has no correction (too few training runs, or no correction reduced the errors); the scene
-            has numbers that do not occur in the training runs (a traced scene is not checked).
+            has numbers that do not occur in the training runs (inside jit, grad or vmap this is not checked).
     """
     if model.correction is None:
-        raise InputError("this reduced model has no correction: train it with more rows, or use lj.reduced_error")
+        raise InputError("this reduced model has no correction: train it with more runs, or use lj.reduced_error")
     refuse_unseen_numbers(model, scene)
     if not corrected:
         return size_at(model.correction, result.coordinates, scene.solve.dt)

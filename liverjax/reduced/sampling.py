@@ -2,8 +2,9 @@
 
 The contributions of all P integration points to the reduced forces form a matrix G. It has one row for each reduced
 force in each training state, and the sum of a row is this force. G is replaced by its most important singular vectors.
-Then the least-squares problem G xi = G 1 with xi >= 0 is solved by the method of Lawson and Hanson. The solution xi has
-few positive entries: at most as many points as singular vectors (Hernandez, Caicedo, Ferrer 2017).
+Then the factors xi >= 0 of the points are the least-squares solution of G xi = G 1, where 1 is the vector of ones
+(method of Lawson and Hanson). The number of positive factors is at most the number of singular vectors (Hernandez,
+Caicedo, Ferrer 2017).
 """
 
 from collections.abc import Callable, Mapping
@@ -34,14 +35,15 @@ from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.tensors.matrices import determinant
 from liverjax.tensors.principal_fields import principal_fields
 
-#: Maximum number of states from which forces are used. Memory and time increase with this number.
+#: Maximum number of training states whose forces are used. The required memory and time increase with this number.
 MOST_STATES = 240
-#: A state is left out if its forces cause a motion below this fraction [1] of the largest coordinate (roundoff).
+#: A state is not used if its forces cause a motion below this fraction [1] of the largest coordinate, because such a
+#: motion is roundoff.
 LEAST_MOTION = 1e-9
 
 
 class Coordinates(NamedTuple):
-    """Coordinates of R runs of T steps."""
+    """Reduced coordinates of R runs with T steps each."""
 
     q: np.ndarray | jax.Array  # coordinates of the modes (R, T, n) [m]
     p: np.ndarray | jax.Array | None  # coordinates of the pressure modes (R, T, m) [Pa]
@@ -50,17 +52,18 @@ class Coordinates(NamedTuple):
 def sampled(
     whole: ReducedModel, scene: Scene, values: Mapping[str, Any], runs: Coordinates, tolerance: float
 ) -> ReducedModel:
-    """Return the model with few points, from a model with all points and the coordinates of R training runs.
+    """Select few points from a model with all points, using the coordinates of R training runs. Return the model with
+    these points.
 
-    States at rest are left out. States with an inverted element are also left out if the law has no finite stress
-    there.
+    States at rest are not used. States with an inverted element are not used if the law has no finite stress there.
 
     Args:
-        whole: model from `with_all_points`.
+        whole: model with all points, from `with_all_points`.
         scene: `Scene`.
-        values: dotted names -> values of the training runs (R, …).
+        values: dotted names of the parameters -> their values in the training runs (R, …).
         runs: coordinates of these runs.
-        tolerance: reduced forces are converted to motions. This fraction of the motions may be left out [1].
+        tolerance: the reduced forces are converted to the motions that they cause. The selected points may neglect this
+            fraction of the motions [1].
     """
     compliance, rows, q = _reduced_compliance(whole, scene), [], runs.q
     for r, times in states_of(*q.shape[:2]):
@@ -81,17 +84,18 @@ def sampled(
 
 
 def _balances(volumes: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return rows (…, P) of the matrix G for both sides of the fluid's volume balance (2, K, m, P), given as pressures.
+    """Return rows (2 K m, P) of the matrix G, from both sides `volumes` (2, K, m, P) [Pa] of the fluid's volume balance
+    (see `_balance`).
 
-    Each row is divided by the scale of its state: the norm of the pressures from the change of volume, plus the norm of
-    p (K, m).
+    Each row is divided by the scale of its state. The scale is the norm of the pressures due to the change of volume,
+    plus the norm of the pressure coordinates p (K, m) [Pa].
     """
     size = np.linalg.norm(volumes[0].sum(axis=2), axis=1) + np.linalg.norm(p, axis=1)
     return (volumes / np.where(size > 0, size, 1.0)[:, None, None]).reshape(-1, volumes.shape[-1])
 
 
 def _at(whole: ReducedModel, points: np.ndarray, weights: jax.Array) -> ReducedModel:
-    """Return the model at some of its points, with other weights."""
+    """Return the model with only some of its points, and with new weights [m^3]."""
     fluid = whole.pressures
     if fluid is not None:
         fluid = replace(
@@ -101,10 +105,10 @@ def _at(whole: ReducedModel, points: np.ndarray, weights: jax.Array) -> ReducedM
 
 
 def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
-    """Return numbers of runs, and for each of them the numbers of the steps from which forces are used.
+    """Return (number of a run, numbers of its steps) for all training states whose forces are used.
 
-    The steps are evenly spaced, with a different first step in every run. So all times are used, even if only few steps
-    of each run are used. The first steps of a run alone would contain no large motion.
+    The steps of a run are evenly spaced, and each run begins with a different step. So all times occur, even if only
+    few steps of each run are used. The first steps alone would contain no large motion.
     """
     chosen = np.unique(np.linspace(0, runs - 1, min(runs, MOST_STATES)).round().astype(int))
     each = min(steps, max(1, MOST_STATES // len(chosen)))
@@ -115,7 +119,7 @@ def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
 
 
 def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
-    """Return the inverse (n, n) [m/N] of the reduced stiffness in the reference shape."""
+    """Return the reduced compliance (n, n) [m/N]: the inverse of the reduced stiffness at the reference shape."""
     modes = np.asarray(whole.modes).reshape(whole.number_of_modes, -1)
     K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), scene.mesh.points)
     springs = reduced_springs(whole.modes, scene)
@@ -126,10 +130,10 @@ def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
 def _contributions(
     whole: ReducedModel, scene: Scene, run: tuple[jax.Array, jax.Array | None], times: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Return the contributions (K, n, P) [N] of each point to the reduced forces, at K steps `times` of a run.
+    """Return (forces, balance): forces (K, n, P) [N] are the contributions of each point to the reduced forces at the K
+    steps `times` of a run; balance is the result of `_balance`, or None without a fluid.
 
-    `run` contains the coordinates of motion (T, n) and pressure (T, m) of the run. The second result is the result of
-    `_balance`, or None without a fluid.
+    `run` contains the coordinates of motion (T, n) [m] and pressure (T, m) [Pa] of the run.
     """
     solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
     F0, (q, p) = prescribed_gradients(whole, scene), run
@@ -160,13 +164,13 @@ def _balance(
     """Return the contributions of each point to both sides of the fluid's volume balance, as pressures (2, K, m, P)
     [Pa].
 
-    One side is the change of volume. The other side is storage and flow.
+    The first side is the change of volume in a step. The second side is the fluid that is stored or flows away.
 
     Args:
-        whole, scene: as in `sampled`.
+        whole, scene: the same arguments as for `sampled`.
         gradient: function (number of a step, from 0) -> deformation gradients (9, P) at the end of this step.
         p: coordinates of the pressure (T, m) [Pa].
-        times: numbers of K steps.
+        times: numbers of the K steps.
     """
     sponge, rest, modes = porosity_at_points(whole, scene), fluid_at_rest(whole, scene), whole.pressures
     assert modes is not None
@@ -188,21 +192,21 @@ def _balance(
 
 
 def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return non-negative factors xi (P,) with G xi close to G 1. Few factors are above 0, and the total volume is
-    nearly unchanged.
+    """Return non-negative factors xi (P,) of the points, with G xi close to G 1 (symbols: module docstring). Few
+    factors are above 0, and the total volume is nearly unchanged.
 
     Args:
-        G: contributions of the P points (rows, P).
+        G: contributions of the P points to each reduced force in each state (rows, P).
         volumes: volumes of the points (P,).
-        tolerance: fraction of G that may be left out [1].
+        tolerance: fraction of G that may be neglected [1].
     """
     from scipy.optimize import nnls
 
     if not len(G):
         raise InputError(
-            "the runs contain no forces for a selection of points: give at least two rows with different parameters"
+            "the runs contain no forces for a selection of points: give at least two parameter sets that differ"
         )
-    # These rows have length 1, so singular vectors of small singular values have the same weight as the others.
+    # The rows of V have length 1, so singular vectors with small singular values have the same weight as the others.
     V = principal_fields(G, tolerance)
     V = np.concatenate([V, volumes[None] / np.linalg.norm(volumes)])
     return nnls(V, V.sum(axis=1), maxiter=20 * V.shape[1])[0]

@@ -3,10 +3,10 @@
     u(x, p_1 ... p_n) = sum over m of w_m(x) f_m1(p_1) ... f_mn(p_n)
 
 This is the form of proper generalised decomposition (chapter, section 3.3; Chinesta, Ladeveze, Cueto 2011, Arch.
-Comput. Methods Eng. 18, 395). The equations of soft tissue do not separate in this way, so the terms are computed from
-full runs at a grid of parameters. The terms are found one after another: each term is fitted by alternating least
-squares to the remainder after the earlier terms. After each term all fields w_m are computed again by least squares.
-The functions of a parameter are Chebyshev polynomials.
+Comput. Methods Eng. 18, 395). The equations of soft tissue cannot be separated into such products. So the terms are
+computed from full runs at the points of a parameter grid. The terms are found one after another. Each term is fitted by
+alternating least squares to the residual of the earlier terms. After each term all fields w_m are computed again by
+least squares. The functions f of a parameter are sums of Chebyshev polynomials.
 """
 
 import itertools
@@ -27,7 +27,8 @@ from liverjax.simulation.batch import simulate_batch
 
 #: Maximum number of parameters, and maximum number of runs of the grid.
 MOST_PARAMETERS, MOST_RUNS = 4, 2000
-#: SWEEPS: maximum number of sweeps of alternating least squares for a term. SETTLED: relative change at which they end.
+#: SWEEPS: maximum number of iterations of alternating least squares for a term. SETTLED: the iterations end if the
+#: relative change is at most this.
 SWEEPS, SETTLED = 50, 1e-6
 
 
@@ -39,9 +40,9 @@ class SeparatedModel:
     functions: tuple[jax.Array, ...] = param("1", "for each parameter, coefficients of Chebyshev polynomials (M, k)")
     ranges: jax.Array = param("1", "lowest and highest value of each parameter (n, 2)")
     left_out: jax.Array = param(
-        "1", "fraction of the displacements at the grid that the terms leave out (root mean square)"
+        "1", "fraction of the displacements at the grid that the terms do not describe (root mean square)"
     )
-    error: jax.Array = param("1", "maximum error of a node in c other runs, over the largest displacement (c,)")
+    error: jax.Array = param("1", "(c,) maximum error of a node in c other runs, divided by the largest displacement")
     names: tuple[str, ...] = static(default=(), about="dotted names of the parameters")
 
 
@@ -53,18 +54,20 @@ def separate(
     most_terms: int = 50,
     checks: int = 8,
 ) -> SeparatedModel:
-    """Compute the separated form of a static scene's displacement, and its error in runs outside of the grid.
+    """Compute the displacement of a static scene as a sum of products, and the error of this sum in runs that are not
+    on the grid.
 
     Args:
         scene: `Scene` without time. The displacement at the last load step is used.
-        ranges: dotted names (as in `with_parameters`) of one to four single numbers -> lowest and highest value.
-        points: number of grid points for each parameter. This needs points ** n full runs.
-        tolerance: fraction of the displacements at the grid that the terms may leave out.
+        ranges: dotted names of one to four single numbers (see `with_parameters`) -> lowest and highest value.
+        points: number of grid points for each parameter. For n parameters this needs points ** n full runs.
+        tolerance: fraction of the displacements at the grid that the terms may neglect.
         most_terms: maximum number of terms.
         checks: number of runs at random parameters (seed 0) from which the error is computed.
 
     Raises:
-        InputError: the scene has time, a range cannot be used, there are too many runs, or a run did not converge.
+        InputError: the scene has a time step, a range cannot be used, too many runs are needed, or a run did not
+            converge.
     """
     names, limits = _names_and_limits(scene, ranges, points)
     t = np.cos(np.pi * (np.arange(points) + 0.5) / points)  # Chebyshev's points in (-1, 1)
@@ -93,17 +96,18 @@ def separate(
 
 
 def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> jax.Array:
-    """Return the displacements (V, 3) [m] for one value of each parameter.
+    """Return the displacements (V, 3) [m] of the model. `values`: dotted name of each parameter -> one value.
 
-    The function may be differentiated, vmapped and jitted. If a traced value is outside of the model's range, the
-    displacements and their derivatives are NaN.
+    The function may be used inside jit, grad and vmap. There, a value outside of the model's range gives NaN for the
+    displacements and their derivatives.
 
     Raises:
-        InputError: a parameter has no value, a value has no parameter, or a value is outside of the model's range.
+        InputError: a parameter has no value, a name is not a parameter of the model, or a value is outside of the
+            model's range.
     """
     wrong = sorted(set(model.names) ^ set(values))
     if wrong:
-        raise InputError(f"the parameters of this model are {', '.join(model.names)}: leave out or give {wrong[0]}")
+        raise InputError(f"the parameters of this model are {', '.join(model.names)}: add or remove {wrong[0]}")
     product = jnp.ones(model.fields.shape[0], model.fields.dtype)
     for name, function, (low, high) in zip(model.names, model.functions, model.ranges, strict=True):
         value = jnp.asarray(values[name], model.fields.dtype)
@@ -112,14 +116,14 @@ def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> 
                 f"{name} = {float(value):g} is outside of {float(low):g} to {float(high):g}: make the model with a "
                 "wider range"
             )
-        # Polynomials grow fast outside of the range, so neither value nor derivative would be correct there.
+        # Polynomials grow fast outside of the range, so values and derivatives would be wrong there.
         value = value * jnp.where((low <= value) & (value <= high), 1.0, jnp.nan)
         product = product * (function @ _chebyshev(2 * (value - low) / (high - low) - 1, function.shape[1]))
     return jnp.tensordot(product, model.fields, axes=1)
 
 
 def _chebyshev(t: jax.Array, number: int) -> jax.Array:
-    """Return the values (number,) of the first Chebyshev polynomials at t."""
+    """Return the values of the first Chebyshev polynomials at t. `number`: how many polynomials."""
     out = [jnp.ones_like(t), t]
     for _ in range(number - 2):
         out.append(2 * t * out[-1] - out[-2])
@@ -129,7 +133,7 @@ def _chebyshev(t: jax.Array, number: int) -> jax.Array:
 def _names_and_limits(
     scene: Scene, ranges: Mapping[str, tuple[float, float]], points: int
 ) -> tuple[tuple[str, ...], np.ndarray]:
-    """Check the ranges, and return names and limits (n, 2) of the parameters."""
+    """Check the ranges. Return the names and the limits (n, 2) of the parameters."""
     if scene.solve.kind != "static" or scene.solve.dt is not None:
         raise InputError("a separated form needs a static solution: give a scene of kind 'static' without dt")
     if scene.points_are == "loaded":
@@ -156,7 +160,7 @@ def _names_and_limits(
 
 
 def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np.ndarray:
-    """Return the displacements (N, V, 3) [m] of the full model for every row of parameters (N, n)."""
+    """Return the displacements (N, V, 3) [m] of the full model at the last step, for N parameter sets `rows` (N, n)."""
     result = simulate_batch(scene, {name: rows[:, k] for k, name in enumerate(names)}).result
     bad = np.flatnonzero(np.any(np.asarray(result.status) != status.CONVERGED, axis=1))
     if len(bad):
@@ -171,15 +175,16 @@ def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np
 def _terms(
     known: np.ndarray, shape: tuple[int, ...], tolerance: float, most: int
 ) -> tuple[np.ndarray, list[np.ndarray], float]:
-    """Return the products of the terms at the grid (N, M), the factors (M, points) for each parameter, and the fraction
-    that is left out.
+    """Return (products, factors, left). products (N, M): product of the functions in each term at the grid; factors:
+    values (M, points) of these functions for each parameter; left: fraction of the displacements that the terms do not
+    describe.
 
     Args:
         known: displacements at the grid (N, 3 V), times the square roots of the nodal volumes.
         shape: shape of the grid.
-        tolerance, most: as `tolerance` and `most_terms` in `separate`.
+        tolerance, most: `tolerance` and `most_terms` of `separate`.
     """
-    # Coordinates in the space that the N runs span, so each run has at most N coordinates.
+    # Coordinates of the runs in the space that they span. So N runs have at most N coordinates each.
     U, S, _ = np.linalg.svd(known, full_matrices=False)
     data = U * S
     size, left = np.linalg.norm(data), data
@@ -198,7 +203,8 @@ def _terms(
 
 
 def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
-    """Return the product of vectors that is closest to a tensor: unit vectors for all axes except the last."""
+    """Return the unit vectors, one for each axis except the last, of the product of vectors that is closest to a
+    tensor."""
     n = tensor.ndim
     # The iteration begins with the first singular vector of each axis.
     factors = [np.linalg.svd(np.moveaxis(tensor, a, 0).reshape(tensor.shape[a], -1))[0][:, 0] for a in range(n - 1)]
@@ -218,7 +224,7 @@ def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
 
 
 def _against(tensor: np.ndarray, factors: list[np.ndarray | None]) -> np.ndarray:
-    """Return the tensor contracted with the given factors. Axes with the factor None are not contracted."""
+    """Return the contraction of a tensor with one vector for each axis. Axes with None are not contracted."""
     out = tensor
     for a in reversed(range(tensor.ndim)):
         f = factors[a]

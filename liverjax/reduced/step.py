@@ -1,8 +1,8 @@
 """Equations of one step of a reduced model, with stresses only at the sampled points, and the solution of these
 equations.
 
-Newton's method uses an inverse tangent from earlier steps, which is updated with the changes of the forces
-(quasi-Newton method). A new tangent is computed only if the residual decreases too little.
+Newton's method uses the inverse of a tangent from an earlier step. This inverse is updated with the changes of the
+forces (quasi-Newton method). A new tangent is computed only if the residual decreases too little.
 """
 
 from collections.abc import Callable
@@ -34,37 +34,37 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 class ReducedMotion(NamedTuple):
-    """Velocity and acceleration of the coordinates (n,), and the last change of the acceleration."""
+    """Velocity and acceleration of the reduced coordinates (n,), and the last change of the acceleration."""
 
     velocity: jax.Array  # [m/s]
     acceleration: jax.Array  # [m/s^2]
     change: jax.Array  # of the acceleration in the last step [m/s^2]
-    steady: jax.Array  # whether this change is closer to the previous change than to 0
+    steady: jax.Array  # whether `change` is closer to the change of the step before than to 0
 
 
 class ReducedEquations(NamedTuple):
     """Quantities that are constant during a step."""
 
     model: ReducedModel
-    acting: Solid  # stress of the solid, with the viscous memory of the step before
+    acting: Solid  # stress of the solid, with the history variables at the end of the last step
     load: jax.Array  # loads on the modes (n,) [N]
     gradient: jax.Array  # deformation gradients of the prescribed motion (9, S)
     mass: jax.Array | None  # (n, n) [kg]
-    q: jax.Array  # coordinates at the beginning of the step (n,) [m]
+    q: jax.Array  # reduced coordinates at the beginning of the step (n,) [m]
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
     spread: jax.Array | None  # absolute values of the mode gradients (9, S, n) [1/m] if motion is prescribed
-    noise: jax.Array  # [N] forces of this size have a roundoff equal to the tolerance; the only scale without loads
+    noise: jax.Array  # [N] forces of this size have a roundoff equal to the tolerance; scale of residuals without loads
     fluid: Flowing | None  # fluid of a porous scene
     light: SinglePrecision  # mode gradients in single precision
-    steepest: jax.Array  # root of the sum of squares of all mode gradients [1/m]
+    steepest: jax.Array  # square root of the sum of squares of all mode gradients [1/m]
     springs: jax.Array | None = None  # stiffness of elastic supports (n, n) [N/m]
 
 
 def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
-    """Return velocity and acceleration for coordinates q at the end of the step, as in
-    `liverjax.physics.inertia.Moving.kinematics`."""
+    """Return velocity and acceleration at the end of the step, for coordinates q (n,) [m] at this time. The formulas
+    are those of `liverjax.physics.inertia.Moving.kinematics`."""
     assert e.motion is not None
     velocity = (q - e.q) / e.dt
     acceleration = (velocity - e.motion.velocity) / e.dt
@@ -77,7 +77,7 @@ def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
 
 
 def gradients_at(e: ReducedEquations, q: jax.Array) -> jax.Array:
-    """Return the deformation gradients (9, S) of the points for coordinates q (n,)."""
+    """Return the deformation gradients (9, S) at the points for coordinates q (n,) [m]."""
     return e.gradient + e.model.slopes @ q
 
 
@@ -87,9 +87,9 @@ def _stresses(solid: Solid, F: jax.Array) -> jax.Array:
 
 
 def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
-    """Return the roundoff of the forces of a unit stretch along x, divided by the tolerance [N].
+    """Return the roundoff of the reduced forces due to a unit stretch along x, divided by the tolerance [N].
 
-    It has the same purpose as `liverjax.simulation.equations.Equations.noise`: a scale for residuals without loads.
+    Residuals without loads are divided by this force (see `liverjax.simulation.equations.Equations.noise`).
     """
     own = solid_at_points(model, replace(scene, viscosity=None))
     assert isinstance(own, Elasticity)
@@ -100,14 +100,14 @@ def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _residual(e: ReducedEquations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return out-of-balance forces (n,) and the size of all forces, for coordinates q and their deformation gradients F
-    (9, S)."""
+    """Return out-of-balance forces (n,) [N] and the size of all forces [N], for coordinates q (n,) [m] and their
+    deformation gradients F (9, S)."""
     P = _point_forces(e, F)
     return _unbalanced(e, q, P, _added_up(e, P))
 
 
 def _point_forces(e: ReducedEquations, F: jax.Array) -> jax.Array:
-    """Return stress times weight (9, S) [N m] at every point."""
+    """Return the first Piola-Kirchhoff stress times the weight (9, S) [N m] of each point."""
     P = _stresses(e.acting, F)
     if e.fluid is not None:
         p = pressure_coordinates(e.fluid, determinant(as_matrix(F)))
@@ -121,7 +121,7 @@ def _added_up(e: ReducedEquations, P: jax.Array) -> jax.Array:
 
 
 def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return out-of-balance forces (n,) [N] and the size of all forces [N].
+    """Return out-of-balance forces (n,) [N], and the sum of the norms of all forces [N].
 
     Args:
         e: constants of the step.
@@ -143,8 +143,8 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
 
 
 def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
-    """Return the derivative of the residual with respect to q. The moduli are the stiffness blocks of elements with the
-    unit vectors in place of the gradients of the shape functions."""
+    """Return the derivative of the out-of-balance forces with respect to q. The moduli come from the function for
+    stiffness blocks of elements, with unit vectors instead of the gradients of the shape functions."""
     F = gradients_at(e, q)
     blocks = e.acting.blocks(as_matrix(F), list(IDENTITY), _PAIRS)
     if e.fluid is not None:
@@ -167,7 +167,7 @@ def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
 
 
 class _Found(NamedTuple):
-    """The state at the end of a step, and the inverse tangent for the beginning of the next step."""
+    """State at the end of a step, and the inverse tangent with which the next step begins."""
 
     q: jax.Array
     residual: jax.Array
@@ -192,19 +192,21 @@ class _ReducedIterate(NamedTuple):
     tangents: jax.Array  # number of computed tangents
 
 
-#: If an iteration leaves more than this fraction of the residual, a new tangent is computed, at the cost of ten
-#: iterations.
+#: If the residual after an iteration is above this fraction of the residual before, a new tangent is computed. A
+#: tangent costs as much as ten iterations.
 _LITTLE_GAIN = 0.95
-#: If the error due to single precision exceeds this fraction of the tolerance, forces are computed again in double
+#: If the error due to single precision exceeds this fraction of the tolerance, the forces are computed again in double
 #: precision.
 _DOUBT = 0.1
 
 
 def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Array:
-    """Return the inverse tangent, updated with the change of the forces due to the last motion.
+    """Return the inverse tangent after an update: `change` (n,) [N] is the change of the forces due to the motion
+    `moved` (n,) [m].
 
     This is the update of Broyden, Fletcher, Goldfarb and Shanno (1970), which keeps the inverse symmetric and positive
-    definite. If the forces decrease along the motion, no positive definite inverse fits, and the old one is kept.
+    definite. If the forces decrease along the motion, no positive definite inverse is possible, and the old inverse is
+    kept.
     """
     work, towards = moved @ change, inverse @ change
     seen = work > 1e-8 * jnp.linalg.norm(moved) * jnp.linalg.norm(change)
@@ -214,7 +216,7 @@ def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Arr
 
 
 def _in_double_precision(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
-    """Return the iterate with forces that are computed in double precision from its deformation gradients."""
+    """Return the same iterate, with forces computed in double precision from its deformation gradients."""
     P = _point_forces(e, at.F)
     internal = _added_up(e, P)
     r, size = _relative_residual(e, at.q, P, internal)
@@ -233,14 +235,14 @@ def _upright(F: jax.Array) -> jax.Array:
 
 
 def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
-    """Return the iterate after one iteration with the present inverse. The inverse is updated with the new forces.
+    """Do one iteration with the present inverse, update the inverse with the new forces, and return the new iterate.
 
-    Changes of deformation gradients and forces are small, so they are computed in single precision, which takes half
-    the time.
+    The changes of deformation gradients and forces are small. So they are computed in single precision, which needs
+    half the time.
     """
     dq = at.inverse @ at.r
     dF = (e.light.slopes @ dq.astype(jnp.float32)).astype(dq.dtype)
-    # The step is halved until no sampled point is inverted, at most six times.
+    # The correction is halved until no sampled point is inverted, at most six times.
     part = jax.lax.while_loop(
         lambda part: (part > 0.02) & ~_upright(at.F - part * dF), lambda part: 0.5 * part, jnp.ones((), dq.dtype)
     )
@@ -254,7 +256,7 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
     lost = float(jnp.finfo(jnp.float32).eps) * e.steepest * jnp.linalg.norm(change) * size
     rounded = at.rounded + lost / jnp.maximum(jnp.linalg.norm(r), jnp.finfo(r.dtype).tiny)
     inverse = _updated(at.inverse, -part * dq, r - at.r)
-    # With an old inverse |r| may grow. Then the iteration is rejected.
+    # With an old inverse, |r| may increase. Then the iteration is rejected.
     before, after = jnp.linalg.norm(at.r), jnp.linalg.norm(r)
     good = at.fresh | (after < before)
     no = jnp.array(False)
@@ -265,7 +267,7 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, inverse: jax.Array) -> _Found:
-    """Return the coordinates at the end of a step.
+    """Return the reduced coordinates at the end of a step, with residual, number of iterations and inverse tangent.
 
     Derivatives of this function are those of the exact solution, not those of the iterations.
 
@@ -273,7 +275,7 @@ def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, i
         newmark: whether the time integrator is Newmark's method.
         most: maximum number of tangents.
         e: constants of the step.
-        tolerance: of the relative residual.
+        tolerance: maximum relative residual.
         inverse: inverse tangent of the previous step (n, n) [m/N]; zeros in the first step.
     """
     arrays, tree = jax.tree.flatten((e, tolerance, inverse))
@@ -286,10 +288,10 @@ def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, i
 
 
 def _lane_by_lane(function: Callable) -> Callable:
-    """Return a version of the function for which vmap runs the batch entries (lanes) one after another.
+    """Return the same function, but vmap computes the runs of a batch (lanes) one after another.
 
-    On a CPU, all lanes would otherwise wait for the slowest lane and for every new tangent in any lane. This function
-    replaces `jax.custom_batching.sequential_vmap`, which fails in second derivatives.
+    Otherwise, on a CPU, all runs of the batch would wait for the slowest run, and for every new tangent in any run.
+    `jax.custom_batching.sequential_vmap` is not used because it fails in second derivatives.
     """
     own = jax.custom_batching.custom_vmap(function)
 
@@ -308,8 +310,8 @@ def _lane_by_lane(function: Callable) -> Callable:
 
 
 def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, inverse: jax.Array) -> _Found:
-    """Solve the step by Newton's method with the inverse of earlier steps. A new tangent is computed only if the
-    iterations reduce the residual too little."""
+    """Solve the equations of the step by Newton's method with the inverse tangent of earlier steps. A new tangent is
+    computed only if the iterations reduce the residual too little."""
     e = e._replace(newmark=newmark)
 
     def unfinished(at: _ReducedIterate) -> jax.Array:
@@ -332,8 +334,8 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
 
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
-        # The prediction is a parabola or a cubic through the last coordinates, whichever would have predicted the last
-        # step better. Accelerations of Newmark's method oscillate, so they are not used for a prediction.
+        # The coordinates are predicted by a parabola or a cubic through the last coordinates: by the one that would
+        # have predicted the last step better. Accelerations of Newmark's method oscillate, so they are not used here.
         more = jnp.where(e.motion.steady, e.motion.change, 0.0)
         start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = gradients_at(e, start), jnp.zeros((), jnp.int32)
@@ -348,7 +350,7 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     begin = begin._replace(iterations=at.iterations)
     at = jax.tree.map(lambda old, new: jnp.where(at.size > tolerance, new, old), at, begin)
     at = jax.lax.while_loop(unfinished, lambda at: inner(refreshed(at)), at)
-    # The last correction needs no new forces.
+    # One more correction is possible without new forces.
     return _Found(at.q - at.inverse @ at.r, at.size, at.iterations, at.inverse)
 
 
@@ -358,8 +360,8 @@ def _derivative_of_end(newmark: bool, most: int, primals: tuple, tangents: tuple
     found = step_end(newmark, most, *primals)
     without = e._replace(newmark=None)
 
-    # Only numbers with a tangent are differentiated. Derivatives with respect to the mode gradients would take most of
-    # the time.
+    # Only numbers with a nonzero JAX tangent are differentiated. Derivatives with respect to the mode gradients would
+    # need most of the time.
     numbers, tree = jax.tree.flatten(without)
     changes = jax.tree.leaves(de)
     live = [k for k, change in enumerate(changes) if not isinstance(change, SymbolicZero)]

@@ -1,10 +1,11 @@
-"""The tangent of a reduced step: products with the tangent, and an approximate inverse that takes half the time.
+"""The tangent of a reduced step: products with the tangent, and an approximate inverse that needs half the time of the
+exact inverse.
 
 The tangent is K = sum_p B_p^T A_p B_p + R, with the gradients B_p of the modes and the moduli A_p at the points p. R
-contains the terms that do not come from the points. The assembly of K takes as long as ten products with K, and half of
-this time in single precision. The inverse N of the single-precision matrix is close to the inverse of K. Newton's
-method uses N. Accurate solves use N in a few corrections x + N (b - K x), with products in double precision (iterative
-refinement: Wilkinson 1963).
+contains the terms that do not come from the points. The assembly of K needs as much time as ten products with K, or
+half of this time in single precision. The inverse N of the single-precision matrix is close to the inverse of K.
+Newton's method uses N. If K x = b must be solved accurately, x is replaced a few times by x + N (b - K x), with
+products in double precision (iterative refinement: Wilkinson 1963).
 """
 
 from typing import NamedTuple
@@ -27,7 +28,7 @@ class SinglePrecision(NamedTuple):
 
 
 class ReducedTangent(NamedTuple):
-    """The parts of the tangent (n, n) [N/m]."""
+    """The arrays B, A and R of the tangent (n, n) [N/m] (module docstring)."""
 
     slopes: jax.Array  # B: gradients of the modes (9, S, n) [1/m]
     moduli: jax.Array  # A: moduli times weights (9, 9, S) [N m]
@@ -41,26 +42,26 @@ def in_single_precision(slopes: jax.Array) -> SinglePrecision:
 
 
 def tangent_times(K: ReducedTangent, x: jax.Array) -> jax.Array:
-    """Return K x (n,) [N] for x (n,) [m]."""
+    """Return the product K x (n,) [N] of the tangent and x (n,) [m]."""
     stress = jnp.sum(K.moduli * (K.slopes @ x)[None], axis=1)
     return jnp.tensordot(stress, K.slopes, axes=2) + K.rest @ x
 
 
 def tangent_matrix(K: ReducedTangent) -> jax.Array:
-    """Return the matrix K (n, n) [N/m]."""
+    """Return the assembled tangent K (n, n) [N/m]."""
     AB = jnp.sum(K.moduli[..., None] * K.slopes[None], axis=1)
     return jnp.tensordot(K.slopes, AB, axes=((0, 1), (0, 1))) + K.rest
 
 
 def near_inverse(K: ReducedTangent, light: SinglePrecision) -> jax.Array:
-    """Return an approximate inverse of K (n, n) [m/N]. K is assembled in single precision."""
+    """Return an approximate inverse (n, n) [m/N] of the tangent K. The matrix is assembled in single precision."""
     AB = jnp.sum(K.moduli.astype(jnp.float32)[..., None] * light.slopes[None], axis=1)
     near = light.flat @ AB.reshape(-1, AB.shape[-1])
     return jnp.linalg.inv(near.astype(K.rest.dtype) + K.rest)
 
 
 def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -> jax.Array:
-    """Return the solution x (n,) of K x = b. The function may be differentiated."""
+    """Return the accurate solution x (n,) [m] of K x = b. The function may be differentiated."""
 
     def solve(_: object, b: jax.Array) -> jax.Array:
         near, limit = near_inverse(K, light), jnp.linalg.norm(b)
@@ -68,7 +69,7 @@ def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -
         def going(at: tuple) -> jax.Array:
             _, r, before, count = at
             size = jnp.linalg.norm(r)
-            # If a correction does not halve r, r is roundoff, or the inverse is not accurate enough.
+            # If a correction does not halve r, then r is only roundoff, or the inverse is not accurate enough.
             return (size > LEFT * limit) & (size < 0.5 * before) & (count < CORRECTIONS)
 
         def corrected(at: tuple) -> tuple:

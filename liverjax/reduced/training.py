@@ -47,16 +47,18 @@ def reduce_scene(
 
     Args:
         scene: `Scene`.
-        rows: dotted names -> one value per run, as in `simulate_batch`. A row is the parameter set of one run.
-        tolerance: fraction of the displacements of these runs that the modes may leave out [1], as a root mean square.
+        rows: dotted names of parameters -> one value for each run (see `simulate_batch`). A row is the parameter set of
+            one run.
+        tolerance: fraction of the displacements of these runs that the modes may neglect [1] (root mean square).
         most_modes: maximum number of modes.
-        point_tolerance: the reduced forces are converted to motions; the sampled points may leave out this fraction of
-            these motions [1]. Default: `tolerance`.
-        runs: number of full runs. Two thirds of them are the first rows. The others are the rows for which a first
-            reduced model states the largest errors, relative to the displacements. Default: all rows.
+        point_tolerance: the reduced forces are converted to motions; the sampled points may neglect this fraction of
+            the motions [1]. Default: `tolerance`.
+        runs: number of full runs. Two thirds of these runs use the first rows. A first reduced model is made from them.
+            The other runs use those of the remaining rows for which this model states the largest errors, relative to
+            the displacements. Default: all rows.
 
     Raises:
-        InputError: the scene has parts that reduced models do not support; a tolerance is not between 0 and 1; no run
+        InputError: the scene has entries that reduced models do not support; a tolerance is not between 0 and 1; no run
             converged; `runs` does not fit the number of rows; the rows have different time steps.
     """
     refuse_unknown_physics(scene)
@@ -66,7 +68,10 @@ def reduce_scene(
             raise InputError(f"{name} = {value} must be between 0 and 1: give e.g. 1e-4")
     values = {name: np.asarray(value, float) for name, value in rows.items()}
     if "solve.dt" in values:
-        raise InputError("a reduced model has one time step: remove the column solve.dt, and give dt in [solve]")
+        raise InputError(
+            "all runs of a reduced model must have the same time step dt: remove the column solve.dt, and give dt in "
+            "[solve]"
+        )
     count = len(next(iter(values.values()), ()))
     runs = count if runs is None else runs
     if not FEWEST_RUNS <= runs <= count and runs != count:
@@ -93,13 +98,13 @@ def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
     result = simulate_batch(scene, dict(values)).result
     good = np.all(np.asarray(result.status) == status.CONVERGED, axis=1)
     if not good.any():
-        raise InputError(f"none of the {len(good)} runs converged: give smaller loads or time steps in the rows")
+        raise InputError(f"none of the {len(good)} runs converged: give smaller loads, or more and smaller steps")
     mask = free_degrees(scene.mesh, scene.fixed, scene.displaced)
     u = np.asarray(result.positions)[good]
     u -= np.asarray(scene.mesh.points)
     u *= np.asarray(mask)
     if np.abs(u).max() <= _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points)):
-        raise InputError("no row moves the body: give rows with loads or motions that are not 0")
+        raise InputError("no row moves the body: give loads or prescribed motions that are not 0")
     P = None if result.pressure is None else np.asarray(result.pressure)[good, :, : scene.mesh.number_of_vertices]
     return _Runs(_some(values, good), u, P)
 
@@ -117,8 +122,8 @@ def _model_of(scene: Scene, runs: _Runs, tolerance: float, most_modes: int, poin
 
 
 def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -> tuple[jax.Array, np.ndarray]:
-    """Return modes (m, V) of the pressures P (R, T, V) and their coordinates (R, T, m) [Pa]. The number m is at most
-    half of `most`."""
+    """Return modes (m, V) [1] of the pressures P (R, T, V) [Pa], and the coordinates (R, T, m) [Pa] of P in these
+    modes. The number m of modes is at most half of `most`."""
     volumes = np.asarray(integrals(scene.mesh, jnp.ones_like(scene.mesh.weights)))
     modes = proper_modes(P.reshape(-1, P.shape[-1], 1), volumes, tolerance)[: max(1, most // PRESSURES), :, 0]
     return jnp.asarray(modes), (P * volumes) @ modes.T
@@ -127,7 +132,7 @@ def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -
 def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction | None:
     q, failed = _coordinates_of_rows(model, scene, runs.values)
     moved = np.linalg.norm(runs.u, axis=-1).max(axis=(1, 2))
-    good = ~failed & (moved > 1e-9 * moved.max(initial=0.0))  # smaller motions are roundoff of a body at rest
+    good = ~failed & (moved > 1e-9 * moved.max(initial=0.0))  # smaller displacements are roundoff of a body at rest
     missing = runs.u[good] - np.tensordot(q[good], np.asarray(model.modes), axes=1)
     volumes = np.asarray(nodal_volumes(scene.mesh))
     return learnt_correction(Learnt(q[good], missing, moved[good], volumes, scene.solve.dt))
@@ -137,7 +142,7 @@ def _coordinates_of_rows(
     model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Run the reduced model once for each of the R parameter sets. Return the reduced coordinates (R, T, n) [m], and
-    whether each run failed (R,)."""
+    for each run whether it failed (R,)."""
 
     def run(model: ReducedModel, values: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
         found = simulate_reduced(model, with_parameters(scene, values))
@@ -149,8 +154,8 @@ def _coordinates_of_rows(
 
 
 def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return for each row the size of the correction divided by the largest displacement. Without a correction, return
-    the largest displacement instead. The value of a failed run is -1."""
+    """Return for each row the largest correction of a node, divided by the largest displacement [1]. If the model has
+    no correction, return the largest displacement [m] instead. The value of a failed run is -1."""
     q, failed = _coordinates_of_rows(model, scene, values)
     found = np.zeros(len(q))
     for k, own in enumerate(q):
@@ -160,14 +165,15 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
             continue
         off = np.linalg.norm(np.asarray(correction_at(model.correction, jnp.asarray(own), scene.solve.dt)), axis=-1)
         found[k] = off.max() / max(u, 1e-300)
-    # A failed run has the lowest rank, because the full run would probably fail, too.
+    # A failed run is chosen last, because the full run would probably fail too.
     return np.where(failed, -1.0, found)
 
 
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return modes (n, V, c) that leave out at most the fraction `tolerance` of the fields u (N, V, c).
+    """Return modes (n, V, c): their combinations approximate the fields u (N, V, c) with a relative error of at most
+    `tolerance`.
 
-    `volumes` (V,): volumes of the nodes, which are the weights of a mean square.
+    The error is a root mean square with the weights `volumes` (V,), the volumes of the nodes.
     """
     modes = principal_fields((u * np.sqrt(volumes)[:, None]).reshape(len(u), -1), tolerance)
     return modes.reshape(-1, *u.shape[1:]) / np.sqrt(volumes)[:, None]

@@ -1,1 +1,1 @@
-"""Scenes: the parts of a scene, scene files, and checks of scenes."""
+"""Scenes: their entries, scene files, and checks of scenes."""

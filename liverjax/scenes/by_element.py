@@ -73,7 +73,7 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
 
 
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
-    """Return the porosity. A parameter that a region changes has one value per element: (E,); quadratic: (1, E)."""
+    """Return the porosity. A parameter that a region changes gets one value per element, (E,) or (1, E)."""
     found: Content = {}
     for region in regions:
         for name, value in (region.porosity or {}).items():
@@ -84,5 +84,5 @@ def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: 
 
 
 def sponge_at_points(porosity: Porosity, mesh: TetMesh) -> Porosity:
-    """Give porosity parameters with one value per element the axes of arrays over the integration points."""
+    """Return the porosity. Parameters with one value per element get an axis for the integration points."""
     return replace(porosity, **mesh.at_points({name: getattr(porosity, name) for name in POROUS}))

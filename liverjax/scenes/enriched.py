@@ -1,4 +1,4 @@
-"""Convert a scene to the next richer shape functions: linear to quadratic elements, quadratic to cubic elements.
+"""Convert a scene to shape functions of the next order: linear to quadratic elements, quadratic to cubic elements.
 
 Supports, motions and loads stay the same. The position and the values of a new node follow from the nodes around it.
 """
@@ -17,7 +17,7 @@ from liverjax.scenes.scene import Scene
 
 
 def enriched(scene: Scene) -> Scene:
-    """Return the scene with quadratic or cubic elements (`liverjax.mesh.promotion`). Numbers may be traced."""
+    """Return the scene with quadratic or cubic elements (`liverjax.mesh.promotion`). Numbers may be JAX tracers."""
     return _quadratic_mesh(scene) if scene.mesh.order == 1 else _cubic(scene)
 
 
@@ -70,7 +70,7 @@ def _cubic(scene: Scene) -> Scene:
 
 
 def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Density for all shape functions. A new function has the mean density of the elements around it."""
+    """Return the density for all shape functions. A new function has the mean density of the elements around it."""
     nodes = jnp.stack(mesh.element_nodes)
     own = jnp.broadcast_to(jnp.mean(density[mesh.tetrahedra], axis=1), nodes.shape)
     total, count = (jnp.zeros(mesh.number_of_nodes).at[nodes].add(each) for each in (own, 1.0))
@@ -78,7 +78,7 @@ def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _with_faces(mesh: TetMesh, load: Traction) -> Traction:
-    """Add the face number to each triangle of a load, because the face function gets a part of the load."""
+    """Add the face number to each triangle of a load, because the function of the face gets a share of the load."""
     triangles = np.asarray(load.triangles)
     faces = promotion.face_numbers(mesh, triangles)
     return replace(load, triangles=node_numbers(np.column_stack([triangles, faces])))

@@ -31,7 +31,7 @@ from liverjax.scenes.scene import Scene
 from liverjax.tensors.subsets import subsets
 
 T = TypeVar("T")
-#: Error of a run, divided by the change due to the refined mesh, where an error of second order is a quarter as large.
+#: Error of a run, divided by the change of its result on the refined mesh. There, a second-order error is 1/4 as large.
 REFINED = 4 / 3
 
 
@@ -54,7 +54,7 @@ class Within:
 
 
 def can_be_refined(scene: Scene) -> bool:
-    """Whether all parts of the scene can be converted to the refined mesh.
+    """Return whether all entries of the scene can be converted to the refined mesh.
 
     This is not possible for a vessel, which contains element numbers. It is also not possible for a load, an inlet or a
     physics with one number per triangle or per node.
@@ -76,10 +76,12 @@ def can_be_refined(scene: Scene) -> bool:
 
 
 def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
-    """Return the scene with every element cut into eight of the same order. Runs on the host; numbers may be traced.
+    """Return the scene with every element cut into eight of the same order, and the new nodes in the old mesh.
+
+    Numbers of the scene may be unknown (inside jit, grad or vmap), but node numbers must be known.
 
     Raises:
-        InputError: the positions of the mesh are traced inside `jax.jit`.
+        InputError: the positions of the mesh are unknown inside `jax.jit`.
     """
     old, E = scene.mesh, scene.mesh.number_of_elements
     mesh, within = _mesh_and_within(old)
@@ -112,12 +114,12 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
 def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
     """Return the refined mesh, and the positions of its nodes in the old mesh."""
     traced = isinstance(old.points, jax.core.Tracer)
-    with nullcontext() if traced else jax.ensure_compile_time_eval():  # node numbers are needed on the host
+    with nullcontext() if traced else jax.ensure_compile_time_eval():  # the node numbers must be known
         mesh = refined(replace(old, triangle_sets=None))
         if isinstance(mesh.pattern.edges, jax.core.Tracer):
             raise InputError(
                 "the mesh error of a scene with a fluid cannot be estimated inside jax.jit if the positions of the "
-                "mesh are traced: estimate the error outside jax.jit"
+                "mesh are unknown there: estimate the error outside jax.jit"
             )
         element, place = places_in(old, mesh)
         nodes, values = weights(old, element, place)
@@ -125,7 +127,7 @@ def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
 
 
 def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Nodes (n,) of the old mesh, and the new nodes between them, if they belong to the same set of nodes."""
+    """Return nodes (n,) of the old mesh, and the new nodes between them on the same face or edge of the body."""
     found = np.concatenate([nodes, np.setdiff1d(middles_of_places(old, nodes), nodes)])
     if mesh.order == 1:
         return found
@@ -156,7 +158,7 @@ def _law_of_parts(E: int, law: Law) -> Law:
 
 
 def _series(E: int, prony: Prony | None) -> Prony | None:
-    """Prony series for the refined mesh: values per mode and element (N, E) are repeated for the eight parts."""
+    """Return the Prony series for the refined mesh: values for each element (N, E) are repeated for its eight parts."""
     if prony is None:
         return None
     by_element = {name: own for name in VISCOUS if np.ndim(own := getattr(prony, name)) == 2}
@@ -164,7 +166,7 @@ def _series(E: int, prony: Prony | None) -> Prony | None:
 
 
 def _sponge(E: int, porosity: Porosity | None, more: Callable[[Indices], Indices], parts: Callable) -> Porosity | None:
-    """Porosity for the refined mesh: drained nodes, inlets, and values per element."""
+    """Return the porosity for the refined mesh: drained nodes, inlets, and values per element."""
     if porosity is None:
         return None
     inlets = tuple(parts(own if own.nodes is None else replace(own, nodes=more(own.nodes))) for own in porosity.inlet)

@@ -21,12 +21,12 @@ POROUS = ("bulk", "limit_bulk", "fluid_fraction", "permeability")
 
 @struct
 class Region:
-    """Elements with other parameters or another law than the scene. If regions overlap, the later one counts."""
+    """Elements with other parameters or another law than the scene. Where regions overlap, the later region counts."""
 
     elements: Indices = param("1", "element numbers (n,)")
     law: Content | Law | None = param(
         "1",
-        "parameter names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or another law",
+        "names of parameters, as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or another law",
         default=None,
     )
     viscosity: Mapping[str, Numbers] | None = param("1", "`ratios` or `relaxation_times` or both -> (N,)", default=None)
@@ -36,7 +36,7 @@ class Region:
 
 
 def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | None, name: str = "region") -> np.ndarray:
-    """Element numbers of a set, or of the elements whose four vertices satisfy `where` (see `boundary.select`).
+    """Return the numbers of the elements in a set, or with four vertices that satisfy `where` (see `boundary.select`).
 
     Raises:
         InputError: `where` and `set` are both given or both missing; the mesh has no such set; no element is found.
@@ -62,7 +62,7 @@ _APART = 0.02
 
 
 def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, float], name: str) -> None:
-    """Warn if a bound cuts elements: a cut element is left out, so the region is smaller than stated."""
+    """Warn if a bound cuts elements. Cut elements are not in the region, so the region is smaller than stated."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     size = np.ptp(points, axis=0).max()
     inside = {
@@ -77,7 +77,7 @@ def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, 
         end = own.min() if first else own.max()
         if np.any(cut) and abs(end - bound) > _APART * np.ptp(own):
             warnings.warn(
-                f"{name}: {key} = {bound:g} cuts elements. Cut elements are left out, so the region "
+                f"{name}: {key} = {bound:g} cuts elements. Cut elements are not in it, so the region "
                 f"{'begins' if first else 'ends'} at {end:.4g} m. Put a layer of nodes at this bound (cells of the "
                 "mesh), or use an element set",
                 stacklevel=3,
@@ -118,7 +118,7 @@ def set_by_regions(regions: tuple[Region, ...], name: str, number_of_elements: i
 
 
 def law_number(law: Law, name: str) -> jax.Array:
-    """Value, in the law of the scene, of a parameter that a region changes.
+    """Return the value that a parameter, which a region changes, has in the law of the scene.
 
     Raises:
         InputError: the law does not have this name, or it is the name of a list of parameters.
@@ -130,5 +130,5 @@ def law_number(law: Law, name: str) -> jax.Array:
 
 
 def refused_name(name: str) -> str:
-    """First part of the message if the law has no such parameter."""
+    """Return the beginning of the message for a parameter that the law does not have."""
     return f"region: the law has no number {name!r}"

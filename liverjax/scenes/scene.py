@@ -36,7 +36,9 @@ class Body:
     )
     gravity: Numbers = param("m/s^2", "acceleration (3,)", default=(0.0, 0.0, 0.0))
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
-    history: Numbers | None = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
+    history: Numbers | None = param(
+        "1", "factors (T,) that multiply gravity, or gravity itself (T, 3) [m/s^2]", default=None
+    )
     mass: str = static(default="lumped", about="mass for inertia: lumped at the nodes, or consistent, as the weight")
 
 
@@ -61,7 +63,7 @@ class Solve:
     )
     newton_iterations: int = static(
         default=25,
-        about="maximum number of iterations in a step, or in a part of a divided step; 1 means newton = one_step",
+        about="maximum number of iterations in a step, or in a substep of a divided step; 1 means newton = one_step",
         lower=1,
     )
     integrator: str = static(
@@ -69,7 +71,7 @@ class Solve:
     )
     precision: str = static(default="float64", about="float64 or float32")
     linear_solver: str = static(
-        default="auto", about="cg; direct: factorised on the host; auto: chosen by size and stiffness"
+        default="auto", about="cg; direct: factorised on the CPU; auto: chosen by size and stiffness"
     )
     volumetric: str = static(
         default="element",
@@ -84,13 +86,16 @@ class Solve:
     )
     reduced: str = static(default="", about="file of a reduced model, written by `python -m liverjax reduce`")
     reduced_tolerance: Number = param(
-        "1", "estimated error / largest displacement; above this value the full model runs", above=0.0, default=0.01
+        "1",
+        "estimated error divided by largest displacement; above this value the full model runs",
+        above=0.0,
+        default=0.01,
     )
 
 
 @struct
 class Scene:
-    """Input of `simulate`. Missing parts are None or empty; they need no computing time."""
+    """Input of `simulate`. Entries that are missing are None or empty; they need no computing time."""
 
     mesh: TetMesh = param("1", "the body")
     law: Law = param("1", "its hyperelastic law")
@@ -109,7 +114,7 @@ class Scene:
     )
 
     def named(self, section: str) -> list[int]:
-        """Indices in `physics` of the objects that scene files write as [[section]]."""
+        """Return the indices in `physics` of the objects that scene files write as [[section]]."""
         return [k for k, physics in enumerate(self.physics) if physics.section == section]
 
 
@@ -120,7 +125,7 @@ def named_physics(scene: Scene) -> list[tuple[str, Physics]]:
 
 
 def histories(scene: Scene) -> dict[str, object]:
-    """Return name -> part for all parts with a history: body, motions, loads, inlets, further physics."""
+    """Return {name: entry} for all entries with a history: body, motions, loads, inlets, further physics."""
     inlets = () if scene.porosity is None else scene.porosity.inlet
     parts: dict[str, object] = {"body": scene.body}
     for key, several in (("displaced", scene.displaced), ("traction", scene.traction), ("porosity.inlet", inlets)):
@@ -130,7 +135,7 @@ def histories(scene: Scene) -> dict[str, object]:
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
-    """Return the scene with changed numbers. The values may be traced.
+    """Return the scene with changed numbers. The values may be unknown (inside jit, grad or vmap).
 
     Args:
         scene: `Scene`.
@@ -146,7 +151,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
             scene = replace(scene, mesh=with_points(scene.mesh, value))
             continue
         if name.startswith("mesh."):
-            raise InputError(f"{_refusal(name)}: of a mesh only all points can change, mesh.points")
+            raise InputError(f"{_refusal(name)}: of a mesh, only all positions together can change: use mesh.points")
         old = names.get(scene, name, _refusal(name))
         like = (
             tuple(value) if isinstance(old, tuple) else jnp.array(value, float) if isinstance(old, jax.Array) else value
@@ -156,13 +161,13 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
 
 
 def numbers_at(scene: Scene, name: str) -> Any:
-    """Value of a scene for a dotted name: one number or an array.
+    """Return the value of a scene for a dotted name: one number or an array.
 
     Raises:
         InputError: the scene does not have the name, or its value is not a floating-point number.
     """
     if name.startswith("mesh.") and not name.startswith("mesh.points"):
-        raise InputError(f"{_refusal(name)}: of a mesh only all points can change, mesh.points")
+        raise InputError(f"{_refusal(name)}: of a mesh, only all positions together can change: use mesh.points")
     found = names.get(scene, name, _refusal(name))
     # A single whole number is allowed (`mu = 770`). An array of whole numbers contains node or element numbers.
     if not all(isinstance(v, int) or np.issubdtype(np.asarray(v).dtype, np.floating) for v in jax.tree.leaves(found)):

@@ -22,10 +22,10 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def check_before_run(scene: Scene) -> None:
-    """Check choices, bounds of numbers, and nodes. Traced arrays are not checked, and nothing is compiled.
+    """Check choices, bounds of numbers, and nodes. Arrays inside jit are not checked, and nothing is compiled.
 
     Raises:
-        InputError: as in `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume;
+        InputError: see `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume;
             nodes that are fixed and moved along the same axis, fixed although a plate moves them, or in two oblique
             planes.
     """
@@ -62,11 +62,11 @@ def check_time_and_mass(scene: Scene) -> None:
 
 
 def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
-    """Check that a run can begin with the numbers, nodes and positions of further physics. Runs on the host.
+    """Check that a run can begin with the numbers, nodes and positions of further physics. Not for use inside jit.
 
     Args:
         scene: `Scene`.
-        only: names of the physics to check, for example ``obstacle.0``; None: all.
+        only: names of the physics to check, for example ``obstacle.0``. None means all.
 
     Raises:
         InputError: the message begins with the name of the physics.
@@ -79,7 +79,7 @@ def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
 
 
 def check_scene(scene: Scene) -> None:
-    """Check that a scene can be simulated, before anything is compiled. Runs on the host.
+    """Check that a scene can be simulated, before anything is compiled. Not for use inside jit.
 
     Raises:
         InputError: the mesh or the viscosity cannot be used; time step or mass is missing; conditions contradict each

@@ -70,7 +70,7 @@ PLACE = {"where", "set"}
 
 
 def load_scene(path: str | Path) -> Scene:
-    """Read a scene from a TOML file. Relative paths in the file begin at the folder of the file.
+    """Read a scene from a TOML file. Paths in the file are relative to the folder of the file.
 
     Raises:
         InputError: the file cannot be read; unknown or missing keys; values that cannot be used. All checks run before
@@ -84,7 +84,7 @@ def load_scene(path: str | Path) -> Scene:
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}): give a scene file (TOML)") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path} is not text: give a scene file (TOML)") from None
+        raise InputError(f"{path} is not a text file: give a scene file (TOML)") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not TOML ({error}): correct that line") from None
     try:
@@ -156,7 +156,7 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
 
 
 def _of_two_kinds(name: str, given: set[str], kinds: list[set[str]]) -> str:
-    """Message for keys that are known but cannot be used together."""
+    """Return the message for keys that are known but cannot be used together."""
     first = min((given - keys for keys in kinds), key=len)
     other = min((given - keys for keys in kinds if first <= keys), key=len, default=given)
     return f"{name} has {', '.join(sorted(first))} together with {', '.join(sorted(other))}: remove one"
@@ -291,7 +291,8 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
 
 
 def _law_of_region(name: str, given: Any) -> dict[str, object] | Law:
-    """Return another law if `given` has a name, otherwise the parameters that differ."""
+    """Return a complete law if `given` has a name or is a list of laws. Otherwise return the parameters (dotted name ->
+    value) that differ from the law of the body."""
     if isinstance(given, list) or "name" in given:
         return _law(given, f"{name}: law")
     return dict(_dotted(f"{name} law", given))

@@ -6,8 +6,8 @@ dashpot (alpha = 1). With the stiffness G0 of the law, the model (see `Springpot
     G* / G0 = spring + sum_k 1 / ((i omega tau_k)^-alpha_k + 1 / limit_k).
 
 Special cases with one springpot: spring = 0 gives the springpot alone, and spring = 1 the fractional Kelvin-Voigt
-model. A limit is a spring in series with the springpot; this is the fractional Zener model (Bagley and Torvik 1983,
-J. Rheol. 27, 201).
+model. With a limit, a spring of stiffness limit_k G0 is in series with springpot k; this is the fractional Zener model
+(Bagley and Torvik 1983, J. Rheol. 27, 201).
 """
 
 from typing import Any
@@ -25,24 +25,27 @@ from liverjax.physics.viscosity import PARTS, Prony, check_part
 
 @struct
 class SpringpotSeries:
-    """Complex modulus divided by the modulus of the law. Only for harmonic motion."""
+    """Springpots: complex modulus divided by the modulus of the law. Only for harmonic motion."""
 
     times: Any = param("s", "tau_k (K,): at omega = 1/tau_k a springpot is as stiff as the law", above=0.0)
     exponents: Any = param("1", "alpha_k (K,): 0 is a spring, 1 a dashpot", lower=0.0, upper=1.0)
     limits: Any = param(
-        "1", "(K,) stiffness of the spring in series with each / that of the law", above=0.0, default=None
+        "1",
+        "stiffness of the spring in series with each springpot (K,), divided by the stiffness of the law",
+        above=0.0,
+        default=None,
     )
-    spring: Number = param("1", "stiffness at frequency 0 / stiffness of the law", lower=0.0, default=1.0)
+    spring: Number = param("1", "stiffness at frequency 0, divided by the stiffness of the law", lower=0.0, default=1.0)
     part: str = static(
         default="all", about="all: whole stress; isochoric: only the isochoric part of the stress", words=PARTS
     )
 
 
 def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) -> None:
-    """Check that springpots give a modulus. Runs on the host.
+    """Check that springpots give a modulus. Not for use inside jit.
 
     Raises:
-        InputError: different lengths; values out of bounds; an unknown part; a part that the law does not have; a
+        InputError: different lengths; values out of bounds; an unknown `part`, or one that the law does not have; a
             viscosity in the same scene.
     """
     if viscosity is not None:
@@ -50,17 +53,17 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
     bounds.check_fields(own, "springpots")
     shapes = {np.shape(a) for a in (own.times, own.exponents, own.limits) if a is not None}
     if len(shapes) != 1 or len(np.shape(own.times)) != 1:
-        raise InputError("springpots times, exponents and limits differ in length: give one each for every springpot")
+        raise InputError("springpots times, exponents and limits differ in length: give one of each per springpot")
     check_part(own.part, law, "springpots")
 
 
 def series_at_rest(own: SpringpotSeries) -> Prony:
-    """Prony series with a completely relaxed stress that is equal to the stress of the springpots at rest."""
+    """Return a Prony series with a completely relaxed stress that is equal to the stress of the springpots at rest."""
     return Prony(ratios=1 - jnp.atleast_1d(own.spring), relaxation_times=jnp.ones(1), part=own.part)
 
 
 def springpot_factors(own: SpringpotSeries, omegas: jax.Array) -> jax.Array:
-    """Complex ratio G*/G0 (F,) at angular frequencies (F,) [rad/s]."""
+    """Return the complex ratio G*/G0 (F,) at angular frequencies (F,) [rad/s]."""
     times, alpha = jnp.atleast_1d(own.times)[:, None], jnp.atleast_1d(own.exponents)[:, None]
     # (i omega tau)^-alpha has the phase -alpha pi/2.
     compliance = jnp.exp(-alpha * (jnp.log(omegas[None] * times) + 0.5j * jnp.pi))

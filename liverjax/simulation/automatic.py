@@ -1,11 +1,11 @@
 """Choice of the linear solver for `linear_solver = "auto"`: a rule on size and stiffness, measured in `experiments/`.
 
-"auto" chooses a factorisation for a static body of at most 10,000 tetrahedra (a quadratic one counts as eight) in two
-cases. In the first case the bulk modulus is more than a thousand times the shear modulus. For at most 1,500 tetrahedra,
-a ratio of a hundred is enough: in Newton's method the stiffness of such bodies has negative eigenvalues, and a
-factorisation can solve with them. In the second case the worst element is a sliver. A body is never factorised if it
-has friction, nodes that move together, follower pressures, or pressures as unknowns. In all other cases "auto" chooses
-conjugate gradients.
+"auto" chooses a factorisation for a static body of at most 10,000 tetrahedra (a quadratic element counts as eight) in
+two cases. In the first case the bulk modulus is more than a thousand times the shear modulus. For at most 1,500
+tetrahedra, a ratio of a hundred is enough: in Newton's method the stiffness of such bodies has negative eigenvalues,
+and a factorisation can solve with them. In the second case the worst element is a sliver. A body is never factorised if
+it has friction, nodes that move together, follower pressures, or pressures as unknowns. In all other cases "auto"
+chooses conjugate gradients.
 """
 
 from collections.abc import Iterable, Mapping
@@ -38,12 +38,12 @@ def chosen(scene: Scene) -> Scene:
 def with_solver(scene: Scene, rows: Iterable[Mapping[str, object]]) -> Scene:
     """Choose one linear solver for all parameter sets, because one compiled program runs all of them.
 
-    Inside this program the numbers are unknown. So "direct" is chosen here if any parameter set needs it. Otherwise
-    "auto" stays.
+    Inside the compiled program the numbers are unknown. So "direct" is chosen here if any parameter set needs it.
+    Otherwise "auto" stays.
 
     Args:
         scene: `Scene`.
-        rows: parameter sets, each with dotted names -> numbers, as in `with_parameters`. Traced numbers are ignored.
+        rows: parameter sets, each with dotted names -> numbers (see `with_parameters`). Unknown numbers are ignored.
     """
     direct = replace(scene, solve=replace(scene.solve, linear_solver="direct"))
     if scene.solve.linear_solver != "auto" or not _may_factorise(_with_form(scene)):
@@ -62,7 +62,7 @@ def _with_form(scene: Scene) -> Scene:
 
 
 def linear_solver(scene: Scene) -> str:
-    """Linear solver for a scene: "cg" or "direct". It is "cg" if the numbers of the scene are traced, hence unknown."""
+    """Return the linear solver for a scene, "cg" or "direct"; inside jit, grad or vmap "cg" (numbers unknown)."""
     return "direct" if _may_factorise(scene) and (_is_stiff(scene) or _is_thin(scene)) else "cg"
 
 
@@ -83,7 +83,7 @@ def _size(scene: Scene) -> int:
 
 
 def _is_stiff(scene: Scene) -> bool:
-    """Whether the bulk modulus is far above the shear modulus. Returns False if the moduli are traced."""
+    """Whether the bulk modulus is far above the shear modulus. Returns False inside jit, grad or vmap (unknown)."""
     try:
         shear = scene.law.shear_modulus()
         bulk = scene.law.bulk_modulus() if scene.porosity is None else scene.porosity.limit_bulk
@@ -96,7 +96,7 @@ def _is_stiff(scene: Scene) -> bool:
 
 
 def _is_thin(scene: Scene) -> bool:
-    """Whether an element is a sliver. Returns False if the points are traced."""
+    """Whether an element is a sliver. Returns False inside jit, grad or vmap (points unknown)."""
     points, volumes = scene.mesh.points, scene.mesh.volumes
     if isinstance(points, jax.core.Tracer) or isinstance(volumes, jax.core.Tracer):
         return False
@@ -105,7 +105,7 @@ def _is_thin(scene: Scene) -> bool:
 
 
 def form_of_volumes(scene: Scene) -> str:
-    """Form of the volume changes: "mixed" for quadratic elements if possible, otherwise "element".
+    """Return the form of the volume changes: "mixed" for quadratic elements if possible, otherwise "element".
 
     The choice does not depend on numbers, since a run and its derivatives must use the same form.
     """

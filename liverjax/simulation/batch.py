@@ -1,7 +1,8 @@
 """Many runs of one scene, each with other numbers, in one compiled program on all devices of the process.
 
-A lane is one run of the batch. On a CPU each device runs one lane after another. A vectorised step would be slower
-there, because it would wait for the slowest lane in every loop. On a GPU each device runs all of its lanes at once.
+Each run of the batch has one parameter set. On a CPU each device does one run after another. A vectorised step would be
+slower there, because it would wait for the slowest run in every loop. On a GPU each device does all of its runs at
+once.
 """
 
 from typing import Any
@@ -24,16 +25,16 @@ STRATEGIES = ("map", "vmap")
 
 @struct
 class Batch:
-    """Results of N lanes. `result.status` is (N, T). A failed lane does not change the results of the other lanes."""
+    """Results of the N runs of a batch. `result.status` is (N, T). A failed run does not change other runs."""
 
-    result: Result = param("1", "every field with a leading axis of N lanes")
+    result: Result = param("1", "every field with a leading axis of N runs")
     reference: jax.Array | None = param(
-        "m", 'reference shapes (N, V, 3) of the lanes, if the mesh of the scene is "loaded"', default=None
+        "m", 'reference shapes (N, V, 3) of the runs, if the mesh of the scene is "loaded"', default=None
     )
     strategy: str = static(
-        default="map", about="map: one lane after another per device; vmap: all lanes of a device at once"
+        default="map", about="map: one run after another per device; vmap: all runs of a device at once"
     )
-    devices: int = static(default=1, about="number of devices that shared the lanes")
+    devices: int = static(default=1, about="number of devices that shared the runs")
 
 
 def strategy_for(platform: str) -> str:
@@ -44,18 +45,18 @@ def strategy_for(platform: str) -> str:
 def simulate_batch(
     scene: Scene, parameters: dict[str, Any], strategy: str | None = None, devices: list | None = None
 ) -> Batch:
-    """Run a scene once for each lane of `parameters`. This function may be jitted and differentiated.
+    """Run a scene once for each set of values in `parameters`. This function may be jitted and differentiated.
 
     Args:
         scene: `Scene`.
-        parameters: dotted names (see `with_parameters`) -> values with a leading axis of N lanes.
+        parameters: dotted names (see `with_parameters`) -> values with a leading axis of N parameter sets.
         strategy: "map" or "vmap"; None: the fastest strategy on the platform (`strategy_for`).
-        devices: devices that share the lanes; None: all devices of the process.
+        devices: devices that share the runs; None: all devices of the process.
 
     Raises:
-        InputError: no parameters, different numbers of lanes, a name that the scene does not have, "vmap" of robust
-            steps on a CPU. Also if `simulate` would raise InputError for a lane; the message then begins with the
-            number of the lane.
+        InputError: no parameters, different numbers of values, a name that the scene does not have, "vmap" of robust
+            steps on a CPU. Also if `simulate` would raise InputError for a parameter set; the message then begins with
+            the number of this set.
     """
     devices = jax.local_devices() if devices is None else devices
     strategy = strategy_for(devices[0].platform) if strategy is None else strategy
@@ -82,7 +83,7 @@ def simulate_batch(
 
     number = min(len(devices), lanes)
     if number > 1:
-        # The last lane is repeated until all devices have the same number of lanes.
+        # The last parameter set is repeated until all devices have the same number of runs.
         fill = -lanes % number
         parameters = {n: jnp.concatenate([v, jnp.repeat(v[-1:], fill, axis=0)]) for n, v in parameters.items()}
         spread = PartitionSpec("lane")
@@ -101,17 +102,21 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
     first = next(iter(lengths))
     for name, length in lengths.items():
         if length is None or length == 0:
-            raise InputError(f"{name} has no lanes: give one value per lane, e.g. [700.0, 800.0]")
+            raise InputError(
+                f"{name} has no list of values: give one value for each parameter set, e.g. [700.0, 800.0]"
+            )
         if length != lengths[first]:
-            raise InputError(f"{name} has {length} lanes and {first} has {lengths[first]}: give equal numbers")
+            raise InputError(
+                f"{name} has {length} values, but {first} has {lengths[first]}: give equal numbers of values"
+            )
     return int(lengths[first] or 0)
 
 
 def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[str, np.ndarray]]:
-    """Check the numbers of each lane and return them. Returns an empty list if they are traced.
+    """Check the numbers of each parameter set and return the sets, or an empty list inside jit, grad or vmap.
 
     Raises:
-        InputError: `simulate` would raise InputError for a lane. The message begins with the number of this lane.
+        InputError: `simulate` would raise InputError for a parameter set. The message begins with its number.
     """
     if any(isinstance(value, jax.core.Tracer) for value in parameters.values()):
         return []
@@ -122,5 +127,5 @@ def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[
         try:
             check_before_run(own) if k == 0 else check_bounds(own)
         except InputError as error:
-            raise InputError(f"lane {k}: {error}") from None
+            raise InputError(f"parameter set {k} (counted from 0): {error}") from None
     return lanes

@@ -1,4 +1,4 @@
-"""Warnings about a run, computed on the host. The functions return sentences. No sentence means no warning."""
+"""Warnings about a run, computed after the run. The functions return a list of warnings, which may be empty."""
 
 from functools import partial
 
@@ -48,7 +48,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
     """Warnings about the mesh, the loads, the contacts and the volumes of a run; the list may be empty.
 
     Args:
-        scene: `Scene`, not traced.
+        scene: a `Scene` with known numbers (not inside jit, grad or vmap).
         result: `Result` of its run.
     """
     return [
@@ -69,7 +69,7 @@ _SMALL = 0.02
 
 
 def mesh_sentence(scene: Scene, result: Result) -> str:
-    """One sentence on the mesh error of the positions at the last step, with a remedy if the error is large."""
+    """Return a sentence about the mesh error of the positions at the last step, with a remedy if it is large."""
     assert result.mesh_error is not None
     if np.asarray(result.status)[-1] not in (status.CONVERGED, status.ONE_STEP):
         return "mesh error: unknown, because the last step failed"
@@ -100,7 +100,7 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
 
 
 def _pressure_errors(result: Result) -> tuple[str, str]:
-    """Two parts of the sentence on the mesh error: what the error omits, and the error of the fluid pressures."""
+    """Return two additions to the sentence about the mesh error: what this error omits, and the error of pressures."""
     if result.pressure is None or result.mesh_error is None:
         return "", ""
     if result.mesh_error.pressure is None:
@@ -134,7 +134,8 @@ def cautions_of_mesh(mesh: TetMesh) -> list[str]:
     return said
 
 
-#: Above this K/mu, quadratic elements without pressure unknowns have errors of 10 % or more (experiments/TABLES.md).
+#: Above this K/mu, quadratic elements without pressure unknowns have errors of 10 % or more (see
+#: `experiments/TABLES.md`).
 _LOCKING = 100.0
 
 
@@ -277,8 +278,8 @@ def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, m
         if what:
             return (
                 f"{name} {what} the body in step {k + 1}, in which it moves {ways[k]:.2g} m, with a radius of "
-                f"{radius:.2g} m: it passed the surface between two steps, so contact forces are missing or point to "
-                "the wrong side; use more steps"
+                f"{radius:.2g} m: it passed the surface between two steps, so contact forces are missing or have "
+                "the wrong direction; use more steps"
             )
     return ""
 
@@ -357,8 +358,8 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
     """Warn if the layer that drains in `seconds` is thinner than the elements there; `when` is the time in words.
 
     In a time t, a layer of the thickness sqrt(c t) drains, with the diffusivity c = kappa / (1/K_lim + 1/M) (Biot
-    1941). kappa is the permeability, M = K0 + 4/3 mu. The pressure is linear in an element, so an element thicker than
-    this layer loses too much fluid.
+    1941). kappa is the permeability. M = K0 + 4/3 mu, with the bulk modulus K0 and the shear modulus mu. The pressure
+    is linear in an element, so an element thicker than this layer loses too much fluid.
     """
     sponge = scene.porosity
     assert sponge is not None
@@ -447,7 +448,7 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
 
 
 def _at_times(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (n, k) of a table at other times (n,), by linear interpolation."""
+    """Values (n, k) of a table of k columns at other times (n,), by linear interpolation."""
     columns = values.reshape(len(times), -1).T
     return np.stack([np.interp(at, times, column) for column in columns], axis=1)
 
@@ -475,7 +476,7 @@ def _of_volumes(scene: Scene, result: Result) -> list[str]:
 
 
 def _extremes(mesh: TetMesh, positions: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Minimum J (E,) of each element, the step of the minimum (from 0), maximum J, and the step of the maximum."""
+    """Return for each element (E,): minimum J, its step (from 0), maximum J, and its step."""
 
     def one(carry: tuple, given: tuple) -> tuple[tuple, None]:
         least, when_least, most, when_most = carry

@@ -8,6 +8,7 @@ import numpy as np
 
 from liverjax.core.struct import Number, replace
 from liverjax.elements import mjed
+from liverjax.laws.base import isochoric_part
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Free, NodalForce, Physics, Solid, Start, Step, VolumeStress
@@ -23,7 +24,7 @@ class State(NamedTuple):
     """The state between two steps."""
 
     x: jax.Array  # (V, 3) [m]
-    memories: tuple  # one memory per physics, in order; None if the physics has no memory
+    memories: tuple  # internal variables of each physics, in order; None if the physics has no such variables
 
 
 class Sizes(NamedTuple):
@@ -34,7 +35,7 @@ class Sizes(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """The equations of a step, constant during the step."""
+    """The data of the equations of one step. These data are constant during the step."""
 
     scene: Scene
     physics: tuple[Physics, ...]
@@ -94,7 +95,7 @@ class Forces(NamedTuple):
 
 
 def free_directions(scene: Scene) -> Free:
-    """Directions in which the nodes of the body can move."""
+    """Return the directions in which the nodes of the body can move."""
     free = Free(free_degrees(scene.mesh, scene.fixed, scene.displaced))
     for physics in scene.physics:
         free = physics.constrain(free)
@@ -122,9 +123,9 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
 
 
 def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] of all physics at positions x (V, 3), with the memories of the reference shape.
+    """Forces (V, 3) [N] of all physics at positions x (V, 3), with the internal variables of a body at rest.
 
-    Inertia and the forces that act only at the end of a step (`NodalForce.at_end`) are left out.
+    Inertia and the forces that act only at the end of a step (`NodalForce.at_end`) are omitted.
     """
     still = replace(scene, solve=replace(scene.solve, kind="static"))
     none = jnp.zeros((), x.dtype)
@@ -148,8 +149,10 @@ def _with_tied(physics: tuple[Physics, ...], step: Step) -> Step:
 
 
 def force_sizes(scene: Scene) -> Sizes:
-    """Norms [N] of the forces of a strain along x and of rounded positions, for the tolerance if no load acts."""
-    mesh, law = scene.mesh, law_at_rest(scene)
+    """Norms [N] of the nodal forces due to a unit strain along x and due to rounding, for runs without loads."""
+    mesh = scene.mesh
+    # Unknown pressures do not follow from the positions, so the bulk modulus does not enlarge their rounding.
+    law = isochoric_part(scene.law) if scene.solve.volumetric == "mixed" else law_at_rest(scene)
     dtype = mesh.points.dtype
     along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], dtype)
     rounded = 0.5 * float(jnp.finfo(dtype).eps) * jnp.abs(mesh.points)
@@ -158,7 +161,7 @@ def force_sizes(scene: Scene) -> Sizes:
     def size(motion: jax.Array) -> jax.Array:
         return jnp.linalg.norm(mjed.linear_force(mesh, law, motion))
 
-    # One loop for both: this program is a third as large as two products with a linearised force.
+    # One loop for both: the compiled program is a third as large as with two products with a linearised force.
     unit_strain, roundoff = jax.lax.map(size, jnp.stack([along, rounded]))
     return Sizes(*jax.lax.stop_gradient((unit_strain, roundoff + _roundoff_at_nodes(scene, rounded))))
 
@@ -166,7 +169,7 @@ def force_sizes(scene: Scene) -> Sizes:
 def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
     """Norm [N] of the forces of springs and masses if the nodes move by `rounded` (V, 3) [m] from the reference shape.
 
-    Contact is left out: the contact points are not known before the step.
+    Contact is omitted, because the contact points are not known before the step.
     """
     x = scene.mesh.points
     begin = _first_step(scene, x, free_directions(scene))
@@ -188,7 +191,7 @@ def _is_spring(acting: NodalForce) -> bool:
 
 
 def equations(scene: Scene, state: State, k: Number, sizes: Sizes | None = None) -> Equations:
-    """Equations of step k (from 1) that begins at `state`. `sizes` is `force_sizes(scene)`, the same for all steps."""
+    """Return the equations of step k (from 1), which begins at `state`. `sizes` is `force_sizes(scene)`."""
     sizes = force_sizes(scene) if sizes is None else sizes
     return _of_physics(scene, physics_of(scene), state, k, sizes)
 
@@ -224,7 +227,7 @@ def _prescribed_motion(scene: Scene, k: Number) -> tuple[jax.Array, jax.Array] |
 
 
 def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
-    """Positions (V, 3) from the unknowns q (3 V,) and the prescribed motion, at fraction s of the step."""
+    """Positions (V, 3) [m] from the unknowns q (3 V,) and the prescribed motion, at fraction s of the step."""
     held, free = e.mesh.points, e.free
     q = q[: 3 * e.mesh.number_of_nodes]
     if e.moved is not None:
@@ -241,7 +244,7 @@ def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
 
 
 def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> jax.Array:
-    """Unknowns q of a step at positions x (V, 3): free positions (3 V,), then pressures in the unit `mixed.unit`.
+    """Return the unknowns q of a step at positions x (V, 3): positions (3 V,), then pressures / `mixed.unit`.
 
     Args:
         pressure: pressures of the vertices (V,) [Pa] if they are unknowns; default: pressures at the beginning of the
@@ -257,7 +260,7 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
     return jnp.concatenate([q, pressure / e.mixed.unit])
 
 
-@jax.jit  # a program calls it several times, but with jit it is traced once
+@jax.jit  # so that JAX evaluates this function only once for all its calls in a compiled program
 def forces(
     e: Equations, q: jax.Array, s: Number, guess: Guess | None = None, pressure: jax.Array | None = None
 ) -> Forces:
@@ -324,8 +327,8 @@ def residual(
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
     """Out-of-balance forces (3 V,) [N] at fraction s of the step, sum of the norms of all forces [N], and pressures.
 
-    With unknown pressures, the sum of all forces counts mu/K times and the isochoric forces count in full, see
-    `Mixed.counted`.
+    With unknown pressures, the norms of all forces are weighted by about mu/K, and the isochoric forces count in full
+    (see `Mixed.counted`).
     """
     f = forces(e, q, s, guess)
     at_work = jnp.linalg.norm(f.internal)
@@ -348,25 +351,25 @@ def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
     F = deformation_gradient(e.mesh, x)
     total = jnp.sum(e.mesh.weights * sum(solid.energy(F) for solid in e.solids))
     if e.volume is not None:
-        total = total + e.volume.energy(e.mesh, determinant(F))  # unknown pressures take their optimal values
+        total = total + e.volume.energy(e.mesh, determinant(F))  # unknown pressures have their optimal values
     return sum((a.energy_from(e.mesh, x, begin) for a in e.nodal), total)
 
 
 def advanced(e: Equations, end: End, by_end_forces: jax.Array | None = None) -> State:
-    """State after an accepted step. `by_end_forces` is the second result of `reported_forces`."""
+    """Return the state after an accepted step. `by_end_forces` (V, 3) is the result a of `reported_forces`."""
     end = end._replace(by_end_forces=by_end_forces)
     each = zip(e.physics, e.state.memories, e.acting, strict=True)
     return State(end.x, tuple(p.advance(memory, acting, end) for p, memory, acting in each))
 
 
 def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-    """Sum of all forces (V, 3) [N], from which the reactions follow. Forces of `NodalForce.at_end` are not doubled.
+    """Return (f, a): f (V, 3) [N] is the sum of all forces, from which the reactions follow.
 
-    The second result is minus the accelerations (V, 3) [m/s^2] due to these forces. It is None if there are no such
-    forces.
+    Unlike `total`, f contains the forces of `NodalForce.at_end` once (not doubled). a is minus the accelerations (V, 3)
+    [m/s^2] due to these forces, or None if there are no such forces.
 
     Args:
-        total: sum of all forces at positions x (V, 3), as in the step's equations.
+        total: sum of all forces (V, 3) [N] in the step's equations, at positions x (V, 3).
     """
     doubled = _at_end(e, x, 1.0)
     if not doubled:
@@ -382,7 +385,7 @@ def _at_end(e: Equations, x: jax.Array, s: Number) -> list[jax.Array]:
 
 
 def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:
-    """Results of the physics at a state by name, in addition to positions and reactions."""
+    """Additional results at a state, by name, for example the pressures of a fluid at the nodes."""
     shown: dict[str, jax.Array] = {}
     for physics, memory in zip(physics_of(scene), state.memories, strict=True):
         shown |= {name: on_middles(scene.mesh, field) for name, field in physics.output(memory).items()}

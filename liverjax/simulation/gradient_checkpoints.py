@@ -17,7 +17,7 @@ from liverjax.solvers.step_cutting import ROOT
 
 
 def number_kept(store: str | int, steps: int) -> int:
-    """Number of states that reverse mode keeps in a run of `steps` steps.
+    """Return the number of states that reverse mode keeps in a run of `steps` steps.
 
     Args:
         store: "all", "sqrt", or a number above 0.
@@ -62,7 +62,7 @@ def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, carry, k)[1])
         return jax.lax.cond(real, step, lambda carry, _: (carry, nothing), carry, k)
 
-    # Only the state at the beginning of a segment is kept. All segments share one program, so the last segment skips
+    # Only the state at the beginning of a segment is kept. All segments share one compiled loop, so the last one skips
     # the steps after the end of the run.
     @jax.checkpoint
     def segment(carry, at):

@@ -3,7 +3,7 @@
     found = lj.value_and_gradient(lambda result: loss(result.positions), scene, {"law.mu": 770.0})
 
 `jax.grad` through `simulate` gives the same derivatives. This module adds a status code, the choice between reverse and
-forward mode, and a prediction of the memory.
+forward mode, and a prediction of the required memory.
 """
 
 import functools
@@ -50,15 +50,15 @@ def value_and_gradient(
         loss: a function that JAX can differentiate. If the same function is given again, the compiled program is
             reused.
         scene: `Scene`.
-        at: dotted names as in `with_parameters` -> values that replace the values of the scene. The name "start" means
+        at: dotted names (see `with_parameters`) -> values that replace the values of the scene. The name "start" means
             the positions (V, 3) [m] at which the run begins, at rest.
-        store: the steps that reverse mode keeps: "all", "sqrt" (the square root of their number), or a number of states
+        store: how many states reverse mode keeps: "all", "sqrt" (square root of the number of steps), or a number
             (see `gradient_checkpoints` and `memory`).
         mode: "reverse" or "forward". The cost of "reverse" does not grow with the number of parameters. "forward" needs
             no memory for the steps, but costs one run per parameter.
 
     Raises:
-        InputError: unknown mode or store, no parameters, a name that the scene does not have; also as in `simulate`.
+        InputError: unknown mode or store, no parameters, a name that the scene does not have; the errors of `simulate`.
     """
     if mode not in MODES:
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
@@ -92,12 +92,12 @@ def _program_of_gradient(loss: Callable[[Result], jax.Array], store: str | int, 
     return jax.jit(both)
 
 
-#: Measured memory for the derivative of one step, without the tangents, in numbers per integration point.
+#: Measured memory for the derivative of one step, without the tangents: numbers stored per integration point.
 _WORK = 440
 
 
 def memory(scene: Scene, store: str | int = "all") -> int:
-    """Predict the memory [bytes] of a derivative in reverse mode, without compiling a program."""
+    """Predict the memory [bytes] for a derivative in reverse mode, without compilation."""
     steps = scene.solve.steps
     kept = gradient_checkpoints.number_kept(store, steps)
 
@@ -110,7 +110,7 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     root = _bytes(scene.mesh.points)
     if scene.porosity is not None and scene.porosity.scheme == "implicit":
         root += scene.mesh.number_of_vertices * scene.mesh.points.dtype.itemsize
-    # There are two tangents: that of a step, and that of the beginning of the run.
+    # There are two tangents: the tangent of a step, and the tangent of the beginning of the run.
     work = 2 * tangent + _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
     if kept >= steps:
         return steps * (state + root) + work

@@ -4,9 +4,9 @@ The richer space has quadratic functions for linear elements, and cubic function
 the positions of a step exactly. In the richer space these positions have out-of-balance forces r. With the tangent K,
 the forces give du = -K^-1 r, a displacement that the elements of the run cannot represent. The reactions change by
 their derivative along du. A second run, in the richer space, accompanies the first run. The second run has separate
-memories for viscosity, fluid and inertia. In the richer space a surface touches an obstacle at other points. With
-contact, the solves are therefore repeated until these contact points are found. With the contact points of the first
-solve only, the estimated error of the force on a flat punch was 1/4; the true error was 1/100.
+internal variables of viscosity, fluid and inertia. In the richer space a surface touches an obstacle at other points.
+With contact, the solves are therefore repeated until these contact points are found. With the contact points of the
+first solve only, the estimated error of the force on a flat punch was 25 %; the true error was 1 %.
 
 The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 times the error, at small and
 moderate strain. If du is added to the result, about a tenth of the error is left. For quadratic elements the cubic
@@ -63,18 +63,18 @@ from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
 #: Tolerance of the linear solve. 1e-1 would find only a fifth of the error of a slender beam of quadratic elements.
 _TOLERANCE = 1e-2
-#: For each order of the elements: the tolerance if pressures are unknowns, and the factor on du.
+#: For each order of the elements: the tolerance if pressures are unknowns, and the factor that multiplies du.
 _WITH_PRESSURES = {1: 1e-5, 2: 1e-4}
 _FACTOR = {1: 1.0, 2: 1.5}
 #: Error bar of a quantity, divided by the correction of this quantity.
 BAR = 1.25
-#: Up to this K/mu, quadratic elements without pressure unknowns do not lock (experiments/TABLES.md).
+#: Up to this K/mu, quadratic elements without pressure unknowns do not lock (see `experiments/TABLES.md`).
 _LOCKS = 10.0
 #: With contact: maximum number of linear solves in a step. The solves end if the residual, divided by the sum of the
 #: norms of all forces, is below the second number.
 _ROUNDS, _SETTLED = 24, 1e-3
-#: With a flowing fluid the residual must be below this. One solve is not exact, because it only approximates the
-#: inverse of the pressure matrix (`liverjax.physics.darcy.nearly_solved`).
+#: With a flowing fluid the relative residual must be below this value. One solve is not exact, because it only
+#: approximates the inverse of the pressure matrix (`liverjax.physics.darcy.nearly_solved`).
 _WITH_FLUID = 1e-5
 #: Maximum number of halvings of the change from such a solve if the full change increases the residual.
 _HALVINGS = 4
@@ -107,7 +107,7 @@ class MeshError:
 def mesh_error_of(
     scene: Scene, positions: jax.Array, reactions: jax.Array, pressure: jax.Array | None = None
 ) -> MeshError:
-    """Estimate the mesh error of a run from the reference positions. Node numbers may not be traced.
+    """Estimate the mesh error of a run from the reference positions. Node numbers must be known (not inside jit).
 
     Args:
         scene: the scene that was run (`liverjax.simulation.run.prepared`).
@@ -183,7 +183,7 @@ def _with_richer_elements(scene: Scene) -> Scene:
 
 
 def _may_lock(scene: Scene) -> bool:
-    """Whether a bulk modulus is more than `_LOCKS` times the shear modulus. Returns True if the moduli are unknown."""
+    """Whether K is more than `_LOCKS` times mu in any material. Returns True if the moduli are unknown."""
     laws = list(laws_of(scene.law, scene.region))
     for region in scene.region:
         own = scene.law
@@ -258,8 +258,8 @@ _Solved = tuple[jax.Array, jax.Array, jax.Array]
 def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _Solved]:
     """Return the unknowns at which the last linear solve begins, and the result of this solve.
 
-    Without contact there is one solve, from q. With contact, more solves find the contact points in the richer space. A
-    flowing fluid also needs more solves.
+    Without contact there is one solve, from q. With contact, more solves are needed to find the contact points in the
+    richer space. A flowing fluid also needs more solves.
     """
     one = jnp.ones((), q.dtype)
     tolerance = _TOLERANCE
@@ -303,7 +303,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
 
 
 def _shortened(size: Callable[[jax.Array], jax.Array], q: jax.Array, dq: jax.Array) -> jax.Array:
-    """Find the factor t with which q + t dq has a smaller residual than q. It is halved at most `_HALVINGS` times."""
+    """Return a factor t for which q + t dq has a smaller residual than q: 1, halved at most `_HALVINGS` times."""
     before = size(q)
 
     def go_on(t: jax.Array) -> jax.Array:

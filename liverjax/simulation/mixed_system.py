@@ -33,10 +33,11 @@ def coupled(
 ) -> block_matrix.BlockMatrix:
     """Assemble the coupled matrix in 4 x 4 blocks, which is symmetric and indefinite.
 
-    It is the derivative of the forces and of minus the pressure equation with respect to (x, P).
+    The matrix is the derivative of the forces, and of the pressure equation with a minus sign, with respect to the
+    positions x and the pressures P.
 
     Args:
-        K: stiffness blocks (E,) at given pressure, for pairs of nodes.
+        K: stiffness blocks (E,) [N/m] at given pressure, for pairs of nodes.
         own: 3 x 3 blocks of entries (V,) that force terms at nodes add to the diagonal, or None. An entry that is 0 is
             None.
         F: deformation gradient at the end of the step.
@@ -62,7 +63,8 @@ def coupled(
 def balances(
     mesh: TetMesh, A: block_matrix.BlockMatrix | PointMatrix, motion: Sequence[jax.Array]
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """Forces due to a displacement at given pressures, as columns (V,), and change (V,) of the balance of volumes."""
+    """Forces [N], as columns (V,), and change (V,) of the volume balance, due to the displacement `motion`. The
+    pressures stay constant."""
     if isinstance(A, PointMatrix):
         return point_matrix.product(mesh, A, motion), -point_matrix.volume_changes(mesh, A, motion)
     *forces, balance = block_matrix.product(A, motion)
@@ -109,7 +111,7 @@ def with_pressures(
 
 
 def without_pressures(mesh: TetMesh, volume: Any, A: PointMatrix, motion: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Forces, as columns (V,), of a displacement and of the pressures that it causes, for quadratic elements.
+    """Forces, as columns (V,), due to a displacement and the pressures that it causes, for quadratic elements.
 
     A polynomial approximates the inverse of the pressure matrix, so that this product stays symmetric. In tetrahedra
     the pressure matrix divided by its diagonal has eigenvalues between 1/2 and 5/2 (Wathen 1987).

@@ -36,7 +36,7 @@ def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
     found = [p.in_body(scene.mesh, scene.law) for p in scene.physics if isinstance(p, Obstacle)]
 
     def one(obstacle: Obstacle) -> tuple[jax.Array, jax.Array, jax.Array]:
-        # Friction has a memory, so the steps are computed in order.
+        # Friction has an internal variable (the slip), so the steps are computed in order.
         def at(carry: Any, given: Any) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
             (memory, before), (k, x) = carry, given
             acting = obstacle.freeze(memory, Step(mesh, before, k, steps, dt, False, None, free))

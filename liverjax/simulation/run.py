@@ -36,7 +36,7 @@ class Result:
     mesh_error: MeshError | None = param("1", "estimated mesh error; None: not estimated", default=None)
 
     def check(self) -> "Result":
-        """Check the result on the host: return it, or raise `RuntimeError` with advice if a step failed."""
+        """Return this result, or raise `RuntimeError` with advice if a step failed."""
         codes = np.asarray(self.status)
         if np.any(codes != status.CONVERGED):
             step = int(np.argmax(codes != status.CONVERGED))
@@ -97,7 +97,7 @@ def _run_part(
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
     kept, _ = beginning(equations(scene, state, numbers[0], sizes))
-    # With `inline` the function is traced only once, for `eval_shape` and for the program.
+    # With `inline`, JAX evaluates the function only once, for `eval_shape` and for the compiled program.
     advance = jax.jit(_step_by_step(scene, sizes, report, None, differentiable=False), inline=True)
 
     def unless_over(carry, k):
@@ -124,7 +124,7 @@ def simulate(
             step. None: the reference positions. If elements are inverted at `start`, use robust = "projected". Then a
             static scene uses `start` as a guess. If the guess is inverted or does not lead to a solution, the run
             begins at the reference positions.
-        report: a function that is called on the host with the number of each finished step, to show progress.
+        report: a Python function that is called with the number of each finished step, to show progress.
         store: number of states that reverse mode keeps: "all" (the end of every step), a whole number, or "sqrt" (the
             square root of the number of steps). The steps between kept states run a second time. Without derivatives
             `store` has no effect. See `liverjax.simulation.gradients`.
@@ -132,10 +132,10 @@ def simulate(
             the reference positions. The estimate can be differentiated in forward mode only.
 
     Raises:
-        InputError: unknown choices; a time step or a mass is missing; numbers out of bounds, unless they are traced; a
-            loaded mesh for which no reference shape is found (if traced, its points are NaN and its steps are
-            NOT_FINITE); precision "float64" although JAX's 64-bit mode is off. `check_scene`, which is called when a
-            scene file is read, checks more, mainly the mesh.
+        InputError: unknown choices; a time step or a mass is missing; numbers out of bounds; a loaded mesh for which no
+            reference shape is found; precision "float64" although JAX's 64-bit mode is off. Inside jit, grad or vmap,
+            numbers are not checked; if no reference shape is found there, the points are NaN and the status of the
+            steps is NOT_FINITE. `check_scene`, which is called when a scene file is read, checks more, mainly the mesh.
     """
     scene = prepared(scene)
     check_time_and_mass(scene)
@@ -146,7 +146,7 @@ def simulate(
     if mesh_error:
         refuse(scene)
         if start is not None:
-            raise InputError("mesh_error = True needs a run from the reference positions: leave start out")
+            raise InputError("mesh_error = True needs a run from the reference positions: remove start")
     result = _run(scene, start, report, gradient_checkpoints.number_kept(store, scene.solve.steps))
     if not mesh_error:
         return result
@@ -160,20 +160,20 @@ def simulate_part(
     count: int,
     report: Callable[[int], None] | None = None,
 ) -> tuple[Result, State]:
-    """Run some steps and return their results and the final state. So a long run can be stored in parts.
+    """Run some steps. Return their results and the final state, so that a long run can be stored in parts.
 
-    This function is not differentiable. Every part begins with a new tangent, so that a run which continues from a
+    This function is not differentiable. Every part of the run begins with a new tangent. So a run that continues from a
     stored state gives exactly the same result.
 
     Args:
         scene: `Scene`.
         state: state after the previous step; at the beginning `initial_state(prepared(scene))`.
-        first: number of the first step, from 1; may be traced.
+        first: number of the first step, from 1; may be unknown during compilation.
         count: number of steps. Steps after the last step of the scene are skipped; their results are zeros.
-        report: as in `simulate`.
+        report: the same argument as for `simulate`.
 
     Raises:
-        InputError: as `simulate`.
+        InputError: in the same cases as `simulate`.
     """
     scene = prepared(scene)
     numbers = first + jnp.arange(count, dtype=scene.mesh.points.dtype)
@@ -184,10 +184,10 @@ def prepared(scene: Scene) -> Scene:
     """Prepare a scene for its run: one value of each number per element, a linear solver, the scene's precision.
 
     `simulate` calls this function. But inside `jax.jit` the numbers are unknown, so `linear_solver = "auto"` then means
-    iterations. Call this function before `jax.jit` if a factorisation may be chosen.
+    conjugate gradients. Call this function before `jax.jit` if a factorisation may be chosen.
 
     Raises:
-        InputError: as `simulate`.
+        InputError: in the same cases as `simulate`.
     """
     scene = _ready(scene)
     return unload(scene).scene if scene.points_are == "loaded" else scene
@@ -202,7 +202,8 @@ def unloaded(scene: Scene) -> Unloaded:
     positions. In the reference shape the edges of these elements are straight.
 
     Raises:
-        InputError: as `simulate`; a porous scene; no reference shape was found (if traced, the points are NaN).
+        InputError: in the same cases as `simulate`; a porous scene; no reference shape was found (inside jit, grad or
+            vmap the points are NaN instead).
     """
     found = unload(_ready(replace(scene, points_are="loaded")))
     whole = replace(scene, mesh=with_points(scene.mesh, found.scene.mesh.points), points_are="reference")

@@ -42,7 +42,7 @@ from liverjax.tensors.matrices import deformation_gradient, determinant
 
 
 def problem_of(e: Equations) -> Problem:
-    """Define the problem that `step_cutting.solve` solves to find the end of the step."""
+    """Return the problem that `step_cutting.solve` solves to find the positions at the end of the step."""
     potential = None
     if e.scene.solve.robust != "off":
         potential = Potential(
@@ -83,7 +83,7 @@ def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangen
 
 
 def _flowing(e: Equations) -> Beside | None:
-    """Pressures of a flowing fluid, which depend on the positions, or None if the scene has no such fluid."""
+    """Return the pressures of a flowing fluid as additional unknowns, or None if the scene has no such fluid."""
     volume: Any = e.volume
     if volume is None or volume.flow is None:
         return None
@@ -104,13 +104,14 @@ def _definite(
 
 
 def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
-    """Unknowns of the reference shape, and whether this is the first step and begins at another shape (a guess)."""
+    """Return the unknowns of the reference shape, and whether this is the first step and it begins at positions that
+    differ from the reference shape."""
     points = e.mesh.points
     return unknowns(e, points), (e.k == 1) & jnp.any(e.free.vectors(e.state.x - points) != 0)
 
 
 def _finite(e: Equations) -> Equations:
-    """Equations of the same body with a stable neo-Hookean law. Force terms at nodes stay the same."""
+    """Return the equations of the same body with a stable neo-Hookean law. Force terms at nodes stay the same."""
     law = e.scene.law
     mu = law.shear_modulus()
     own = [p.bulk_modulus() for p in e.physics if p.bulk_modulus() is not None]
@@ -123,9 +124,9 @@ def _finite(e: Equations) -> Equations:
 def step(
     e: Equations, kept: Kept | None = None, near: Any = None, differentiable: bool = True
 ) -> tuple[State, jax.Array, StepStatistics, Kept]:
-    """Solve a step. Return the next state, the reactions (V, 3) [N], the statistics and the tangent for the next step.
+    """Solve a step. Return the next state, the reactions (V, 3) [N], statistics, and the tangent for the next step.
 
-    `kept` is the tangent of the last step. Derivatives may use the coarse space of the tangent `near`.
+    `kept` contains the tangent of the last step. Derivatives may use the coarse space of the tangent `near`.
     """
     scene, x, solve = e.scene, e.state.x, e.scene.solve
     options = StepOptions(
@@ -134,7 +135,7 @@ def step(
         one_step=solve.newton == "one_step",
         differentiable=differentiable,
     )
-    # With inertia the solve starts after a motion at constant velocity. A one-step solve starts at x (book chapter).
+    # With inertia the first guess is a motion at constant velocity. A one-step solve starts at x (book chapter).
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
     problem = problem_of(e)

@@ -3,9 +3,9 @@
 The physics of the scene determine the method. Conjugate gradients solve symmetric systems, after nodal pressures are
 eliminated. BiCGSTAB solves two other kinds of systems: systems with follower loads or friction, which are not
 symmetric, and systems with pressures as unknowns, which have a non-symmetric preconditioner. The preconditioner
-consists of the inverse diagonal blocks. A coarse space, with few unknowns for long waves, is added if long waves would
-need many iterations. Columns (V,) are the x, y and z components of a nodal vector in separate arrays. A flat vector
-(3 V,) contains the columns one after the other.
+consists of the inverse diagonal blocks. A coarse space, with few unknowns for motions of long wavelength, is added if
+these motions would need many iterations. Columns (V,) are the x, y and z components of a nodal vector in separate
+arrays. A flat vector (3 V,) contains the columns one after the other.
 """
 
 from collections.abc import Callable, Sequence
@@ -56,7 +56,7 @@ Kind = str | tuple[str, jax.Array]
 
 
 def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
-    """Call `make` with the kind. If the kind is chosen at run time, the compiled program contains both kinds."""
+    """Return `make(kind)`. If the kind is chosen at run time, the compiled program contains both kinds."""
     if isinstance(kind, str):
         return make(kind)
     name, taken = kind
@@ -138,7 +138,7 @@ def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -
 
 
 def _shift(e: Equations) -> jax.Array | None:
-    """Stiffness (V,) [N/m] that acts on every node and limits long waves, or None."""
+    """Stiffness (V,) [N/m] that acts on every node (inertia), or None if there is no such stiffness."""
     own = [a.stiffness() for a in e.nodal if a.everywhere]
     return own[0][0][0] if own and own[0] is not None else None
 
@@ -222,8 +222,8 @@ def _thin(e: Equations) -> bool:
 def _slow_pressures(e: Equations, K: Tangent) -> Coarse:
     """Coarse space of the pressures, after approximate elimination of the displacements.
 
-    In a layer between plates, pressures that vary slowly along the layer cause much smaller displacements than their
-    mass matrix suggests.
+    In a layer between plates, pressures that vary slowly along the layer cause much smaller displacements than the
+    mass matrix of the pressures suggests.
     """
     motions, volume = _motions(e, K), e.mixed
 
@@ -243,7 +243,7 @@ def _true(kind: Kind, dtype: Any) -> jax.Array:
 #: Matrix, inverse and vertices of a `Tangent`, the matrix for its coarse space, and elements between nodes.
 _Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Between, ...]]
 
-# The functions below occur several times in a program. With jit they are traced once.
+# The functions below are called several times in a compiled program. With jit, JAX evaluates them only once.
 
 
 @partial(jax.jit, static_argnames="name")
@@ -324,7 +324,7 @@ def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number
 
 
 def _of_vertices(e: Equations) -> Free:
-    """Free directions of the vertices."""
+    """Return the free directions of the vertices."""
     V, (mask, normals) = e.mesh.number_of_vertices, e.free[:2]
     return Free(mask[:V], None if normals is None else normals[:V])
 
@@ -373,7 +373,8 @@ def _motions(e: Equations, K: Tangent) -> Callable:
 
 
 def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[jax.Array], jax.Array]:
-    """Preconditioner as a function of flat vectors, from `motions` for columns (V,), with pressure unknowns if any."""
+    """Preconditioner as a function of flat vectors, made from `motions`, the preconditioner of the displacements for
+    columns (V,). Pressures that are unknowns belong to the flat vectors."""
     if e.mixed is None:
         return lambda r: flat_free(e, motions(block_matrix.columns(r)))
     volume, n = e.mixed, 3 * e.mesh.number_of_nodes
@@ -428,7 +429,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 def with_nodal_products(
     e: Equations, K: Tangent, motion: Sequence[jax.Array], force: Sequence[jax.Array]
 ) -> tuple[jax.Array, ...]:
-    """Add to `force` the forces of elements between nodes and of follower loads due to `motion`; columns (V,)."""
+    """Add to `force` the forces of elements between nodes and of follower loads due to `motion`, all as columns."""
     for own in K.attached:
         force = block_matrix.sums(force, attached.product(own, motion))
     following = [a for a in e.nodal if not a.conservative]
@@ -460,7 +461,7 @@ def solve(
 def _one_of_both(
     e: Equations, K: Tangent, flag: jax.Array, b: jax.Array, limits: tuple[Number, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve K dq = b, with pressures eliminated if `flag` is true. The other solve has the load 0 and ends at once."""
+    """Solve K dq = b, with pressures eliminated if `flag` is true. The unused solve has the load 0 and ends at once."""
     n, A, motions = 3 * e.mesh.number_of_nodes, K.matrix, _motions(e, K)
     assert isinstance(A, PointMatrix)
 

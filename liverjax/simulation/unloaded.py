@@ -43,10 +43,12 @@ class Unloaded(NamedTuple):
 
 
 def unload(scene: Scene) -> Unloaded:
-    """Find the reference shape, as `liverjax.simulation.run.unloaded`, for a scene that is ready to run.
+    """Find the reference shape of a scene that is already prepared for its run.
+
+    `liverjax.simulation.run.unloaded` does the same, but also checks and prepares the scene.
 
     Raises:
-        InputError: no reference shape was found. If numbers are traced, nothing is raised.
+        InputError: no reference shape was found. Inside jit, grad or vmap no error is raised.
     """
     points, code, relative = _found_shape(resting(scene))
     if not isinstance(code, jax.core.Tracer) and int(code) != status.CONVERGED:
@@ -60,7 +62,7 @@ def unload(scene: Scene) -> Unloaded:
 
 
 def resting(scene: Scene) -> Scene:
-    """The scene of the same body after a long time under the loads of time 0: static and fully relaxed."""
+    """Return the scene of the same body after a long time under the loads of time 0: static and fully relaxed."""
     if scene.springpots is not None:
         scene = replace(scene, viscosity=series_at_rest(scene.springpots), springpots=None)
     law = scene.law
@@ -117,7 +119,8 @@ def _reference_shape(mesh: TetMesh, given: jax.Array, e: Equations, z: jax.Array
 
 
 def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
-    """Equations of the body with the reference shape that belongs to z, and the unknowns of its loaded positions."""
+    """Return the equations of the body with the reference shape that belongs to z, and the unknowns of the loaded
+    body."""
     n = 3 * scene.mesh.number_of_nodes
     still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)
     mesh = _reference_shape(scene.mesh, given, still, z)

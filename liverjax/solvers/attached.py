@@ -27,7 +27,10 @@ class GivesWay(NamedTuple):
 
 
 class Masses(NamedTuple):
-    """Consistent minus lumped mass matrices of the elements, or the stiffness of this difference in a time step."""
+    """For each element: the consistent minus the lumped mass matrix, or this difference times k/dt^2.
+
+    The product with k/dt^2 is its term in the effective stiffness of a time step (k of `liverjax.physics.inertia`).
+    """
 
     nodes: jax.Array  # (n, E)
     signs: jax.Array  # (n, E) 1, or -1 for a shape function with reversed direction
@@ -40,7 +43,7 @@ Between = Attached | GivesWay | Masses
 
 
 def masses(mesh: TetMesh, matrix: np.ndarray, size: jax.Array) -> Masses:
-    """Make `Masses`: the matrix (n, n), the same for all elements, times one number `size` for each element (E,)."""
+    """Return `Masses`: a matrix (n, n), the same for all elements, times one number `size` for each element (E,)."""
     nodes = jnp.stack(mesh.element_nodes)
     signs = mesh.oriented(jnp.ones((len(nodes), 1, nodes.shape[1]), size.dtype))[:, 0]
     return Masses(nodes, signs, jnp.asarray(matrix, size.dtype), size)
@@ -93,7 +96,7 @@ def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -
 
 
 def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
-    """Restrict the elements to motions linear along edges: a midside node moves by the mean of the two edge ends."""
+    """Restrict the elements to motions that are linear along edges: a midside node moves by the mean of its edge."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     edge = jnp.clip(A.nodes - V, 0, low.shape[0] - 1)
     is_vertex = A.nodes < V

@@ -32,9 +32,8 @@ class BlockMatrix(NamedTuple):
 def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
     """Assemble the blocks between nodes and their neighbours, m x m arrays (W, V).
 
-    They are sums of the element blocks of `PAIRS`, m x m arrays (E,).
-
-    An entry that is None in all element blocks stays None.
+    Each block is the sum of the element blocks of `PAIRS`, m x m arrays (E,). An entry that is None in all element
+    blocks stays None.
     """
     pattern: Pattern = mesh.pattern
     m = len(blocks[PAIRS[0]])
@@ -94,7 +93,8 @@ def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None =
     """Invert the 3 x 3 diagonal blocks. Directions with `mask` (V, 3) equal to 0 get unit rows.
 
     If a block is not positive definite, its mean absolute diagonal entry is inverted instead. `normals` (V, 3) are unit
-    vectors or 0. Nodes do not move along them; in this direction a block is replaced by the mean of its diagonal.
+    vectors or 0. Nodes do not move along their normals. So the coupling of a block with the normal direction is
+    removed, and the entry along the normal becomes the mean of the block's diagonal (see `_across`).
     """
     if normals is not None:
         diagonal = _across(diagonal, normals)

@@ -40,7 +40,7 @@ def inverses(
         clusters: clusters of the mesh, or None if the mesh has no clusters.
         entries: blocks (n, 3, 3) of the matrix, one for each entry of `clusters.sources`.
         diagonal: diagonal blocks of the matrix, 3 x 3 arrays (V,).
-        mask: (V, 3) 1 where free, else 0.
+        mask: (V, 3) 1 for free directions, else 0.
         single: inverse blocks of single nodes, 3 x 3 arrays (V,).
     """
     if clusters is None or entries is None:

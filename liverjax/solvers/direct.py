@@ -1,7 +1,7 @@
-"""Solve linear systems by sparse factorisation on the host, if they are too ill-conditioned for Krylov methods.
+"""Solve linear systems by sparse factorisation, if they are too ill-conditioned for Krylov methods.
 
-The factorisation is SciPy's SuperLU. Its time and memory grow faster than the number n of nodes (as n^1.5 to n^2), so
-it is suitable for bodies with a few thousand nodes.
+The factorisation is SciPy's SuperLU. It runs on the CPU, outside the compiled program. Its time and memory grow faster
+than the number n of nodes (as n^1.5 to n^2), so it is suitable for bodies with a few thousand nodes.
 """
 
 from functools import partial
@@ -32,7 +32,7 @@ def solve(
     """Solve A x = b (m, V) for a matrix of m x m blocks. Return x (m, V).
 
     x is 0 where `free` (m, V) is 0, and NaN if A is singular. `normals` (V, 3) are unit vectors or 0: the motion of
-    each node (the first three rows of x) has no component along its normal. `attached` is added to A.
+    each node (the first three rows of x) has no component along its normal. The matrices `attached` are added to A.
     """
     rows, diagonal = (jnp.stack([jnp.stack(row) for row in blocks]) for blocks in (A.rows, A.diagonal))
     shape = jax.ShapeDtypeStruct(b.shape, b.dtype)
@@ -48,7 +48,7 @@ def solve_points(
     normals: Number | None = None,
     attached: tuple[Between, ...] = (),
 ) -> jax.Array:
-    """Solve the linear system of quadratic elements. The arguments have the same meaning as in `solve`.
+    """Solve the linear system of quadratic elements, with the same arguments as `solve`.
 
     The result is a flat vector: the positions (3 V,), then the pressures of the vertices if A has pressures. `free` and
     `b` are pairs of arrays: for positions (3, V) and for pressures. An empty array for the pressures means that all
@@ -175,7 +175,7 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
 def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: tuple) -> np.ndarray:
     """Solve (A - H S^-1 H^T) x = b (n,). x is 0 where `free` (n,) is 0. `ways` contains H and the diagonal of S.
 
-    `along` contains the normals, along which x is 0 (or None), and the stiffness that replaces A along them.
+    `along` contains the normals (or None) and a stiffness. x is 0 along the normals. The stiffness replaces A there.
     """
     import scipy.sparse.linalg
 

@@ -1,4 +1,4 @@
-"""Preconditioned Krylov methods for use inside `jax.jit`. At the end they compute the true residual."""
+"""Preconditioned Krylov methods for use inside `jax.jit`. At the end, the methods compute the true residual."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -42,7 +42,7 @@ def conjugate_gradients(
 
     def step(c):
         x, r, p, rz_before, k, _ = c
-        z = precondition(r)  # the only call, so that the program contains it once
+        z = precondition(r)  # the only call, so that the compiled program contains it once
         rz = jnp.vdot(r, z)
         p = z + rz / rz_before * p
         Ap = matvec(p)
@@ -65,7 +65,7 @@ def chebyshev(
     bounds: tuple[Number, Number],
     degree: Number,
 ) -> jax.Array:
-    """Approximate A^-1 b by a polynomial in D^-1 A times D^-1 b (Saad 2003, 12.3).
+    """Approximate A^-1 b by a polynomial of the matrix D^-1 A, multiplied by D^-1 b (Saad 2003, 12.3).
 
     The approximation of A^-1 is symmetric and positive definite.
 
@@ -73,7 +73,7 @@ def chebyshev(
         matvec, diagonal: A and its diagonal D.
         bounds: lower and upper bound of the eigenvalues of D^-1 A. The error is at most 2 exp(-2 degree sqrt(low /
             high)).
-        degree: number of products with A; may be traced.
+        degree: number of products with A; may be unknown during compilation.
     """
     low, high = bounds
     theta, delta = (high + low) / 2, jnp.maximum((high - low) / 2, 1e-3 * high)
@@ -98,7 +98,7 @@ def stabilised_biconjugate_gradients(
 ) -> tuple[jax.Array, LinearStatistics]:
     """Solve A x = b for a matrix A that is not symmetric, by BiCGSTAB (van der Vorst 1992).
 
-    The arguments are those of `conjugate_gradients`. Each iteration needs two products with A.
+    The arguments are the same as for `conjugate_gradients`. Each iteration needs two products with A.
     """
     goal = tolerance * jnp.linalg.norm(b)
     one = jnp.ones((), b.dtype)
@@ -143,7 +143,7 @@ class Earlier(NamedTuple):
     def combined(self, b: jax.Array) -> jax.Array:
         """Linear combination (m,) of the earlier solutions that has the load closest to b (n,).
 
-        It is computed by Gram-Schmidt orthogonalisation of the loads, applied twice.
+        The method is Gram-Schmidt orthogonalisation of the loads, applied twice.
         """
 
         def add(c, pair):
@@ -169,11 +169,11 @@ class Earlier(NamedTuple):
 
 
 def no_earlier(load: jax.Array, solution: jax.Array) -> Earlier:
-    """Empty `Earlier` for loads and solutions of the same sizes as `load` and `solution`."""
+    """Return an empty `Earlier` (zeros) for loads and solutions of the same sizes as `load` and `solution`."""
     return Earlier(*(jnp.zeros((EARLIER, len(each)), each.dtype) for each in (load, solution)))
 
 
-#: A vector, and earlier solves.
+#: A pair: a vector, and earlier solves.
 WithEarlier = tuple[jax.Array, Earlier]
 
 
@@ -185,8 +185,8 @@ def symmetric_solve(
 ) -> WithEarlier:
     """Solve A x = b for a symmetric A. Return x, and the earlier solves with this solve added.
 
-    x is a linear function of b: its derivatives are also solves, in forward and in reverse mode. x is NaN if the
-    residual is too large (the bounds are those of `differentiable_solve`).
+    x is a linear function of b, so its derivatives are also solves, in forward and in reverse mode. x is NaN if the
+    residual is too large (same bounds as in `differentiable_solve`).
 
     Args:
         matvec: function (x, earlier) -> (A x, the same earlier).
@@ -259,9 +259,10 @@ def differentiable_solve(
 ) -> jax.Array:
     """Solve A x = b as a linear function of `b`: derivatives are also solves, not derivatives of the iterations.
 
-    It uses conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. The solution is NaN if the true
-    residual is above 6e-6 |b| (float32: 1e-3) and above ten times the tolerance. With the `diagonal` D of a diagonally
-    dominant A, a residual below 4 eps |D x| is also accepted, because the rounding of x alone causes eps |D x|.
+    The method is conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. The solution is NaN if
+    the true residual is above 6e-6 |b| (float32: 1e-3) and above ten times the tolerance. With the `diagonal` D of a
+    diagonally dominant A, a residual below 4 eps |D x| is also accepted, because the rounding of x alone causes a
+    residual of eps |D x|.
     """
     symmetric, solver, diagonal = known
     method = conjugate_gradients if symmetric else stabilised_biconjugate_gradients

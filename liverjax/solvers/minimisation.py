@@ -11,7 +11,7 @@ positions, the solution is a minimum. So only positions are varied, and the pres
 quadratic elements the pressures are eliminated from a tangent without negative eigenvalues, so that the tangent is
 positive.
 
-Forces without an energy, for example friction, are held constant during an iteration. So they have an energy during
+Forces without an energy, for example friction, are held constant during an iteration, so that they have an energy in
 this iteration. At the beginning of the iteration, the gradient of the total energy is the residual.
 """
 
@@ -23,7 +23,8 @@ import jax.numpy as jnp
 from liverjax.core import status
 from liverjax.solvers.problem import LINEAR_TOLERANCE, MOST_LINEAR_ITERATIONS, Potential, Problem, StepOptions
 
-#: Required decrease of the energy / decrease that its derivative predicts (Armijo; Nocedal and Wright 2006, 3.1).
+#: Required decrease of the energy, divided by the decrease that its derivative predicts (Armijo; Nocedal and Wright
+#: 2006, 3.1).
 _FALL = 1e-4
 #: A relative difference of energies below this multiple of the precision is roundoff. Then the residual must decrease.
 _ROUNDOFF = 5e3
@@ -41,7 +42,7 @@ _UNTANGLED = 1e-4
 
 
 class Minimum(NamedTuple):
-    """Last iterate of the minimisation."""
+    """Result of a minimisation: the last iterate."""
 
     q: jax.Array
     code: jax.Array
@@ -97,7 +98,10 @@ def _settled(problem: Problem, q: jax.Array) -> jax.Array:
 
 
 def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Try to find unknowns near `start` without inverted elements. Return them, and both numbers of iterations."""
+    """Try to find unknowns near `start` without inverted elements.
+
+    Return the unknowns, the number of iterations and the number of linear iterations.
+    """
     zero, potential = jnp.zeros((), jnp.int32), _potential(problem)
     surrogate = potential.surrogate
     if surrogate is None:
@@ -151,7 +155,7 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
 
 
 def _length(problem: Problem, c: _Descent, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
-    """Return the first factor 1, 1/2, 1/4, … on dq that reduces the energy; 0 if none reduces it."""
+    """Return the first factor t among 1, 1/2, 1/4, … for which q + t dq has less energy than q; 0 if there is none."""
     one, size = jnp.ones((), c.q.dtype), jnp.linalg.norm(c.r)
 
     def good(t):

@@ -25,16 +25,16 @@ class NewtonStatistics(NamedTuple):
     status: jax.Array
     iterations: jax.Array
     linear_iterations: jax.Array
-    residual: jax.Array  # |r| / scale at the returned point
+    residual: jax.Array  # |r| divided by the given scale, at the returned point
 
 
 class NewtonOptions(NamedTuple):
     """Tolerances and limits. All except the tolerance are fixed in the compiled program."""
 
-    tolerance: float = 1e-8  # of |r|, relative to the given scale
+    tolerance: float = 1e-8  # upper bound of |r|, relative to the given scale
     max_iterations: int = 25
-    linear_tolerance: float = 1e-4  # of each Newton step
-    adjoint_tolerance: float = 1e-10  # of the solves for derivatives
+    linear_tolerance: float = 1e-4  # tolerance of the linear solve in each Newton step
+    adjoint_tolerance: float = 1e-10  # tolerance of the solves for derivatives
     max_linear_iterations: int = 2000
     max_halvings: int = 10
     symmetric: bool = True  # whether the derivative is symmetric; if not, BiCGSTAB solves the linear systems
@@ -50,8 +50,8 @@ def newton_root(
     """Find a root of `residual`, a function of a flat vector (n,).
 
     Args:
-        residual: the function may use traced parameters. The derivatives of the root with respect to these parameters
-            are exact (implicit function theorem with the true tangent).
+        residual: the function may use parameters of the scene. The derivatives of the root with respect to these
+            parameters are exact (implicit function theorem with the true tangent).
         start: first guess, without derivatives.
         precondition: approximate inverse of the tangent, without derivatives.
         scale: force [N]; the tolerance is relative to this force.
@@ -86,7 +86,7 @@ class _Iterate(NamedTuple):
 def _halving_newton(residual, start, precondition, scale, options):
     """Run Newton's method. A step is halved if |r| does not decrease.
 
-    The program contains residual and tangent only once, so it compiles twice as fast.
+    The compiled program contains residual and tangent only once, so the compilation is twice as fast.
     """
     goal = options.tolerance * scale
     method = conjugate_gradients if options.symmetric else stabilised_biconjugate_gradients

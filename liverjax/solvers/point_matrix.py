@@ -1,9 +1,9 @@
 """Symmetric matrices of quadratic elements, stored as blocks at their integration points.
 
 A matrix-vector product needs no assembled matrix. At every integration point, an element behaves like a linear element
-with other corners (`liverjax.mesh.shape_functions`). So its stiffness has 45 numbers per point. A product interpolates
-the motion to these corners, multiplies it by the blocks, and distributes the forces to the nodes. The second level of
-the preconditioner is an assembled matrix of linear elements on the vertices.
+with other corners (see `liverjax.mesh.shape_functions`). So its stiffness has 45 numbers per point. A product
+interpolates the motion to these corners, multiplies it by the blocks, and distributes the forces to the nodes. The
+second level of the preconditioner is an assembled matrix of linear elements on the vertices.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class PointMatrix(NamedTuple):
 
     blocks: dict[tuple[int, int], Matrix]  # for corners 1 <= a <= b <= 3, arrays (Q, E) [N/m]
     own: Block | None  # 3 x 3 arrays (V,) of forces at nodes; entries that are 0 are None
-    border: list[Vector] | None  # d volume of a point / d corners 1, 2, 3; arrays (Q, E) [m^2]
+    border: list[Vector] | None  # (Q, E) [m^2] derivatives of a point's volume with respect to corners 1, 2, 3
     pressures: BlockMatrix | None  # block of the vertex pressures [m^3/Pa]
 
 
@@ -100,7 +100,7 @@ def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
     """Diagonal blocks, 3 x 3 arrays (V,).
 
     The block of node a is the sum of c_ak K_kl c_al over elements, points and k, l = 1, 2, 3. c_ak is the derivative of
-    function a with respect to the barycentric coordinate k, minus that with respect to coordinate 0.
+    shape function a with respect to the barycentric coordinate k, minus its derivative with respect to coordinate 0.
     """
     c = basis(mesh.order).c
     slopes = c[:, 1:] - c[:, :1]

@@ -29,12 +29,12 @@ class Coarse(NamedTuple):
 def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coarse:
     """Make the coarse space of the leading m x m blocks of A.
 
-    Its inverse is 0 if `used` is false, or if the coarse matrix is not positive definite.
+    The stored inverse is 0 if `used` is false, or if the coarse matrix is not positive definite.
 
     Args:
         mesh: `TetMesh`.
         A: the matrix.
-        mask: (V, m) 1 where free, else 0. m is 3 for forces and 1 for a pressure.
+        mask: (V, m) 1 for free directions, else 0. m is 3 for forces and 1 for a pressure.
         used: whether the coarse space saves time (see `worthwhile`).
     """
     f, number = mesh.pattern.patch_functions, mesh.pattern.number_of_patches
@@ -74,7 +74,7 @@ def coarse_of_product(mesh: TetMesh, product: Callable[[jax.Array], jax.Array]) 
 
 
 def worthwhile(A: BlockMatrix, inertia: Any) -> jax.Array:
-    """Whether the coarse space saves time: true if the sum of `inertia` is less than 1/30 of that of the diagonal."""
+    """Whether the coarse space saves time: true if `inertia` is on average below 1/30 of the diagonal of A."""
     if inertia is None:
         return jnp.array(True)
     total = sum(jnp.sum(A.diagonal[r][r]) for r in range(3)) / 3

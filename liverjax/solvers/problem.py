@@ -22,21 +22,21 @@ class StepStatistics(NamedTuple):
     """Statistics of one step. Every field is an array; under vmap it has one entry for each run."""
 
     status: jax.Array
-    iterations: jax.Array  # Newton iterations of all parts of the load
+    iterations: jax.Array  # Newton iterations of all substeps
     linear_iterations: jax.Array
-    cuts: jax.Array  # how often a part of the load was halved
+    cuts: jax.Array  # how often a substep was halved
     residual: jax.Array  # |r| divided by the norm of all forces
 
 
 class StepOptions(NamedTuple):
     """Limits of the solver of a step. All except the tolerance are fixed in the compiled program."""
 
-    tolerance: float = 1e-8  # of |r|, relative to the norm of all forces
-    max_iterations: int = 25  # per part of the load
+    tolerance: float = 1e-8  # upper bound of |r|, relative to the norm of all forces
+    max_iterations: int = 25  # maximum number of Newton iterations per substep
     one_step: bool = False  # only one linear solve per step; its result has no correct derivatives
     max_halvings: int = 6
     max_cuts: int = 12
-    #: Whether derivatives are possible. Without them, tracing takes two thirds of the time.
+    #: Whether derivatives are possible. Without them, JAX prepares the compiled program in two thirds of the time.
     differentiable: bool = True
 
 
@@ -57,12 +57,12 @@ class Kept(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """Additional unknowns, for which `residual` solves at every q. A guess reduces the iterations of this solve."""
+    """Additional unknowns, for example fluid pressures. `residual` solves for them at every q, beginning at a guess."""
 
     before: jax.Array  # a guess at the beginning of the step
-    #: Function (q, s, guess) -> the additional unknowns at q.
+    #: Function (q, s, guess) -> values of the additional unknowns at q.
     solved: Callable[..., jax.Array]
-    #: Function (solution at a nearby q, factor on the usual tolerance) -> guess for `residual` and `solved`.
+    #: Function (solution at a nearby q, factor that multiplies the tolerance) -> guess for `residual` and `solved`.
     guess: Callable[[jax.Array, Number], tuple]
     #: Function (q, solution) -> r, and the residual of the equation of the additional unknowns. Both are differentiated
     #: together, so that no inner solve is differentiated. If dr/dq is symmetric, this joint derivative is symmetric.
@@ -73,22 +73,22 @@ class Problem(NamedTuple):
     """Equations of a step, and functions that solve the linear systems of these equations."""
 
     #: Function (q, s) -> (r, force, by). r is the residual (n,), `force` is the norm of all forces for the relative
-    #: residual, and `by` is data for `tangent`. The function may use traced parameters; derivatives are exact at the
-    #: root. With a `beside`, `by` is the solution for the additional unknowns, and a third argument is a guess for it.
+    #: residual, and `by` is data for `tangent`. Derivatives with respect to numbers in this function are exact at the
+    #: root. If there are additional unknowns (`beside`), `by` contains their values, and a third argument is a guess.
     residual: Callable[..., tuple[jax.Array, jax.Array, Any]]
     #: Function (q, s, by, near) -> any pytree that represents dr/dq. This tangent is used again while iterations
-    #: converge fast. `near` is None or a pair (flag, earlier tangent): the flag shows whether parts of this tangent can
-    #: be used.
+    #: converge fast. `near` is None or a pair (flag, earlier tangent). The flag shows whether parts of the earlier
+    #: tangent can be used.
     tangent: Callable[[jax.Array, jax.Array, Any, Any], Any]
-    #: (tangent, b, tolerance, max_iterations) -> (x with dr/dq x = b, iterations, whether dr/dq seems positive
-    #: definite).
+    #: Function (tangent, b, tolerance, max_iterations) -> (x, iterations, positive): x solves dr/dq x = b, and
+    #: `positive` shows whether dr/dq seems positive definite.
     solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array, jax.Array]]
     #: Function tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
-    #: For derivatives, if dr/dq is symmetric: (tangent, b, tolerance, max_iterations, earlier solves) -> solution with
-    #: the exact dr/dq, its load, and its residual divided by the norm of the load. With a `beside`, b and the solution
-    #: contain q and the additional unknowns (`Beside.lack`). The load is then what remains of b after the elimination
-    #: of the additional unknowns. None: derivatives use products with dr/dq.
+    #: Function for derivatives if dr/dq is symmetric: (tangent, b, tolerance, max_iterations, earlier solves) -> the
+    #: solution with the exact dr/dq, its load, and its residual divided by the norm of the load. If there are
+    #: additional unknowns (`beside`), b and the solution contain them as well as q. The load is then what remains of b
+    #: after the elimination of the additional unknowns. None: derivatives use products with dr/dq.
     adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
     #: Whether dr/dq is symmetric.
     symmetric: bool = True
@@ -109,19 +109,19 @@ class Problem(NamedTuple):
 class Potential(NamedTuple):
     """Energy of a step. It is minimised if Newton's method along the load fails."""
 
-    #: Function (q, start) -> energy. Its gradient at start is r(start, 1). Forces without an energy keep their values
-    #: at start.
+    #: Function (q, start) -> energy. The gradient of the energy at `start` is r(start, 1). Forces without an energy
+    #: keep their values at `start`.
     energy: Callable[[jax.Array, jax.Array], jax.Array]
-    #: As `Problem.tangent`, but without negative eigenvalues. If a fifth argument is false, the true tangent is
-    #: returned.
+    #: Function with the same arguments as `Problem.tangent`, for a tangent without negative eigenvalues. If a fifth
+    #: argument is false, the function returns the true tangent.
     definite: Callable[..., Any]
     #: Function (q, s) -> minimum volume ratio J of the elements, which is 0 or negative if elements are inverted.
     volume: Callable[[jax.Array, Any], jax.Array]
     #: The problem of the body with another law, with a finite energy in inverted elements. None if the law of the body
     #: already has such an energy.
     surrogate: Problem | None
-    #: A pair: unknowns from which the load is followed if the start is only a guess, and whether the start is a guess.
-    #: None: the start is never a guess.
+    #: A pair: unknowns of the reference shape, and whether the start of the step is only a guess. If it is a guess, the
+    #: load is followed from the reference shape. None: the start is never a guess.
     rest: tuple[jax.Array, jax.Array] | None
     #: Function q -> q with the optimal pressures for its positions; None if pressures are not unknowns.
     settled: Callable[[jax.Array], jax.Array] | None = None

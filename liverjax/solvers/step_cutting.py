@@ -1,10 +1,10 @@
-"""Newton's method along a load: the solution is followed from the last equilibrium, if necessary in parts of the load.
+"""Newton's method along a load: the solution is followed from the last equilibrium, if necessary in substeps.
 
 The residual r(q, s) contains the loads and prescribed motions at the beginning of the step for s = 0, and at its end
 for s = 1. Out-of-balance forces at the beginning (inertia, a fluid) are reduced linearly: r - (1 - s) r(start, 0) is 0
-at the beginning of the step. Every part ds begins with a linear solve, with the tangent at its beginning and the load
--(r + dr/ds ds). So a prescribed motion enters through the tangent and not as a jump. If a part fails, it is halved.
-Only the root at s = 1 is returned and differentiated.
+at the beginning of the step. A part of the load, from s to s + ds, is called a substep. Every substep begins with a
+linear solve, with the tangent at its beginning and the load -(r + dr/ds ds). So a prescribed motion enters through the
+tangent and not as a jump. If a substep fails, it is halved. Only the root at s = 1 is returned and differentiated.
 """
 
 from functools import partial
@@ -33,8 +33,8 @@ from liverjax.solvers.problem import (
 #: Then shorter steps do not help.
 _PRECISIONS, _ROUNDINGS = 4096, 8
 
-#: If the derivative of the residual can jump (kinks) and halving does not help, the full direction is taken, at most
-#: this many times per part. The tangent is different beyond a kink.
+#: If the derivative of the residual can jump (kinks) and halving does not help, the full direction is used, at most
+#: this many times per substep. The tangent is different beyond a kink.
 _LEAPS = 8
 
 #: A guess is not used if an element has less than this fraction of its volume: the guess may lead to a folded shape.
@@ -55,28 +55,28 @@ ROOT = "root"
 
 
 class _Point(NamedTuple):
-    q: jax.Array  # best point of the current part
+    q: jax.Array  # best point of the current substep
     size: jax.Array  # |r| there
     aim: jax.Array  # |load| for the last direction
     kept: Kept
     beside: jax.Array | None  # additional unknowns there (`Problem.beside`), or None
-    looser: jax.Array  # factor on the tolerance of the next solve for `beside`
+    looser: jax.Array  # factor that multiplies the tolerance of the next solve for `beside`
     indefinite: jax.Array  # whether the tangent of the last solve was not positive definite
     stale: jax.Array  # dq comes from a tangent that was made before q
     remake: jax.Array  # the next evaluation is at q again, for a new tangent
     dq: jax.Array
-    t: jax.Array  # factor on dq to try next
+    t: jax.Array  # the next trial point is q + t dq
     s: jax.Array
-    q_begin: jax.Array  # where the current part began
-    guessing: jax.Array  # the part began at the guess
+    q_begin: jax.Array  # unknowns at the beginning of the current substep
+    guessing: jax.Array  # the substep began at the guess
     unbalanced: jax.Array  # r at the step's beginning, 0 while guessing
     s_begin: jax.Array
     ds: jax.Array
-    launch: jax.Array  # the next evaluation is at the beginning of a part
-    first: jax.Array  # the next evaluation is the first of a part
-    iterations: jax.Array  # of the part
+    launch: jax.Array  # the next evaluation is at the beginning of a substep
+    first: jax.Array  # the next evaluation is the first of a substep
+    iterations: jax.Array  # number of iterations in this substep
     halvings: jax.Array
-    leaps: jax.Array  # full directions in this part although |r| did not decrease
+    leaps: jax.Array  # number of full directions in this substep although |r| did not decrease
     total: jax.Array
     linear: jax.Array
     cuts: jax.Array
@@ -85,7 +85,7 @@ class _Point(NamedTuple):
 
 
 def nothing_kept(problem: Problem, start: jax.Array) -> Kept:
-    """The empty `Kept` of the first step."""
+    """Return the empty `Kept` for the first step."""
     zero = jnp.zeros((), start.dtype)
     made = jax.eval_shape(lambda q: problem.tangent(q, zero, problem.residual(q, zero)[2], None), start)
     no, beside = jnp.array(False), None if problem.beside is None else problem.beside.before
@@ -109,9 +109,9 @@ def solve(
 
     `start` and `guess` have no derivatives.
 
-    Returns the root, the statistics, and the tangent for the next step. `kept` is the tangent of the last step, and
-    `near` is a nearby tangent for derivatives. If the problem has an `adjoint`, the `beside` of the result is
-    differentiated together with the root.
+    Returns the root, the statistics, and the `Kept` for the next step. The argument `kept` comes from the last step,
+    and `near` is a nearby tangent for derivatives. If the problem has an `adjoint`, the additional unknowns `beside` of
+    the result are differentiated together with the root.
     """
     start = jax.lax.stop_gradient(start)
     guess = predicted = None if guess is None else jax.lax.stop_gradient(guess)
@@ -173,7 +173,7 @@ def _with_derivative(
     tolerance: Number,
     near: Any,
 ) -> tuple[jax.Array, jax.Array | None, Earlier | tuple[()]]:
-    """Return the root q and `beside` with implicit derivatives, and solves with which the next derivative begins.
+    """Return the root q and `beside` with implicit derivatives, and the solves with which the next derivative begins.
 
     These solves must be carried from step to step. So they are treated as additional unknowns that are equal to `last`.
     Forward mode carries them to the next step, and reverse mode to the previous step.
@@ -268,8 +268,8 @@ def _robust(
 ) -> tuple[jax.Array, jax.Array]:
     """Follow the load. If this fails, or if elements are inverted at the beginning, minimise the energy.
 
-    Without inertia, a start that is not the reference shape is only a guess. If an element of the guess is nearly flat,
-    or if the guess leads to no solution, the load is followed from the reference shape.
+    Without inertia, a start that differs from the reference shape is only a guess. If an element of the guess is nearly
+    flat, or if the guess leads to no solution, the load is followed from the reference shape.
     """
     zero = jnp.zeros((), start.dtype)
     nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
@@ -338,17 +338,17 @@ def _first_point(
 class _Verdict(NamedTuple):
     """The decision that follows from the residual at a trial point."""
 
-    accepted: jax.Array  # the point is the best found in its part, or the beginning of a part
+    accepted: jax.Array  # the point is the best found in its substep, or the beginning of a substep
     better: jax.Array
-    converged: jax.Array  # at the end of a part
-    arrived: jax.Array  # at the end of the last part
+    converged: jax.Array  # at the end of a substep
+    arrived: jax.Array  # converged at the end of the last substep
     remake: jax.Array
     failed: jax.Array
     lost: jax.Array  # the guess leads to no solution: the last equilibrium is tried next, and no cut is counted
-    launch_now: jax.Array  # a new part begins at this point
+    launch_now: jax.Array  # a new substep begins at this point
     go_on: jax.Array  # a new direction is needed
     halvings: jax.Array
-    leap: jax.Array  # the full last direction is taken, even if |r| increases
+    leap: jax.Array  # the full last direction is used, even if |r| increases
     cuts: jax.Array
     done: jax.Array
 
@@ -357,7 +357,7 @@ def _judge(
     c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, problem: Problem, options: StepOptions
 ) -> _Verdict:
     finite = jnp.isfinite(size) & jnp.isfinite(relative)
-    # The first point of a part need not be better if its direction was computed with a new tangent.
+    # The first point of a substep need not be better if its direction was computed with a new tangent.
     free = c.first & (~c.stale | (size < c.aim))
     better = finite & ((size < c.size) | free | c.remake) & ~c.launch
     converged = better & (relative <= options.tolerance)
@@ -411,8 +411,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         load = load - jax.lax.cond(v.launch_now, lambda: ds * _along(problem, trial, s), lambda: jnp.zeros_like(r))
     slow = c.remake | (size > _CONTRACTION * c.aim)
     renew = (v.launch_now & (~c.guessing | ~c.kept.made)) | (v.go_on & ~v.launch_now & slow)
-    # The solve is not more accurate than is useful (Eisenstat and Walker 1996), or than the tolerance of the step
-    # needs.
+    # The solve is only as accurate as is useful (Eisenstat and Walker 1996), and as the tolerance of the step needs.
     ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
     reach = 0.3 * jnp.where(renew, ratio**2, ratio)
     goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
@@ -456,16 +455,17 @@ _BESIDE = 0.1
 
 
 def _looser(options: StepOptions, v: _Verdict, expected: jax.Array, before: jax.Array) -> jax.Array:
-    """Factor on the tolerance of the next solve for the additional unknowns, as large as the next residual allows.
+    """Return the factor that multiplies the tolerance of the next solve for the additional unknowns.
 
-    At the beginning of a part the next residual is unknown, so the factor is 1.
+    The factor is as large as the next residual allows. At the beginning of a substep this residual is unknown, so the
+    factor is 1.
     """
     wanted = jnp.maximum(1.0, _BESIDE * expected / options.tolerance)
     return jnp.where(v.failed | v.lost, 1.0, jnp.where(v.go_on, wanted, before)).astype(before.dtype)
 
 
 def _along(problem: Problem, q: jax.Array, s: jax.Array) -> jax.Array:
-    """Derivative dr/ds of the residual: the effect of loads and prescribed motions."""
+    """Derivative dr/ds of the residual with respect to the load fraction s, due to loads and prescribed motions."""
     return jax.jvp(lambda s: problem.residual(q, s)[0], (s,), (jnp.ones_like(s),))[1]
 
 
@@ -476,7 +476,8 @@ def _direction(
 
     Return dq, the number of iterations, the new `kept`, and whether dr/dq seems positive definite.
 
-    `when` contains two values: whether a new tangent is made, and whether a solution is needed.
+    `at` contains q, s and `by` (`Problem.residual`). `when` contains two values: whether a new tangent is made, and
+    whether a solution is needed.
     """
     near, (renew, wanted) = (kept.made & ~kept.worn, kept.tangent), when
     q, s, by = at

@@ -1,7 +1,7 @@
 """Deformation gradients and invariants. Every component is an array over the elements.
 
-A vector is a tuple of three arrays (E,), and a matrix is a tuple of three such rows. In this form XLA vectorises over
-the elements. It does not vectorise batched 3 x 3 products (tiny matrices, no fusion).
+A vector is a tuple of three arrays (E,), and a matrix is a tuple of three such rows (a tuple matrix). In this form XLA
+vectorises over the elements. XLA does not vectorise batched products of arrays (E, 3, 3).
 """
 
 from typing import Any, NamedTuple
@@ -30,12 +30,12 @@ class Invariants(NamedTuple):
 
 
 def dot(a: Vector, b: Vector) -> Any:
-    """Scalar product."""
+    """Scalar product a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """Vector product."""
+    """Vector product a x b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
@@ -103,7 +103,7 @@ def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
 
 
 def green_strain(FA: Matrix) -> Matrix:
-    """Green's strain E = (C - Id) / 2 in the axes A, from the product F A."""
+    """Green's strain E = (C - I) / 2 in the axes A (columns of a rotation), from the product F A."""
     C = right_cauchy_green(FA)
     return tuple(tuple(0.5 * (C[i][j] - (1.0 if i == j else 0.0)) for j in range(3)) for i in range(3))
 
@@ -134,7 +134,7 @@ def pack(A: Matrix) -> jax.Array:
 
 
 def stored(values: T) -> T:
-    """Return the same pytree, written to memory. A branch prevents XLA:CPU from computing it again for every use.
+    """Return the same pytree, stored in memory (RAM). A branch prevents XLA:CPU from computing it for every use.
 
     The leaves are numbers or arrays; at least one of them is not empty.
     """
@@ -145,7 +145,7 @@ def stored(values: T) -> T:
 
 
 def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
-    """F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3, because the shape vectors D of an element add up to zero.
+    """Deformation gradient F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3 (the shape vectors D add up to zero).
 
     The entries of F are (E,), or (Q, E) if elements have Q points (`TetMesh.edges`).
 

@@ -1,4 +1,4 @@
-"""Read array entries, or add to entries, at node or edge numbers. These numbers are valid and are not checked."""
+"""Read array entries, or add to entries, at node or edge numbers. The numbers must be valid; they are not checked."""
 
 import jax
 
@@ -11,5 +11,5 @@ def taken(values: jax.Array, places: Indices) -> jax.Array:
 
 
 def given(total: jax.Array, places: Indices, shares: jax.Array) -> jax.Array:
-    """Add `shares` to `total` (n, …) at `places`, whole numbers from 0 to n - 1; a place may occur several times."""
+    """Add `shares` to `total` (n, …) at `places`, whole numbers from 0 to n - 1. A number may occur several times."""
     return total.at[places].add(shares, mode="promise_in_bounds", wrap_negative_indices=False)

@@ -126,7 +126,7 @@ def _(left, primals, tangents):
 
 
 def power_sum(s: Stretches, alpha: Number) -> jax.Array:
-    """Sum over m of (J^(-1/3) lambda_m)^alpha, minus 3; without cancellation error in the undeformed state."""
+    """Sum over m of (J^(-1/3) lambda_m)^alpha, minus 3, without cancellation error near the undeformed state."""
     return _power_sum(jnp.asarray(alpha, jnp.result_type(s.log_J)), s.logs, s.change, s.log_J)
 
 
@@ -145,7 +145,7 @@ _PAIRS_OF_NODES = ((0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1))  # i, j of g[i, i, j]
 
 
 def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -> jax.Array:
-    """Expansion of the module docstring for (J^(-1/3) lambda)^alpha, differentiable with respect to alpha, X and ln J.
+    """Expansion of the module docstring for (J^(-1/3) lambda)^alpha, differentiable with respect to alpha, X, ln J.
 
     Divided differences of one kind are stacked in one array. So only a tenth of the operations is compiled.
     """
@@ -189,7 +189,8 @@ def divided_difference(p: Number, *logs: Number) -> jax.Array:
 
 
 def _divided_power(p: Any, y: list) -> Number:
-    """Divided difference of (1 + c)^p at three |c| < 0.11, by its binomial series, truncated at 0.11^16 = 5e-16."""
+    """Divided difference of (1 + c)^p at the three values c in y (|c| < 0.11), by the binomial series of the power,
+    truncated at 0.11^16 = 5e-16."""
     homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]  # complete homogeneous sums h_k of the nodes
     for node in y:
         for k in range(1, 16):

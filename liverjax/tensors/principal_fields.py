@@ -2,16 +2,17 @@
 
 import numpy as np
 
-#: Maximum size of the matrix of products. If rows and columns are both more, this number of evenly spaced rows is used.
+#: Maximum size of the matrix of products. If both rows and columns are more than this, only this number of
+#: evenly spaced rows is used.
 MOST_PRODUCTS = 6000
 
 
 def principal_fields(rows: np.ndarray, tolerance: float) -> np.ndarray:
     """Orthonormal fields (n, P) that represent rows (N, P) up to `tolerance` times the Frobenius norm of the rows.
 
-    They are computed from the eigenvectors of the matrix of scalar products between rows, or between columns if there
-    are fewer columns (Sirovich 1987). The products keep only half of the digits, so the minimum useful tolerance is
-    1e-7.
+    The fields are computed from the eigenvectors of the matrix of scalar products between rows, or between columns if
+    there are fewer columns (Sirovich 1987). The products keep only half of the digits, so the minimum useful tolerance
+    is 1e-7.
     """
     if min(rows.shape) > MOST_PRODUCTS:
         rows = rows[np.linspace(0, len(rows) - 1, MOST_PRODUCTS).round().astype(int)]

@@ -24,10 +24,10 @@ class Subsets(NamedTuple):
 
 
 def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
-    """Make subsets: first the elements without a group, if any, then each group.
+    """Return the subsets: first the elements without a group, if any, then each group.
 
     Args:
-        groups: element numbers (n,) of groups without common elements; they may be traced.
+        groups: element numbers (n,) of groups without common elements. Inside jit these numbers may be unknown.
         number_of_elements: E.
     """
     E = number_of_elements

@@ -1,5 +1,4 @@
-"""Cautions (warnings in one sentence) about a scene with harmonic motion. They are computed on the host, without JAX
-tracing."""
+"""Warnings about a scene with harmonic motion. They are computed from known numbers, outside jit, grad and vmap."""
 
 import jax
 import numpy as np
@@ -10,7 +9,8 @@ from liverjax.physics.contact.obstacle import Obstacle, touches_without_pressure
 from liverjax.scenes.scene import Scene, named_physics
 from liverjax.simulation.cautions import cautions_of_mesh, of_drained_layer, of_locking
 
-#: Minimum number of element edges per wavelength of a shear wave. With fewer, even quadratic elements show no wave.
+#: Minimum number of element edges per wavelength of a shear wave. With fewer edges, even quadratic elements cannot
+#: describe a wave.
 _LEAST_PER_WAVE = 2.0
 
 
@@ -19,12 +19,12 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
     motion.
 
     Args:
-        scene: `Scene`, not traced.
-        about: positions (V, 3) [m] about which the body vibrates. None means the reference shape.
+        scene: `Scene` with known numbers (not inside jit, grad or vmap).
+        about: positions (V, 3) [m] about which the body vibrates; None: the reference shape.
     """
     said = [*cautions_of_mesh(scene.mesh), *of_locking(scene)]
     if scene.body is None:
-        said.append("the scene has no [body], so the motion has no inertia: write density = 1060.0 in [body]")
+        said.append("the scene has no [body], so the body has no inertia: write density = 1060.0 in [body]")
     inlets = () if scene.porosity is None else scene.porosity.inlet
     if not scene.displaced and not scene.traction and not inlets:
         said.append("the scene has no excitation: give amplitudes as [[displaced]] or [[traction]]")
@@ -32,13 +32,13 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
     for name, physics in named_physics(scene):
         if isinstance(physics, Ligament) and physics.is_straight_without_tension(scene.mesh, x):
             said.append(
-                f"{name} is straight but has no tension. A ligament can only pull, but here it acts as a spring in "
-                "both directions"
+                f"{name} is straight but has no tension. A real ligament can only pull, but in harmonic motion "
+                "this one also pushes"
             )
         if isinstance(physics, Obstacle) and touches_without_pressure(physics, scene.mesh, x):
             said.append(
-                f"{name} touches the body without pressure. An obstacle can only push, but here it holds the body in "
-                "both directions"
+                f"{name} touches the body without pressure. A real obstacle can only push, but in harmonic "
+                "motion this one also pulls"
             )
     if scene.solve.frequencies is None:
         return said
@@ -55,7 +55,7 @@ def _of_short_waves(scene: Scene, hertz: float) -> list[str]:
         return []
     try:
         shear = float(np.median(np.asarray(scene.law.shear_modulus())))
-    except InputError:  # not every law states its shear modulus
+    except InputError:  # some laws state no shear modulus
         return []
     low, high = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.pattern.edges)]
     edge = float(np.median(np.linalg.norm(high - low, axis=1)))
@@ -63,6 +63,6 @@ def _of_short_waves(scene: Scene, hertz: float) -> list[str]:
     if length >= _LEAST_PER_WAVE * edge:
         return []
     return [
-        f"at {hertz:.3g} Hz shear waves are about {length:.2g} m long, and the edges of the elements {edge:.2g} m: the "
-        "mesh is too coarse for these waves. Use a finer mesh, or lower frequencies (see --mesh-error)"
+        f"at {hertz:.3g} Hz shear waves are about {length:.2g} m long, and the edges of the elements are {edge:.2g} m "
+        "long. The mesh is too coarse for these waves: use a finer mesh, or lower frequencies (see --mesh-error)"
     ]

@@ -27,7 +27,7 @@ from liverjax.waves.operator import Operator, free_part, operator
 from liverjax.waves.rest import under_its_weight, without_history
 
 MASSES = ("consistent", "lumped")
-#: Settings of [solve] for which the equations of one instant are set up, without time.
+#: Settings of [solve] with which the equations of static equilibrium are set up.
 _STILL: Content = {
     "kind": "static",
     "frequencies": None,
@@ -40,17 +40,17 @@ _STILL: Content = {
 
 @struct
 class Harmonic:
-    """Amplitudes of small motion at F frequencies: the displacement is the real part of u exp(i omega t)."""
+    """Complex amplitudes of a small motion at F frequencies. The displacement is the real part of u exp(i omega t)."""
 
     frequencies_Hz: jax.Array = param("Hz", "(F,)")
     displacement: jax.Array = param("m", "u, complex (F, V, 3)")
-    reactions: jax.Array = param("N", "complex (F, V, 3), force of the support on the body at constrained nodes")
+    reactions: jax.Array = param("N", "complex (F, V, 3), forces on the body at constrained nodes")
     residual: jax.Array = param("1", "(F,) out-of-balance forces at free nodes, divided by the size of all forces")
     pressure: jax.Array | None = param("Pa", "complex (F, V), fluid pressure in a porous scene", default=None)
 
     def check(self) -> "Harmonic":
-        """Return the result itself. Raise `RuntimeError` with advice if a frequency has no solution. Call it on the
-        host."""
+        """Return the result itself. Raise `RuntimeError` with advice if a frequency has no solution. Do not call this
+        function inside jit, grad or vmap."""
         wrong = np.flatnonzero(~(np.asarray(self.residual) < 1e-6))
         if wrong.size:
             raise RuntimeError(
@@ -68,32 +68,32 @@ def harmonic(
     motion: Number | None = None,
     mass: str = "consistent",
 ) -> Harmonic:
-    """Compute the small harmonic motion of the scene, caused by its tractions, prescribed motions and inlets.
+    """Compute the small harmonic motion that is caused by the tractions, prescribed motions and inlets of the scene.
 
     The values of these loads are amplitudes. Law, viscosity, porosity, density, gravity, supports, fixed nodes and
     regions are included. Time steps and histories have no effect. An obstacle stays at its position at time 0. The
-    function may be differentiated in both modes and jitted. Every derivative needs one more solve per frequency,
-    without a new factorisation.
+    function works inside jit and in both modes of differentiation. A derivative needs one more solve per frequency.
 
     Args:
         scene: `Scene`. The motion of `displaced` is an amplitude with phase 0.
         frequencies_Hz: (F,), above 0; default: the frequencies of scene.solve.
-        factors: G*/G0, the complex factor of the part of the stress that relaxes, (F,), or (F, E) with one value for
-            each element. Default: the factor 1 - sum g_k/(1 + i omega tau_k) of the scene's Prony series, or the factor
-            of its springpots; 1 without viscosity. Nodal pressures (volumetric "mixed" or "nodal", or a porous body) do
-            not relax.
-        about: positions (V, 3) [m] of a long-time equilibrium, for example from `simulate`. The stress in this state
-            changes the stiffness; the fluid pressure is 0. Default: the state of rest under gravity, from a static run,
-            or the reference shape without gravity. A traced gravity always causes this run, unless `about` is given.
-        motion: complex amplitudes of the prescribed motion (V, 3) or (F, V, 3) [m]. They replace those of the scene.
+        factors: complex factors G*/G0 that multiply the relaxing part of the stress, (F,), or (F, E) with one value for
+            each element. Default: 1 - sum g_k/(1 + i omega tau_k) with the ratios g_k and relaxation times tau_k of the
+            scene's Prony series, or the factor of its springpots; 1 without viscosity. Nodal pressures (volumetric
+            "mixed" or "nodal", or a porous body) do not relax.
+        about: positions (V, 3) [m] about which the body vibrates: an equilibrium after a long time, for example from
+            `simulate`. The stress in this state changes the stiffness; the fluid pressure is 0. Default: the state of
+            rest under gravity and pre-tension, from a static run. Without both, this run is not done and the reference
+            shape is used. If the numbers of gravity are unknown (inside jit, grad or vmap), the run is always done.
+        motion: complex amplitudes (V, 3) or (F, V, 3) [m] that replace the prescribed motion of the scene.
         mass: "consistent" (mass matrix of each element), or "lumped" as in transient runs.
 
     Returns:
         `Harmonic`. The result is NaN at a frequency with a singular matrix.
 
     Raises:
-        InputError: parts of the scene have no harmonic motion here (pressures that follow the surface, friction, rigid
-            plates); shapes or values cannot be used; there is no state of rest under gravity.
+        InputError: the scene contains something that is not implemented for harmonic motion (pressures that follow the
+            surface, friction, rigid plates); shapes or values cannot be used; there is no state of rest under gravity.
     """
     weighed = scene
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
@@ -110,7 +110,7 @@ def harmonic(
         motion = prescribed(mesh, tuple(replace(d, times=None, history=None) for d in scene.displaced), 0.0, 1.0)
     motion = jnp.asarray(motion, complex)
     if motion.shape not in (mesh.points.shape, (number, *mesh.points.shape)):
-        raise InputError(f"motion has shape {motion.shape}: give {mesh.points.shape}, or this for each frequency")
+        raise InputError(f"motion has shape {motion.shape}: give {mesh.points.shape}, or one such array per frequency")
     if about is not None and scene.porosity is not None and not _drains(scene.porosity):
         raise InputError(
             "a loaded state (gravity, about) does not determine the pressure in a porous body that cannot drain: give "
@@ -123,10 +123,11 @@ def harmonic(
 
 
 def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "consistent") -> Operator:
-    """Return the dynamic stiffness of each element as in `harmonic`, for programs that build other equations with it.
+    """Return the dynamic stiffness that `harmonic` uses, as element matrices. Other programs can build their own
+    equations from these matrices.
 
     Args:
-        scene, about, mass: as in `harmonic`.
+        scene, about, mass: the same arguments as for `harmonic`.
     """
     small = _small(scene, mass)
     return _operator(small, under_its_weight(scene) if about is None else about, mass)
@@ -145,7 +146,8 @@ def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
 
 @partial(jax.jit, static_argnames="mass")
 def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, about: Any, mass: str) -> Harmonic:
-    """Return motion, reactions and residuals. `at`: factors G*/G0 and angular frequencies [rad/s]."""
+    """Solve the equations, and return motion, reactions and residuals. `at`: factors G*/G0 and angular frequencies
+    [rad/s]."""
     A, omegas = _operator(scene, about, mass), at[1]
     held, load = _prescribed_and_loads(A, omegas, motion, nodal_tractions(scene.mesh, scene.traction))
     moved = sparse.motions(A, *at, jax.tree.map(jnp.subtract, load, sparse.at_every(A, *at, held)))
@@ -154,7 +156,7 @@ def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, ab
     out, unbalanced = jax.vmap(lambda *m: free_part(A, m))(f, balance)
     residual = _part(out, jnp.abs(f - out) + jnp.abs(load[0]))
     if unbalanced is not None and p is not None:
-        # The scale is the change of volume at the nodes of the pressures, or the fluid that enters.
+        # The residual is divided by the change of volume at the nodes of the pressures, or by the fluid that enters.
         taken: Any = sparse.at_every(A, *at, (u, jnp.zeros_like(p)))[1]
         residual = jnp.maximum(residual, _part(unbalanced, jnp.abs(taken) + jnp.abs(load[1])))
     return Harmonic(
@@ -169,7 +171,8 @@ def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, ab
 def _prescribed_and_loads(
     A: Operator, omegas: jax.Array, motion: jax.Array, traction: jax.Array
 ) -> tuple[sparse.Motions, Any]:
-    """Return the prescribed amplitudes and the loads at every frequency."""
+    """Return (prescribed amplitudes of displacements and pressures, right-hand sides of the equations), both at every
+    frequency."""
     number, own = len(omegas), A.pressures
     held = (1 - A.free.mask)[None] * motion
     force = jnp.broadcast_to(jnp.asarray(traction, complex)[None], motion.shape)
@@ -181,7 +184,8 @@ def _prescribed_and_loads(
 
 
 def _part(out: jax.Array, work: jax.Array) -> jax.Array:
-    """Return the norms (F,) of the out-of-balance forces, divided by the norms of all forces."""
+    """Return the relative residuals (F,): norms of the out-of-balance forces `out`, divided by the norms of all forces
+    `work`."""
     sizes = [jnp.linalg.norm(a.reshape(len(a), -1), axis=1) for a in (out, work)]
     return sizes[0] / jnp.where(sizes[1] > 0, sizes[1], 1.0)
 
@@ -201,7 +205,7 @@ def _frequencies(frequencies_Hz: Any) -> jax.Array:
 
 
 def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
-    """Return the factors G*/G0 (F,), or (F, E), of the scene's viscosity."""
+    """Return the complex factors G*/G0 of the scene's viscosity, (F,), or (F, E) with one value for each element."""
     prony = scene.viscosity
     if prony is None:
         return jnp.ones(omegas.shape, complex)
@@ -212,18 +216,19 @@ def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
 
 
 def _drains(porosity: Porosity) -> bool:
-    """Return whether fluid can leave the porous body somewhere, at a boundary with a given pressure."""
+    """Return whether fluid can leave the porous body: whether the pressure is given at some nodes."""
     return porosity.drained is not None or any(inlet.nodes is not None for inlet in porosity.inlet)
 
 
 def _small(scene: Scene, mass: str) -> Scene:
-    """Return the scene without time and gravity, for small motion. Raise InputError for parts without small motion."""
+    """Return the scene without time and gravity. Raise InputError if it contains something that is not implemented for
+    harmonic motion."""
     if mass not in MASSES:
         raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
     if scene.points_are == "loaded":
         raise InputError(
-            '[mesh] is = "loaded" cannot be used in harmonic motion: use the scene of lj.unloaded(scene), and the last '
-            "positions of its run as about"
+            '[mesh] is = "loaded" cannot be used in harmonic motion: use the scene of lj.unloaded(scene), and '
+            "give the last positions of its run as the argument about"
         )
     if any(isinstance(physics, RoughObstacle | PressedObstacle) for physics in scene.physics):
         raise InputError(

@@ -1,5 +1,5 @@
-"""Mesh error of harmonic motion. The same problem is solved again with shape functions of the next higher order, or on
-a refined mesh."""
+"""Estimate of the mesh error of harmonic motion. The same problem is solved again with shape functions of the next
+higher order, or on a refined mesh."""
 
 from functools import partial
 
@@ -20,10 +20,10 @@ from liverjax.waves.rest import under_its_weight
 
 @struct
 class HarmonicError:
-    """Estimated error of the amplitudes: amplitude on an infinitely fine mesh minus computed amplitude."""
+    """Estimated errors of the amplitudes: amplitude on an infinitely fine mesh minus computed amplitude."""
 
     displacement: jax.Array = param("m", "complex (F, V, 3)")
-    reactions: jax.Array = param("N", "complex (F, V, 3); add them over the nodes of each support")
+    reactions: jax.Array = param("N", "complex (F, V, 3); add the errors over the nodes of each support")
     pressure: jax.Array | None = param(
         "Pa", "complex (F, V), pressure of the fluid; None without fluid, or if the error is unknown", default=None
     )
@@ -38,7 +38,7 @@ def harmonic_mesh_error(
 ) -> jax.Array:
     """Return the estimated mesh error of the displacements, complex (F, V, 3) [m].
 
-    The arguments are those of `harmonic_errors`, which also returns the errors of reactions and pressures.
+    The arguments are the same as for `harmonic_errors`, which also returns the errors of reactions and pressures.
     """
     return harmonic_errors(scene, found, factors, about, motion).displacement
 
@@ -52,18 +52,18 @@ def harmonic_errors(
 ) -> HarmonicError:
     """Estimate the errors of the amplitudes that are due to the mesh.
 
-    Linear elements are replaced by quadratic ones, and quadratic elements by cubic ones. The new mesh has about eight
-    times (linear elements) or three times (quadratic elements) as many unknowns, with a corresponding cost. If there
-    are too few elements per wavelength, the phase is wrong, and the error is as large as the motion. The pressures of a
-    fluid are linear in all elements. So a scene with a fluid is solved again, if possible, on a mesh with every element
-    divided into eight, and the estimate is 4/3 of the change.
+    Linear elements are replaced by quadratic ones, and quadratic elements by cubic ones. The new problem has about
+    eight times (linear elements) or three times (quadratic elements) as many unknowns, and costs correspondingly more.
+    If there are too few elements per wavelength, the phase of the motion is wrong, and the error is as large as the
+    motion. The pressures of a fluid are linear in all elements. So a scene with a fluid is solved again, if possible,
+    on a mesh where every element is divided into eight. Then the estimated error is 4/3 of the change of the result.
 
     Args:
-        scene, factors, about, motion: as in `harmonic`.
-        found: result of `harmonic`.
+        scene, factors, about, motion: the arguments with which `harmonic` was called.
+        found: the result of `harmonic`.
 
     Raises:
-        InputError: the scene has another mesh than the result, or `harmonic` cannot be used for the scene.
+        InputError: the mesh of the scene is not the mesh of the result, or `harmonic` cannot be used for the scene.
     """
     nodes = scene.mesh.number_of_nodes
     if found.displacement.shape[1] != nodes:
@@ -92,7 +92,7 @@ def harmonic_errors(
 def _richer_elements(scene: Scene) -> Scene:
     rich = enriched(scene)
     if rich.mesh.order == 3:
-        # Cubic elements do not lock.
+        # Cubic elements do not lock, so they need no special treatment of the volume.
         return replace(rich, solve=replace(rich.solve, volumetric="element"))
     if scene.solve.volumetric == "nodal":
         return replace(rich, solve=replace(rich.solve, volumetric="mixed"))
@@ -100,7 +100,8 @@ def _richer_elements(scene: Scene) -> Scene:
 
 
 def _on_nodes(mesh: TetMesh, rich: TetMesh, within: Within | None, forces: jax.Array) -> jax.Array:
-    """Return forces (F, V, 3) on the nodes of the original mesh, from the forces on the richer mesh."""
+    """Return the forces (F, V, 3) [N] on the nodes of the original mesh that are equivalent to `forces` [N] on the
+    nodes of the mesh `rich`."""
     nodes = mesh.number_of_nodes
     if within is not None:
         return jax.vmap(lambda f: within.forces(f, nodes))(forces)
@@ -112,7 +113,7 @@ def _on_nodes(mesh: TetMesh, rich: TetMesh, within: Within | None, forces: jax.A
 
 
 def _padded(rich: TetMesh, within: Within | None, x: jax.Array) -> jax.Array:
-    """Return the field x (…, V, 3) on the richer mesh."""
+    """Return the nodal field x (…, V, 3) of the original mesh, interpolated to the nodes of the mesh `rich`."""
     if within is not None:
         return jnp.moveaxis(within.field(jnp.moveaxis(x, -2, 0)), 0, -2)
     if rich.order == 2:

@@ -1,16 +1,16 @@
 """Dynamic stiffness of small harmonic motion, K(omega) - omega^2 M, stored as element matrices.
 
-The body moves about a state x in which it has rested for a long time. Let S_h be the instantaneous elastic stress of
-the relaxing part. In the state x it has decreased to m_inf S_h, with m_inf = 1 - sum g_k and the ratios g_k of the
-Prony series. A small motion adds m(omega) times the change of S_h, with m = G*/G0. The tangent is divided into a
-material and a geometric part (superposed small motion: Lockett 1972, Nonlinear Viscoelastic Solids, chapter 7). The
-stiffness is
+The body moves about positions x, where it has been at rest for a long time. Let S_h be the instantaneous elastic stress
+of the relaxing part. At x this stress has relaxed to m_inf S_h, with m_inf = 1 - sum g_k and the ratios g_k of the
+Prony series. A small motion adds m(omega) times the change of S_h, where m = G*/G0 is the complex modulus divided by
+the instantaneous modulus. The tangent consists of a material and a geometric part (superposed small motion: Lockett
+1972, Nonlinear Viscoelastic Solids, chapter 7). The stiffness is
 
     K(omega) = m(omega) (K_h - K_geometric) + m_inf K_geometric + K_rest,
 
-with the tangent K_h of the elastic stress S_h and its geometric part K_geometric. K_rest is the stiffness that does not
-relax: of the volumetric part of the law if only the isochoric part relaxes, of a porous body, of supports, membranes
-and springs. Unknown pressures are in `liverjax.waves.pressures`.
+with the tangent K_h of the elastic stress S_h and the geometric part K_geometric of K_h. K_rest is the stiffness that
+does not relax: the stiffness of a porous body, supports, membranes and springs, and of the volumetric part of the law
+if only the isochoric part relaxes. Unknown pressures are treated in `liverjax.waves.pressures`.
 """
 
 from typing import NamedTuple
@@ -41,13 +41,13 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
 
 class Operator(NamedTuple):
-    """Matrices of the E elements with n nodes each, and matrices of the V nodes."""
+    """Matrices of the dynamic stiffness: of the E elements with n nodes each, and of the V nodes."""
 
     points: jax.Array  # (V, 3) [m] reference positions of the nodes
-    nodes: jax.Array  # (n, E)
+    nodes: jax.Array  # (n, E) node numbers of the elements
     relaxing: jax.Array  # (n, 3, n, 3, E) [N/m] stiffness that is multiplied by m(omega)
     rest: jax.Array | None  # (n, 3, n, 3, E) [N/m] stiffness that does not relax
-    mass: jax.Array | None  # (n, n, E) [kg], the same for each component, or lumped masses (V,)
+    mass: jax.Array | None  # (n, n, E) [kg], the same for x, y and z; or lumped masses (V,)
     springs: Block | None  # stiffness of springs at the nodes: 3 x 3 entries (V,) [N/m]
     attached: tuple[Attached, ...]
     free: Free
@@ -60,7 +60,7 @@ def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
     Args:
         e: equations of the scene without its viscosity.
         x: positions (V, 3) [m].
-        loaded: whether x differs from the reference shape, so that there is stress.
+        loaded: whether x differs from the reference shape. Then the stress at x changes the stiffness.
         mass: "consistent", or "lumped" as in transient runs.
     """
     scene, mesh, F = e.scene, e.mesh, deformation_gradient(e.mesh, x)
@@ -84,10 +84,10 @@ def _shape_vectors(mesh: TetMesh) -> list[Vector]:
 
 
 def _blocks(scene: Scene, law: Law, F: Matrix, loaded: bool) -> tuple[list[Matrix], list[Matrix] | None]:
-    """Return stiffness blocks, per unit volume, for pairs (`_OWN`) of the corners 1, 2 and 3 of an element.
+    """Return the 3 x 3 stiffness blocks, per unit volume, for the pairs `_OWN` of the corners 1, 2 and 3 of an element.
 
-    The first list is the relaxing part, which is multiplied by m(omega). The second list is the part that does not
-    relax, or None if there is no such part.
+    The first list contains the relaxing part, which is multiplied by m(omega). The second list contains the part that
+    does not relax. It is None if there is no such part.
     """
     mesh, prony, D = scene.mesh, scene.viscosity, _shape_vectors(scene.mesh)
     if prony is None:
@@ -122,8 +122,8 @@ def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
 
 
 def _both_ways(mesh: TetMesh, K: jax.Array) -> jax.Array:
-    """Multiply matrices (n, …, n, …, E) by the signs of the shape functions on both sides. Shape functions of order 3
-    have a direction, so their sign depends on the element."""
+    """Multiply element matrices (n, …, n, …, E) by the signs of the shape functions, for rows and columns. Shape
+    functions of order 3 have a direction along their edge, so their sign depends on the element."""
     if mesh.order < 3:
         return K
     n, E, half = len(K), K.shape[-1], K.ndim // 2
@@ -151,13 +151,14 @@ Motion = tuple[jax.Array, jax.Array | None]
 
 
 def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion) -> Motion:
-    """Return the complex forces (V, 3) [N] of a motion, and the volume balance (P,) [m^3] (None without pressures).
+    """Return the complex nodal forces (V, 3) [N] due to a motion, and the left-hand side of the volume balance (P,)
+    [m^3] (see `liverjax.waves.pressures`; None without pressures).
 
     Args:
         A: `Operator`.
-        factor: m(omega), () or (E,).
+        factor: m(omega), one number or one per element (E,).
         omega: angular frequency [rad/s].
-        motion: complex amplitudes of displacements and pressures.
+        motion: complex amplitudes of displacements [m] and pressures [Pa].
     """
     u, p = motion
     own = u[A.nodes]  # (n, E, 3)
@@ -179,13 +180,15 @@ def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion)
 
 
 def _stored(own: Pressures, omega: Number, near: jax.Array) -> jax.Array:
-    """Return (store + flow / (i omega)) p at the vertices of every element, (4, E) [m^3]."""
+    """Return the volumes (store + flow / (i omega)) p (4, E) [m^3] at the vertices of every element. `near` (4, E)
+    [Pa]: pressures p."""
     stored = jnp.einsum("vwe,we->ve", own.store, near)
     return stored if own.flow is None else stored + jnp.einsum("vwe,we->ve", own.flow, near) / (1j * omega)
 
 
 def _of_nodes_alone(A: Operator, omega: Number, u: jax.Array) -> jax.Array:
-    """Return the forces (V, 3) [N] of lumped masses, springs and attached elements."""
+    """Return the nodal forces (V, 3) [N] of lumped masses, springs and attached elements for displacements u (V, 3)
+    [m]."""
     total = jnp.zeros_like(u)
     if A.mass is not None and A.mass.ndim == 1:
         total = total - (omega**2 * A.mass)[:, None] * u
@@ -198,6 +201,6 @@ def _of_nodes_alone(A: Operator, omega: Number, u: jax.Array) -> jax.Array:
 
 
 def free_part(A: Operator, motion: Motion) -> Motion:
-    """Return the part of a motion, or of forces, in the directions that are free to move."""
+    """Return the components of a motion, or of forces, in the directions in which the nodes are free to move."""
     u, p = motion
     return A.free.vectors(u), None if A.pressures is None or p is None else A.pressures.mask * p

@@ -1,16 +1,19 @@
-"""Pressures at the vertices in harmonic motion: of a flowing fluid, or of a nearly incompressible material.
+"""Unknown pressures at the vertices in harmonic motion: pressures of a flowing fluid, or of a nearly incompressible
+material.
 
-A motion u changes the volumes on which the pressures p act by B^T u. Both cases lead to a symmetric system,
+The unknowns are the displacements u and the pressures p. Both cases lead to a symmetric system,
 
     K u + B p = f,    B^T u - (store + flow / (i omega)) p = -enters / (i omega),
 
-with the dynamic stiffness K, the forces f, the storage and flow matrices `store` and `flow`, and the inflow `enters`.
+with the dynamic stiffness K, the nodal forces B p of the pressures, the forces f, the matrices `store` and `flow` of
+storage and flow, and the inflow `enters`.
 
 In a porous body (`liverjax.physics.porosity`), B^T u is minus the change of the volumes at the vertices. The second
 equation is then Darcy's law divided by i omega. The law is (1/K_lim) i omega p = kappa lap p - i omega (dJ/J), with the
-volume ratio J, the bulk modulus K_lim of the storage and the permeability kappa. Volumes are those of the state about
-which the body moves. With averaged or mixed volumes (`liverjax.physics.volumes`) nothing flows, and `store` is the
-compliance of the pressures.
+Laplacian lap p of the pressure, the volume ratio J, the bulk modulus K_lim of the storage and the permeability kappa.
+Volumes are those of the state about which the body moves. With averaged or mixed volumes (`liverjax.physics.volumes`),
+p is positive in tension and B^T u is the change of the volumes. Nothing flows, and `store` is the volumetric
+compliance.
 """
 
 from typing import Any, NamedTuple
@@ -34,9 +37,9 @@ from liverjax.tensors.matrices import Matrix, determinant, dot, scale
 
 
 class Pressures(NamedTuple):
-    """Matrices of the E elements with n nodes each, and given data of the P pressures."""
+    """Matrices of the E elements with n nodes each (symbols: module docstring), and given values of the P pressures."""
 
-    nodes: jax.Array  # (4, E) vertices
+    nodes: jax.Array  # (4, E) vertices of the elements
     pull: jax.Array  # (n, 3, 4, E) [m^2]: B
     store: jax.Array  # (4, 4, E) [m^3/Pa]
     flow: jax.Array | None  # (4, 4, E) [m^3/(Pa s)]; None if nothing flows
@@ -46,21 +49,23 @@ class Pressures(NamedTuple):
 
 
 def law_beside(scene: Scene) -> Any:
-    """Return the law without the volumetric energy, which the pressures replace."""
+    """Return the law without its volumetric energy if unknown pressures replace this energy; otherwise return the
+    law."""
     if scene.solve.volumetric in ("nodal", "mixed"):
         return isochoric_part(scene.law)
     return law_in_force(scene.porosity, scene.law)
 
 
 def scalars_and_pressures(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars | None, Pressures | None]:
-    """Return the volumetric stress and its derivative with respect to J at given pressures, and `Pressures`.
+    """Return the volumetric stress and its derivative with respect to the volume ratio J at given pressures, and
+    `Pressures`.
 
     Both are computed at positions x (V, 3) [m]. Both are None if the scene has no unknown pressures.
     """
     mesh, J = scene.mesh, determinant(F)
     if scene.porosity is not None:
         own = scene.porosity
-        # After a long time at rest the fluid has flowed until its pressure is 0.
+        # After a long time at rest, the fluid has flowed until its pressure is 0.
         found = Scalars({"J": volumetric_stress(own, J)}, {("J", "J"): volumetric_slope(own, J)})
         return found, _of_sponge(own, mesh, F)
     if scene.solve.volumetric == "mixed":
@@ -93,7 +98,7 @@ def _of_mixed(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars, Pressures
 
 
 def _compliance(mesh: TetMesh, volume: Mixed) -> jax.Array:
-    """Return the compliance matrix (4, 4, E) of every element, as in `Mixed.compliance`."""
+    """Return the matrix of the volumetric compliance of every element (4, 4, E) [m^3/Pa] (see `Mixed.compliance`)."""
     if mesh.order > 1:
         L = jnp.asarray(basis(mesh.order).L, mesh.volumes.dtype)
         return jnp.einsum("aq,bq,qe->abe", L, L, mesh.weights / volume.rest, optimize=True)
@@ -119,8 +124,8 @@ def _sealed(mesh: TetMesh, pull: jax.Array, store: jax.Array) -> Pressures:
 
 
 def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Return diagonal matrices (4, 4, E): the contribution of each element to the integrals, at the vertices, of a
-    density that is given at the integration points."""
+    """Return diagonal element matrices (4, 4, E): integrals of a quantity per volume, times the shape function of each
+    vertex. `density`: values of this quantity at the integration points."""
     if mesh.order == 1:
         share = jnp.broadcast_to(mesh.volumes * density / 4, (4, mesh.number_of_elements))
     else:
@@ -129,8 +134,8 @@ def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _pull(mesh: TetMesh, g: list) -> jax.Array:
-    """Return the nodal forces (n, 3, 4, E) [m^2] of unit pressures at the four vertices. `g`: gradients of the volume
-    ratio with respect to the positions of the four corners."""
+    """Return the nodal forces (n, 3, 4, E) [m^2] of unit pressures at the four vertices of each element. `g`:
+    derivatives of the volume ratio with respect to the positions of the four corners."""
     own = mesh.weights[None, None] * jnp.stack([jnp.stack(vector) for vector in g])  # (4, 3, E), or (4, 3, Q, E)
     if mesh.order == 1:
         return jnp.broadcast_to(own[:, :, None] / 4, (4, 3, 4, mesh.number_of_elements))

@@ -1,4 +1,4 @@
-"""The state of rest under gravity and pre-tension. A body in harmonic motion moves about this state."""
+"""The state of rest under gravity and pre-tension, about which a body in harmonic motion vibrates."""
 
 import jax
 import jax.numpy as jnp
@@ -18,22 +18,22 @@ from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared, simulate
 from liverjax.simulation.unloaded import resting
 
-#: Forces in the reference shape are regarded as 0 if they are below _NONE times the forces at the strain _STRAIN.
+#: Forces in the reference shape are regarded as 0 if they are below _NONE times the forces due to the strain _STRAIN.
 _STRAIN, _NONE = 1e-6, 1e-3
 #: A time [s] after which all flow has ended.
 _FOR_LONG = 1e12
 
 
 def under_its_weight(scene: Scene) -> jax.Array | None:
-    """Return the positions (V, 3) [m] at rest under gravity and pre-tension, with relaxed stresses. Return None if
-    neither acts.
+    """Return the positions (V, 3) [m] at rest under gravity and pre-tension, after all stresses have relaxed. Return
+    None if there is neither gravity nor pre-tension.
 
     Pre-tension is a force that acts already in the reference shape, for example the force of a tight ligament.
-    Tractions and inlets are amplitudes of the motion, so they do not act here. If the scene is traced and no state of
-    rest is found, the positions are NaN.
+    Tractions and inlets cause only the vibration, so they do not act here. Inside jit, grad or vmap, the positions are
+    NaN if no state of rest is found.
 
     Raises:
-        InputError: no state of rest was found.
+        InputError: no state of rest was found (outside jit, grad and vmap).
     """
     body = None if scene.body is None else replace(scene.body, times=None, history=None)
     changed: Content = {"body": body, "porosity": _without_inflow(scene.porosity)}
@@ -58,8 +58,8 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
 
 
 def without_history(physics: Physics) -> Physics:
-    """Return the physics object (load, support, contact …) without a history. A support has its unscaled stiffness, and
-    an obstacle is at its position at time 0."""
+    """Return the physics object (load, support, contact …) without its history. A support then has its stiffness
+    without factors, and an obstacle is at its position at time 0."""
     changed: Content = {name: None for name in ("times", "history") if getattr(physics, name, None) is not None}
     if isinstance(physics, Obstacle):
         changed |= {"by": None, "position": jnp.asarray(physics.position) + physics.displacement(0, 1, 0.0)}
@@ -67,7 +67,7 @@ def without_history(physics: Physics) -> Physics:
 
 
 def _without_inflow(sponge: Porosity | None) -> Porosity | None:
-    """Return the porosity without prescribed fluxes, and with a pressure of 0 where an inlet prescribes a pressure."""
+    """Return the porosity without prescribed inflow, and with a pressure of 0 where an inlet prescribes a pressure."""
     if sponge is None:
         return None
     open_ones = [inlet for inlet in sponge.inlet if inlet.nodes is not None]
@@ -76,14 +76,14 @@ def _without_inflow(sponge: Porosity | None) -> Porosity | None:
 
 
 def _is_heavy(scene: Scene) -> bool:
-    """Return whether gravity is not zero, or is traced."""
+    """Return whether gravity is not zero, or unknown (inside jit, grad or vmap)."""
     leaves = [] if scene.body is None else jax.tree.leaves(scene.body.gravity)
     return any(isinstance(leaf, jax.core.Tracer) or bool(np.any(np.asarray(leaf))) for leaf in leaves)
 
 
 def _is_pulled(still: Scene) -> bool:
-    """Return whether forces other than gravity act on free nodes in the reference shape. If the scene is traced, return
-    whether there is a ligament."""
+    """Return whether forces other than gravity act on free nodes in the reference shape. Inside jit, grad or vmap,
+    return whether the scene has a ligament."""
     if not still.physics:
         return False
     alone = replace(still, fixed=(), displaced=(), body=None, porosity=None)

@@ -1,8 +1,9 @@
-"""Complex sparse linear systems of harmonic motion, solved by one factorisation on the host for every frequency.
+"""Complex sparse linear systems of harmonic motion. For every frequency the matrix is factorised once on the CPU,
+outside the compiled program.
 
-The matrix is symmetric but not Hermitian, so the same factor solves the equations, their derivatives and their adjoint
-equations. Therefore the factor is kept in memory (`KEPT`). The factorisation is the one of
-`liverjax.solvers.factors.multifrontal`. If it fails, SciPy's SuperLU is used, which chooses its pivots in the whole
+The matrix is symmetric but not Hermitian. So the same factor solves the equations, the equations for derivatives and
+the adjoint equations, and the factor is kept in memory (`KEPT`). The matrix is factorised by
+`liverjax.solvers.factors.multifrontal`. If this fails, SciPy's SuperLU is used, which searches pivots in the whole
 matrix.
 """
 
@@ -25,10 +26,10 @@ from liverjax.waves.operator import Motion, Operator, forces_of_motion, free_par
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Displacements (F, V, 3) at every frequency, and pressures (F, P) or None.
+#: Displacements (F, V, 3) [m] at every frequency, and pressures (F, P) [Pa] or None.
 Motions = Motion
 #: Maximum memory [bytes] of the factors that are kept for derivatives. Factors of other matrices are deleted first. If
-#: the factors of all frequencies do not fit, they are kept as 16-bit integers, which need half the memory.
+#: the factors of all frequencies need more, they are kept as 16-bit integers, which need half the memory.
 KEPT = 2e9
 
 _factors: dict[bytes, multifrontal.Factor] = {}
@@ -36,15 +37,15 @@ _orders: dict[bytes, "_Order"] = {}
 
 
 def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: Motions) -> Motions:
-    """Return the motions x of every frequency that solve P A P x = P b, where P projects onto free directions. The
-    motion in directions that are not free is 0.
+    """Return the motion x at every frequency: the solution of P A P x = P b, where P is the projection onto the free
+    directions. The motion in directions that are not free is 0.
 
-    The function is differentiable in both modes with respect to everything except the free directions. If the matrix
-    of a frequency is singular, the motion at this frequency is NaN.
+    The function may be differentiated in forward and reverse mode with respect to all arrays except the free
+    directions. If the matrix of a frequency is singular, the motion at this frequency is NaN.
 
     Args:
         A: `Operator`.
-        factors: m(omega) of every frequency, complex (F,) or (F, E).
+        factors: complex factors m(omega) of the relaxing stiffness at every frequency, (F,) or (F, E).
         omegas: angular frequencies (F,) [rad/s].
         b: complex forces (F, V, 3) [N], and right sides of the volume balance (F, P) [m^3] or None.
     """
@@ -63,14 +64,16 @@ def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: Motions) -> M
         given = (A, factors, omegas, load)
         return jax.pure_callback(_host, shape, *jax.lax.stop_gradient(given), vmap_method="sequential")
 
-    # One array, because JAX cannot differentiate a linear solve of several arrays if one of them is not used.
+    # Displacements and pressures are put into one array, because JAX cannot differentiate a linear solve of several
+    # arrays if one of them is not used.
     x = jax.lax.custom_linear_solve(product, free(_in_one_row(b)), factorised, symmetric=True)
     u, p = _parted(x, V)
     return u, None if b[1] is None else p
 
 
 def _in_one_row(x: Motions) -> jax.Array:
-    """Return one array (F, 3 V + P): x of all nodes, then y, then z, then the pressures."""
+    """Return displacements and pressures in one array (F, 3 V + P): the x components of all nodes, then y, then z, then
+    the pressures."""
     u, p = x
     columns = jnp.swapaxes(u, 1, 2).reshape(len(u), -1)
     return columns if p is None else jnp.concatenate([columns, p], axis=1)
@@ -82,14 +85,15 @@ def _parted(x: jax.Array, V: int) -> Motions:
 
 
 def at_every(A: Operator, factors: jax.Array, omegas: jax.Array, x: Motions) -> Motions:
-    """Return `forces_of_motion` at every frequency, computed one after another."""
+    """Return the nodal forces and the volume balance (`forces_of_motion`) at every frequency. The frequencies are
+    computed one after another."""
     return jax.lax.map(lambda at: forces_of_motion(A, *at), (factors, omegas, x))
 
 
 class _Order(NamedTuple):
-    """Positions of the matrix entries and order of elimination, which are the same for all moduli and frequencies.
+    """Positions of the matrix entries and order of elimination. They are the same for all moduli and frequencies.
 
-    In this numbering, x, y, z of a node follow each other, and the pressures are last.
+    The unknowns are numbered node by node (x, y, z), and the pressures are last.
     """
 
     pairs: np.ndarray  # (n n E,) index of the block for each pair of nodes of an element
@@ -128,7 +132,7 @@ def _free_unknowns(A: Any) -> np.ndarray:
 
 
 def _digest(A: Any) -> bytes:
-    """Return a digest of all arrays of A. Equal numbers have an equal digest."""
+    """Return a digest of all arrays of A, which is the same for the same numbers."""
 
     def of_leaf(leaf: np.ndarray) -> bytes:
         return hashlib.blake2b(np.ascontiguousarray(leaf).data, digest_size=16).digest()
@@ -138,7 +142,8 @@ def _digest(A: Any) -> bytes:
 
 
 def _order(A: Any, free: np.ndarray) -> _Order:
-    """Return the order for this mesh. If the mesh is the same as before, the stored order is returned."""
+    """Return the order of elimination for this mesh. It is computed only if the mesh differs from the mesh of the last
+    call."""
     import scipy.sparse  # imported only where it is used, because it takes a fifth of the package's import time
 
     V, widths = len(A.points), [A.nodes, *(own.nodes for own in A.attached)]
@@ -163,7 +168,7 @@ def _order(A: Any, free: np.ndarray) -> _Order:
 
 
 def _elements_alone(A: Any) -> bool:
-    """Return whether all entries come from stiffness and mass of the elements, and no node slides."""
+    """Return whether all matrix entries come from stiffness and mass of the elements, and no node slides."""
     other = (A.springs, A.pressures, A.free.normals)
     return all(own is None for own in other) and not A.attached and (A.mass is None or A.mass.ndim == 3)
 
@@ -178,7 +183,7 @@ def _entries_of_free(blocks: "scipy.sparse.csr_array", free: np.ndarray) -> "sci
 
 
 def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
-    """Return K(omega) - omega^2 M of the free unknowns."""
+    """Return the sparse matrix K(omega) - omega^2 M of the free unknowns."""
     import scipy.sparse
 
     V, blocks = len(A.points), order.blocks
@@ -203,10 +208,10 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
 
 
 def _blocks_of_nodes(A: Any, order: _Order, factor: np.ndarray, omega: float) -> np.ndarray:
-    """Return the sums over the elements, (blocks, 3, 3) complex.
+    """Return the complex matrix blocks of pairs of nodes (blocks, 3, 3) [N/m], summed over the elements.
 
-    The sums are computed with real numbers, and no sum is computed twice, because large new arrays cost more here than
-    the arithmetic.
+    Sums are computed with real numbers, and no sum is computed twice, because here the allocation of large arrays takes
+    longer than the arithmetic.
     """
     number = order.blocks.nnz
 
@@ -230,8 +235,8 @@ def _blocks_of_nodes(A: Any, order: _Order, factor: np.ndarray, omega: float) ->
 
 
 def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept: tuple[bytes, bool]) -> np.ndarray:
-    """Return the solution, and keep the factor for later calls. `kept`: key of the factor, and whether it is kept as
-    16-bit integers."""
+    """Factorise K, keep the factor for later calls, and return the solution of K x = b. `kept`: key of the factor, and
+    whether the factor is kept as 16-bit integers."""
     for single in (True, False):
         if single and K.shape[0] < multifrontal.SINGLE_FROM:
             continue
@@ -252,10 +257,11 @@ def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept:
 def _has_to_be_small(
     K: "scipy.sparse.csr_array", plan: list[multifrontal.Front], single: bool, small: bool
 ) -> bool | None:
-    """Return whether the factor has to be kept as 16-bit integers, either because of `small` or for lack of memory.
+    """Return whether the factor has to be kept as 16-bit integers, because `small` is true or because there is not
+    enough memory.
 
-    If there is not enough memory even for this, warn and return None. Otherwise the operating system would end the
-    process without a message.
+    If the memory is too small even for 16-bit integers, warn and return None. Without this check, the operating system
+    would end the program without a message.
     """
     free, needed = free_memory(), np.inf
     for own in (small, single):  # 16-bit integers are used only in single precision
@@ -288,7 +294,8 @@ def _pivoted(K: Any, b: np.ndarray) -> np.ndarray:
 
 
 def _entries_beside(A: Any, omega: float) -> list[tuple]:
-    """Return values, rows and columns of all other entries: lumped masses, springs, attached elements and pressures."""
+    """Return values, rows and columns of all matrix entries that are not in the element matrices: lumped masses,
+    springs, attached elements and pressures."""
     every, found = 3 * np.arange(len(A.points)), []
     if A.mass is not None and A.mass.ndim == 1:
         found += [(-(omega**2) * A.mass + 0j, every + r, every + r) for r in range(3)]
@@ -311,7 +318,7 @@ def _entries_beside(A: Any, omega: float) -> list[tuple]:
 
 
 def _with_empty_lines(N: Any, size: int) -> Any:
-    """Return the matrix with appended rows and columns of zeros."""
+    """Return the matrix N with rows and columns of zeros appended, so that it has the shape (size, size)."""
     import scipy.sparse
 
     N = N.tocoo()

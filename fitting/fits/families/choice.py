@@ -1,8 +1,8 @@
 """The choice between models of several families by their information criteria.
 
-If one model contains another, the general model always follows the data at least as closely. The general model is
-chosen only if the criterion is strong evidence for it (Kass and Raftery 1995, J. Am. Stat. Assoc. 90). If the data do
-not need the general model, its predictions outside the measured band are worse.
+If one model contains another, the general model always fits the data at least as closely. The general model is chosen
+only if the criterion is strong evidence for it (Kass and Raftery 1995, J. Am. Stat. Assoc. 90). If the data do not need
+the general model, its predictions outside the measured band are worse.
 """
 
 from collections.abc import Sequence
@@ -10,9 +10,9 @@ from typing import NamedTuple, Protocol
 
 from fitting.fits.viscoelastic import FLUID, Kind
 
-#: For each general model, its special cases: the models that it equals for some values of its parameters. `contains`
-#: adds three cases. A spectrum contains every model. `prony` contains every fluid with at most as many modes. A
-#: fractional Zener model contains a single Prony mode (exponent 1).
+#: The special cases of each general model. For some values of its parameters, the general model equals the special
+#: case. `contains` adds three cases. A spectrum contains every model. `prony` contains every fluid with at most as many
+#: modes. A fractional Zener model contains a single Prony mode (exponent 1).
 SPECIAL_CASES = {
     "fractional_kelvin_voigt": ("springpot",),
     "fractional_maxwell": ("springpot",),
@@ -32,7 +32,7 @@ class Label(NamedTuple):
 
 
 def contains(general: Label, special: Label) -> bool:
-    """Return whether the first model equals the second for some values of its parameters."""
+    """Return whether the model `general` equals the model `special` for some values of its parameters."""
     if general.name == special.name:
         return False
     if general.name == "spectrum" or special.name in SPECIAL_CASES.get(general.name, ()):
@@ -43,8 +43,8 @@ def contains(general: Label, special: Label) -> bool:
 
 
 def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
-    """Return the index of the model with the lowest criterion. A model counts only if its criterion is lower than that
-    of its special cases by `GENERAL`."""
+    """Return the index of the model with the lowest criterion. A model can be chosen only if its criterion is lower by
+    `GENERAL` than the criteria of its special cases."""
     beaten = {
         j
         for j, general in enumerate(labels)
@@ -56,7 +56,7 @@ def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
 
 
 class OfAKind(Protocol):
-    """Attributes that every fit has, whatever its data."""
+    """Attributes that every fit has, for any kind of data."""
 
     @property
     def kind(self) -> Kind:

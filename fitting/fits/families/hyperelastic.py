@@ -23,21 +23,22 @@ class Candidate(NamedTuple):
     values: Callable[[jax.Array, Any], jax.Array]  # (u, modulus scale [Pa]) -> parameters in the order of `names`
     law: Callable[[jax.Array], Law]  # law with these values, without volumetric energy
     random: Callable[[np.random.Generator, int], np.ndarray]  # random starting points (n, len(u))
-    notes: tuple[str, ...] = ()  # sentences on parameters that are not fitted
+    notes: tuple[str, ...] = ()  # notes about parameters that are not fitted
 
 
 def candidates(name: str, terms: int | None = None) -> list[Candidate]:
-    """Return the law with this name. FILE.py:LAW names the law LAW in a file, and `all` names all laws of this package.
-    Without `terms`, Ogden's law is returned several times, with different numbers of terms.
+    """Return the candidates for this name of a law. `FILE.py:LAW` stands for the law LAW in a file, and `all` for all
+    laws of this package. Without `terms`, Ogden's law is returned several times, each time with another number of
+    terms.
 
     Raises:
         InputError: unknown law, or a law whose energy is not an isochoric energy plus U(J).
     """
     if terms is not None and name not in ("ogden", "all"):
-        raise InputError(f"--terms {terms} cannot be used with {name}, only with ogden: leave out --terms")
+        raise InputError(f"--terms {terms} cannot be used with {name}, only with ogden: remove --terms")
     if name == "all":
         singles = [c for n in laws.LAWS if n != "ogden" and incompressible_form(n) for c in candidates(n)]
-        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term is the law bogen
+        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term gives law bogen
     typical = gradient_check.load(name)
     if laws.isochoric_part(typical) is None:
         usable = ", ".join(n for n in laws.LAWS if incompressible_form(n))
@@ -94,7 +95,7 @@ def _single(label: str, typical: Law) -> Candidate:
     middle = np.array([float(getattr(typical, n)) for n in names])
     positive = np.array([f.metadata.get("above") == 0 for f in fields])
     modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
-    # A law with only higher terms has G = 0; its largest modulus is the scale.
+    # A law with only higher terms has G = 0; then its largest modulus is the scale.
     size = abs(ground_state_modulus(typical)) or np.abs(middle[modulus]).max(initial=0.0)
     middle = middle / np.where(modulus, size, 1.0)
 
@@ -140,7 +141,7 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
     if zero:
         notes.append(f"{', '.join(zero)} kept at 0 as given")
     if absent:
-        notes.append(f"{', '.join(absent)} are left out (to fit them, give them values in a law FILE.py:LAW)")
+        notes.append(f"{', '.join(absent)} not fitted (to fit them, give them values in a law FILE.py:LAW)")
     told = f"{label}: the fitted parameters are {', '.join(f.name for f in fitted)}; " + "; ".join(notes)
     return fitted, (told,) if notes else ()
 

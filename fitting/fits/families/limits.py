@@ -1,7 +1,7 @@
 """Moduli at frequency zero and at infinite frequency, of a model and of the Prony modes that represent this model over
 the band.
 
-Springpots relax over many decades. Prony modes follow them only within the band of the data. At frequency 0 and at
+Springpots relax over many decades. Prony modes represent them only within the band of the data. At frequency 0 and at
 infinite frequency, the moduli of the modes therefore differ from the moduli of the model.
 """
 
@@ -21,8 +21,8 @@ NAMES = {"shear_modulus": "instantaneous modulus", "equilibrium_modulus": "equil
 
 
 def of_the_model(own: Estimate | None) -> dict[str, float]:
-    """Return the moduli [Pa] of a model at infinite frequency and at frequency 0. Their names in fit.json are the keys.
-    Infinite moduli are left out."""
+    """Return the moduli [Pa] of a model at infinite frequency and at frequency 0. The keys are their names in fit.json.
+    Infinite moduli are not included."""
     if own is None:
         return {}
     values = {name: float(value) for name, value in zip(own.names, own.values, strict=True)}
@@ -62,7 +62,7 @@ def limit_sentences(name: str, modes: Estimate, model: Maxwell, own: Estimate | 
         if abs(here[limit] - there) > TOLD * alone[limit]:
             out.append(
                 f"the {NAMES[limit]} of the {len(model.ratios)} Prony modes is {here[limit]:.4g} Pa, but the model "
-                f"{name} has {there:.4g} Pa: the modes follow the model over the measured band only"
+                f"{name} has {there:.4g} Pa: the modes represent the model only over the measured band"
             )
     return out
 

@@ -27,9 +27,9 @@ MODELS = ("prony", "fractional", "spectrum", "auto")
 STRONG = 10.0
 
 
-#: Distance from 0 and 1 below which an exponent is at its bound.
+#: An exponent is at its bound if its distance from 0 or 1 is below this value, unless its standard error is small.
 BOUND = 1e-3
-#: Below this distance an exponent is at its bound, even if its standard error is small.
+#: Below this distance from 0 or 1, an exponent is at its bound even if its standard error is small.
 SHARP = 1e-4
 
 
@@ -125,12 +125,12 @@ def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> as_prony_modes.Conver
 
 
 def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
-    """Add the error of the conversion to Prony modes, and the warnings about the model."""
+    """Add the error of the conversion to Prony modes, and the warnings about the model, to the fit."""
     sentences = [_cut_off(fit)] if fit.kind.name != "fractional_zener" and fit.kind.effective is None else []
     if made.error > as_prony_modes.ALLOWED:
         sentences.append(
-            f"{fit.modes} Prony modes follow the model {fit.kind.name} only within {100 * made.error:.2g} %: simulate "
-            "a narrower band with --max-frequency"
+            f"{fit.modes} Prony modes represent the model {fit.kind.name} only with errors of up to "
+            f"{100 * made.error:.2g} %: simulate a narrower band with --max-frequency"
         )
     sentences += limits.limit_sentences(fit.kind.name, fit.uncertainty, fit.model, fit.parameters)
     warnings = (*fit.warnings, *sentences, *undetermined(fit))
@@ -240,7 +240,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
         sweep: data.
         model: one of `MODELS` except "prony".
         prony: the best fit of Prony modes, which is compared too if `model` is "auto".
-        dense: spectrum of the sweep, as in `viscoelastic.closed_form`.
+        dense: result of `generalised_maxwell.spectrum(sweep)`.
     """
     tried = every_model(sweep, model, prony, dense)
     chosen, able = best_of_models(tried, sweep)
@@ -272,14 +272,14 @@ def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
 
 
 def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
-    """Return warnings if another model fits the data about as well, or if another model fits better but the data do not
-    determine all its parameters."""
+    """Return warnings if another model fits the data about equally well, or if another model fits better but the data
+    do not determine all its parameters."""
     best, out = min(tried, key=information_criterion), []
     if information_criterion(best) < information_criterion(chosen) - STRONG:
         apart = information_criterion(chosen) - information_criterion(best)
         out.append(
-            f"{best.kind.name} would follow the data more closely (criterion {apart:.2g} lower), but the data leave "
-            "some of its parameters free"
+            f"{best.kind.name} would fit the data more closely (criterion {apart:.2g} lower), but the data do not "
+            "determine some of its parameters"
         )
     others = [f for f in able if f is not chosen and not contains(label_of(f), label_of(chosen))]
     if not others:
@@ -291,13 +291,14 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     return [
         *out,
         f"{second.kind.name} explains the data about as well as {chosen.kind.name} (criterion {apart:.2g} higher; 10 "
-        "is strong evidence). The data do not decide between these models, which may differ much outside the measured "
-        "band",
+        "is strong evidence). The data do not decide between these models, whose moduli may differ much outside the "
+        "measured band",
     ]
 
 
 def comparison(fit: Fit) -> list[str]:
-    """Return lines with the criterion of each model, best first. There are no lines if only one model was fitted."""
+    """Return lines of text with the criterion of each model, best first. The list is empty if only one model was
+    fitted."""
     rows = fit.details.get("models_compared", [])
     if len(rows) < 2:
         return []

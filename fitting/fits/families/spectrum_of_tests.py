@@ -28,8 +28,8 @@ from liverjax.solvers.blas import one_blas_thread
 #: WEIGHTS: tried weights of the second differences, largest first. MOST_TANGENTS: maximum number of iterations for each
 #: weight.
 WEIGHTS, MOST_TANGENTS = np.logspace(4, -6, 21), 30
-#: A search ends if the cost decreases by less than this part (STILL). A strength of 0 is replaced by NONE, in the unit
-# of the grid.
+#: STILL: a search ends if the relative decrease of the cost is below this value. NONE: value that replaces a strength
+#: of 0, in the unit of the grid.
 STILL, NONE = 1e-9, 1e-12
 
 
@@ -46,8 +46,8 @@ class SpectrumFit(NamedTuple):
 
 
 def _modes_on_grid(grid: GridOfTimes) -> Callable[[np.ndarray], Maxwell]:
-    """Return a NumPy function from equilibrium modulus and strengths (…, 1 + K), in units of the grid, to Prony
-    modes."""
+    """Return a NumPy function that computes Prony modes from x (…, 1 + K). x contains the equilibrium modulus and the
+    strengths, divided by `grid.unit`."""
 
     def maxwell(x):
         strengths = grid.unit * (x + NONE)
@@ -97,7 +97,8 @@ def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> 
 def spectrum_of(
     tests: Sequence[Measured], near: Maxwell, noise: np.ndarray
 ) -> tuple[GridSpectrum, GridOfTimes, _Minimum]:
-    """Return the spectrum for the grid and the smoothness weight with the best evidence, this grid, and the minimum.
+    """Return (spectrum, grid, minimum) for the grid and the weight of smoothness with the highest restricted
+    likelihood.
 
     Args:
         tests: one or more tests.
@@ -131,8 +132,8 @@ def _weighed_parts(tests: Sequence[Measured], noise: np.ndarray) -> list:
 def _as_a_fit(
     tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, told: GridSpectrum, over: Callable | None = None
 ) -> SpectrumFit:
-    """Return the spectrum as a fit. `over` divides the residuals at the minimum by their noise. If `over` is None, the
-    noise is estimated."""
+    """Return the spectrum as a fit. `over`: function that divides the residuals at the minimum by their noise. If
+    `over` is None, the noise is estimated."""
     low, high = together.resolved_by(tests)
     kept = found.x[1:] > 1e-10 * found.x.max()
     solid = told.equilibrium > 0
@@ -163,7 +164,9 @@ def _as_a_fit(
     own = estimated(names, host.exponential, solution, len(found.r), over is not None, told.effective)
     sentences = []
     if made.error > as_prony_modes.ALLOWED:
-        sentences.append(f"{len(made.times)} Prony modes follow the spectrum only within {100 * made.error:.2g} %")
+        sentences.append(
+            f"{len(made.times)} Prony modes represent the spectrum only with errors of up to {100 * made.error:.2g} %"
+        )
     details: Content = {
         "conversion": {"modes": len(spread.values) // 2, "largest_relative_error": made.error},
         "spectrum": {

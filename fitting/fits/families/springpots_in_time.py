@@ -16,7 +16,7 @@ import numpy as np
 from fitting.fits import time_tests, together
 from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.honesty import common_factor
-from fitting.fits.honesty.alike_answers import fitted_by_its_noise, with_own_noise
+from fitting.fits.honesty.alike_answers import fitted_by_its_noise, with_offset_error, with_own_noise
 from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.honesty.rise_of_load import with_rise_of_load
 from fitting.fits.honesty.short_times import with_short_times
@@ -52,7 +52,7 @@ class Spans(NamedTuple):
 
 
 def spans_of(tests: Sequence[Measured]) -> Spans:
-    """Return the times and the frequency for all times that the tests resolve."""
+    """Return the range of times and the reference frequency for all times that the tests resolve."""
     low, high = together.resolved_by(tests)
     return Spans(low, high, springpots.times_of_modes(low, high), float(1 / np.sqrt(low * high)))
 
@@ -79,7 +79,7 @@ def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], j
 
 
 def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.ndarray, data: list) -> Solution:
-    """Return the best minimum of a model for tests, from starting points (S, P).
+    """Return the best minimum of a model for one or more tests, from starting points (S, P).
 
     `data`: for each test, the arrays from which it is predicted, its measured values, and the divisors of its
     residuals.
@@ -141,7 +141,8 @@ def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise
     for error, what in ((made.error, f"{len(made.times)} Prony modes"), (apart, "the modes used in the fit")):
         if error > as_prony_modes.ALLOWED:
             sentences.append(
-                f"{what} follow the model {case.name} only within {100 * error:.2g} %: try another --model"
+                f"{what} represent the model {case.name} only with errors of up to {100 * error:.2g} %: try another "
+                "--model"
             )
     own = estimated(case.names, values, solution, len(solution.residuals), over_noise)
     spread = uncertainty.estimate(solution, over_noise, kind.maxwell)
@@ -200,8 +201,9 @@ def _with_ends_of_record(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFi
     fit = fit._replace(details=fit.details | {CONSTANT_NOISE: test.constant_noise})
     if time_tests.ELASTIC in fit.details and not fit.converged:
         return fit  # its modes have no meaning
+    fit, of_offset = with_offset_error(fit, test)
     fit = with_rise_of_load(fit, test, prony)
-    return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise]), test)
+    return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise], common=of_offset), test)
 
 
 AFit = TypeVar("AFit", TimeFit, Together)
@@ -282,8 +284,8 @@ def choose_together(
 
 
 def _by_its_noise(test: Measured) -> Measured:
-    """Return the test. A relaxation or creep test with enough values is marked if its noise has a constant size
-    (`constant_noise`)."""
+    """Return the test. A relaxation or creep test with enough values gets the mark `constant_noise` if its noise has a
+    constant size."""
     if not isinstance(test, TimeTest) or np.sum(test.used) < _ENOUGH:
         return test
     return fitted_by_its_noise(test)[0]
@@ -317,7 +319,8 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
 
 
 def _shares_of_springpots(fit: Together) -> list[Share]:
-    """Return the errors of the springpot parameters without each test, and the misfit of a fit to each test alone."""
+    """Return the contribution of each test: the errors of the springpot parameters without this test, and the misfit of
+    a fit to this test alone."""
     (case,) = (c for c in FRACTIONAL if c.name == fit.kind.name)
     parts = [together.reported_numbers(t) for t in fit.tests]
     assert fit.kind.values is not None and fit.parameters is not None

@@ -33,8 +33,8 @@ def fitted_by_its_noise(test: TimeTest, modes: int | str = "auto") -> tuple[Time
 
 
 def _has_constant_noise(fit: TimeFit) -> bool:
-    """Return whether the residuals are noise of a constant size. Residuals with a structure contain no information
-    about the noise."""
+    """Return whether the residuals are noise with a constant standard deviation. The result is False if the residuals
+    have a structure, because they then do not show the noise."""
     if not (fit.converged and fit.uncertainty.noise > 0 and np.all(np.isfinite(fit.uncertainty.standard_errors))):
         return False
     if fit.relative_errors.max() <= viscoelastic.EXACT or time_tests.structured_misfit(fit):
@@ -43,7 +43,7 @@ def _has_constant_noise(fit: TimeFit) -> bool:
 
 
 def with_own_noise(fit: TimeFit) -> TimeFit:
-    """Return the fit with standard errors for its real noise. The noise of neighbours may be correlated
+    """Return the fit with standard errors for its real noise. The noise of neighbouring values may be correlated
     (`with_alike_noise`). The noise may also be larger for some values than for others, for example if the noise grows
     with time.
     """
@@ -63,8 +63,8 @@ def with_own_noise(fit: TimeFit) -> TimeFit:
 
 
 def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
-    """Return the estimate with larger errors, where another covariance gives much larger ones. `root` (P, k): square
-    root of this covariance."""
+    """Return the estimate. A standard error is replaced by that of another covariance if the latter is much larger.
+    `root` (P, k): square root of the other covariance."""
     ratio = np.linalg.norm(root, axis=1) / np.where(estimate.standard_errors > 0, estimate.standard_errors, np.inf)
     factor = np.where(np.isfinite(ratio) & (ratio > _UNEVEN_FROM), ratio, 1.0)
     return estimate._replace(
@@ -76,8 +76,9 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
     """Return the fit with standard errors for noise that is correlated between neighbouring values, if the residuals
     show such noise.
 
-    Neighbours may be near each other in time, for example in a drift. Or they may be near in the order of the values,
-    for example if the instrument averages or the model lacks a part of the spectrum. The more probable case is used.
+    Two kinds of correlation are tested. The correlation may decrease with the distance in time, for example in a drift.
+    Or the correlation may decrease with the number of values in between, for example if the instrument averages or the
+    model lacks a part of the spectrum. The more probable kind is used.
     """
     r, J = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian)
     numbers = fit.parameters or fit.uncertainty
@@ -103,8 +104,8 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
     if own is not None and fit.kind.values is not None:
         own = _of_such_noise(own, fit.kind.values, u, alike.root, alike.independent)
     sentence = (
-        f"neighbouring values share their noise (it is correlated), or the model is inadequate. The {len(r)} values "
-        f"carry the information of {alike.independent:.0f} independent values; the standard errors include this"
+        f"the noise of neighbouring values is correlated, or the model is inadequate. The {len(r)} values carry the "
+        f"information of {alike.independent:.0f} independent values; the standard errors include this"
     )
     details = fit.details | {INDEPENDENT: float(alike.independent)}
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, sentence), details=details)
@@ -138,10 +139,37 @@ def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool
 def _of_such_noise(
     estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray, independent: float | None = None
 ) -> Estimate:
-    """Return the estimate with the errors of a covariance of u, given by its square root `root` (p, k)."""
+    """Return the estimate with errors from another covariance of the unknowns u. `root` (p, k): square root of this
+    covariance."""
     root = host.with_jacobian(natural_of, u)[1] @ root
     errors, correlation = errors_and_correlation(root)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
     taken = estimate.components - estimate.freedom
     freedom = estimate.freedom if independent is None else max(1.0, independent - taken)
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation, freedom=freedom)
+
+
+def with_offset_error(fit: TimeFit, test: TimeTest) -> tuple[TimeFit, float]:
+    """Return the fit with the error of the subtracted offset of the sensor in its standard errors.
+
+    The second result is the standard error [Pa] of the equilibrium modulus due to this offset alone. All measured
+    values of the test contain the same error, so more values do not make it smaller.
+    """
+    if not test.offset_error > 0:
+        return fit, 0.0
+    J, u = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.u)
+    shift = np.linalg.pinv(J)[:, : len(fit.scales)] @ (test.offset_error / fit.scales)
+
+    def wider(estimate: Estimate, natural_of: Callable) -> tuple[Estimate, np.ndarray]:
+        column = host.with_jacobian(natural_of, u)[1] @ shift
+        root = np.column_stack([estimate.root, column])
+        errors, correlation = errors_and_correlation(root)
+        errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
+        return estimate._replace(root=root, standard_errors=errors, correlation=correlation), column
+
+    modes, column = wider(fit.uncertainty, _modes_of(fit))
+    own = fit.parameters
+    if own is not None and fit.kind.values is not None:
+        own, _ = wider(own, fit.kind.values)
+    rest = float(np.abs(uncertainty.equilibrium_change(fit.uncertainty.values, column)))
+    return fit._replace(uncertainty=modes, parameters=own), rest

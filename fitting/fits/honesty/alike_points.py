@@ -19,10 +19,11 @@ from fitting.readers.frequency_sweep import Sweep
 INDEPENDENT = "independent_moduli"
 #: Key in `Fit.details`: the standard errors for independent noise, by name.
 OF_INDEPENDENT = "errors_of_independent_noise"
-#: If there is such noise, a warning about structured residuals ends with these words about the standard errors.
+#: If the noise of neighbours is correlated, a warning about structured residuals uses these words about the standard
+#: errors.
 CONTAINED = "the standard errors contain it as correlated noise of neighbours"
 #: First words of the warning about noise that is correlated between neighbours.
-SHARED = "neighbouring frequencies share their noise"
+SHARED = "the noise of neighbouring frequencies is correlated"
 
 
 def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
@@ -37,8 +38,8 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
     if own is not None and fit.kind.values is not None:
         own = not_below(own, fit.kind.values, u, alike.root)
     told = (
-        f"{SHARED} (it is correlated), or the model is inadequate. The {2 * len(fit.storage)} moduli carry the "
-        f"information of {alike.independent:.0f} independent moduli; the standard errors include this"
+        f"{SHARED}, or the model is inadequate. The {2 * len(fit.storage)} moduli carry the information of "
+        f"{alike.independent:.0f} independent moduli; the standard errors include this"
     )
     fluid = uncertainty.like_a_fluid(modes, uncertainty.LOWER) if fit.kind.name == "prony" else []
     fluid = [] if any("(a fluid)" in w for w in fit.warnings) else fluid  # reported before, with smaller errors

@@ -1,4 +1,4 @@
-"""Change of the fitted parameters due to noise alone, if points at one end of the band are left out."""
+"""Change of the fitted parameters due to noise alone, if a fit excludes the points at one end of the band."""
 
 from functools import partial
 
@@ -13,15 +13,15 @@ from fitting.methods.noise.uneven_noise import grouped_sizes
 from fitting.readers import frequency_sweep
 from fitting.readers.rheometer import Sweep
 
-#: Probability that noise alone moves a parameter far enough to be reported.
+#: Probability that noise alone changes a parameter enough to be reported.
 CHANCE = 0.05
-#: SMOOTH: if the points scatter about a smooth curve by less than this part of the residuals, the model causes the
+#: SMOOTH: if the points scatter about a smooth curve by less than this fraction of the residuals, the model causes the
 #: residuals. ENOUGH: minimum number of points for this comparison.
 SMOOTH, ENOUGH = 0.5, 16
 
 
 def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]:
-    """Return, for each parameter of `edges.values`, the standard deviation of its change due to noise alone if only the
+    """Return the standard deviation of the change of each parameter of `edges.values` due to noise alone, if only the
     points `kept` (n,) are fitted. This estimate is of first order in the noise.
 
     Both fits contain the kept points. The variance of the change is therefore that of the difference between the two
@@ -41,7 +41,7 @@ def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]
 
 def farthest_by_chance(fit: Fit | TimeFit, numbers: int) -> float:
     """Return a quantile of Student's t. The largest change at the two ends, divided by its standard deviation, exceeds
-    this quantile by chance in a part `CHANCE` of all fits.
+    this quantile due to noise alone in the fraction `CHANCE` of all fits.
 
     Args:
         fit: the fit whose residuals give the noise.
@@ -70,8 +70,9 @@ def _slopes_of_reported(fit: Fit) -> tuple[list[str], np.ndarray]:
 
 
 def _as_reported(slope: np.ndarray, natural: np.ndarray, reported: np.ndarray) -> np.ndarray:
-    """Return the derivatives (P, p) of the reported parameters. If the sample was compressed, each parameter is the
-    fitted value times a factor, and so is its derivative."""
+    """Return the derivatives (P, p) of the P reported parameters with respect to the p unknowns u. `slope` contains the
+    derivatives of the fitted values `natural`. For a compressed sample, a reported value is a fitted value times a
+    factor."""
     return slope * np.divide(reported, natural, out=np.ones_like(natural), where=natural != 0)[:, None]
 
 

@@ -2,7 +2,7 @@
 by one factor.
 
 Another temperature, a wrong size of the sample or a wrong calibration changes all moduli of a test by the same factor.
-A common fit lies between such tests and follows none of them. In this module, the factor is one more parameter of the
+A common fit lies between such tests and fits none of them well. In this module, the factor is one more parameter of the
 fit.
 """
 
@@ -25,9 +25,9 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
     """Return a warning that names the test and the factor that make all tests agree. There is no warning if the tests
     agree already, or if no factor makes them agree.
 
-    Ratios and times can compensate a factor of a few percent. The common fit then follows each test nearly as well as a
-    fit to this test alone. Wrong sizes of the samples explain a small factor. `relative` is the relative error of the
-    moduli of each test due to these sizes.
+    Ratios and times can compensate a factor of a few percent. The common fit then fits each test nearly as well as a
+    separate fit does. Wrong sizes of the samples explain a small factor. `relative` is the relative error of the moduli
+    of each test due to these sizes.
     """
     if fit.kind.effective is not None:
         return []
@@ -43,13 +43,13 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
     )
     if abs(np.log(factor)) < 2 * np.sqrt(2) * relative:
         return [
-            said + "errors in the sizes of the samples explain this factor, and the errors that include these "
-            "sizes contain this factor"
+            said + "errors in the sizes of the samples explain this factor. The errors that include the "
+            "errors of these sizes contain this factor"
         ]
     return [
         said
-        + "look for another temperature, another sample, or a wrong size of the sample. Until the cause is known, fit "
-        "each test separately"
+        + "check whether this test was made at another temperature or on another sample, or whether the size of its "
+        "sample is wrong. Until the cause is known, fit each test separately"
     ]
 
 
@@ -73,7 +73,7 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
         return np.concatenate(r, axis=-1), np.concatenate(J, axis=-2)
 
     counts, common = [len(y) for _, y, _ in data], np.append(np.asarray(fit.solution.u), 0.0)[None]
-    if fit.kind.values is not None:  # a springpot cannot begin at starting points of modes
+    if fit.kind.values is not None:  # starting points of modes cannot be used for a springpot
         return _certain(from_starts(evaluate, common), counts)
     # If tests contradict each other, their common fit may have too few modes.
     more, answer = together.MORE if together.disagreements(fit.shares) else 0, None
@@ -99,8 +99,8 @@ def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] |
 
 
 def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
-    """Return starting points that follow the other tests, with the factor that shifts their prediction of test k to the
-    measured values. The common fit is not a good starting point for a large factor.
+    """Return starting points that fit the other tests. Each contains the factor that shifts the prediction of test k to
+    the measured values. The common fit is not a good starting point for a large factor.
     """
     others = [t for j, t in enumerate(fit.tests) if j != k]
     band = together.ResolvedBand(together.resolved_by(others))

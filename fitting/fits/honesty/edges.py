@@ -73,18 +73,19 @@ def _with_long_times(fit: Fit, sweep: Sweep) -> Fit:
 
 
 def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
-    """Return a warning that no model can fit much better, because most of the misfit comes from the data."""
+    """Return a warning that no model can fit the data much better than `fit`, because most of the misfit comes from the
+    data."""
     errors, closer = fit.relative_errors(sweep), fit.kind.effective is None
     return (
         f"{MISSES} by {100 * errors.mean():.2g} % on average and by {100 * errors.max():.3g} % at most. The best "
-        f"spectrum of any shape still misses them by {100 * misfit:.2g} % ({KRAMERS_KRONIG}), so the data cause a part "
-        "of the misfit: look for drift, or strain beyond the linear "
+        f"spectrum of any shape still misses the data by {100 * misfit:.2g} % ({KRAMERS_KRONIG}), so the data cause a "
+        "part of the misfit: look for drift, or strain beyond the linear "
         f"range{'; --model auto shows what comes closer' * closer}"
     )
 
 
 def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
-    """Return the change of each parameter, by name, if the first or the last half decade is left out.
+    """Return the change of each parameter, by name, if a fit excludes the first or the last half decade.
 
     The changes of an end are None if too few points are left. For a spectrum, only the equilibrium modulus is compared.
     """
@@ -118,8 +119,8 @@ def moved(fit: Fit) -> set[str]:
 
 
 def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
-    """Return the parameters that change by more than their standard error and by more than noise explains, if the half
-    decade of `part` is left out. The value is the size of the change, divided by the larger of these two limits.
+    """Return the parameters that change by more than their standard error and by more than expected from noise, if the
+    half decade of `part` is left out. The value is the size of the change, divided by the larger of these two limits.
     """
     changes, known = (fit.details.get("band_sensitivity") or {}).get(part) or {}, values(fit)
     by_noise = (fit.details.get("band_scatter") or {}).get(part) or {}
@@ -135,7 +136,8 @@ def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
 
 
 def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None:
-    """Return new values minus old values. The new values are fitted to the kept points."""
+    """Return the changes of the parameters, by name, if only the points `kept` (n,) are fitted (new minus old values).
+    Returns None if too few points are kept."""
     if len(np.unique(sweep.angular_frequency[kept])) <= max(2, len(fit.solution.u) // 2 + 1):
         return None
     # Each kept point has its weight from the whole sweep, because standard deviations are smoothed only once.
@@ -183,12 +185,12 @@ def _moved_most(fit: Fit) -> list[str]:
         if rows:
             listed = ", ".join(f"{n} by {_relative_change(d, v)}" for n, d, v in rows[:3])
             rest = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
-            told.append(f"leaving out the {end} half decade moves {listed}{rest}")
+            told.append(f"leaving out the {end} half decade changes {listed}{rest}")
     if not told:
         return []
     return [
-        f"{'; '.join(told)}. Independent noise does not explain such changes, so these parameters depend on the ends "
-        "of the band: use the total errors, or measure a wider band"
+        f"{'; '.join(told)}. These changes are larger than expected from independent noise, so these parameters "
+        "depend on the ends of the band: use the total errors, or measure a wider band"
     ]
 
 

@@ -1,11 +1,11 @@
-"""Interval of the equilibrium modulus that is possible because parts of the material may relax after the end of the
-test.
+"""Interval of the equilibrium modulus, computed with the possibility that parts of the material relax only after the
+end of the test.
 
 The standard error is a linear estimate at the minimum, for the chosen modes. The data hardly distinguish a mode from
 the equilibrium modulus if its relaxation time is near the end of the test or longer. So the equilibrium modulus is
 fixed at several values, and all other parameters are fitted again (a profile likelihood). Relaxation times may be up to
-`BEYOND` times the longest time that the test resolves. If one more mode follows the data much more closely, the
-interval is computed with this mode.
+`BEYOND` times the longest time that the test resolves. If one more mode fits the data much more closely, the interval
+is computed with this mode.
 """
 
 from collections.abc import Callable, Sequence
@@ -163,7 +163,9 @@ INTERVAL = "equilibrium_modulus_interval_95"
 AFit = TypeVar("AFit", Fit, TimeFit, Together)
 
 
-def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float], factor: float = 1.0) -> AFit:
+def with_interval(
+    fit: AFit, tests: Sequence[Measured], noises: Sequence[float], factor: float = 1.0, common: float = 0.0
+) -> AFit:
     """Return the fit of Prony modes with the interval of its equilibrium modulus. A warning is added if this interval
     is much wider than the interval from the standard error. Fits of other models are returned unchanged.
 
@@ -171,6 +173,7 @@ def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float],
         fit: the fit of these tests.
         tests, noises: see `equilibrium_interval`.
         factor: equilibrium modulus in the fit divided by the one in the data, different from 1 for a compressed sample.
+        common: standard error [Pa] of the equilibrium modulus that comes from an error common to all measured values.
     """
     if fit.parameters is not None or not fit.converged:
         return fit
@@ -185,6 +188,8 @@ def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float],
         return fit
     low, high = factor * found.low, factor * found.high
     rest = max(0.0, float(fit.model.shear_modulus * (1 - np.sum(fit.model.ratios))))
+    low = max(0.0, rest - float(np.hypot(rest - low, NORMAL * common)))
+    high = rest + float(np.hypot(high - rest, NORMAL * common))
     whole = float(fit.model.shear_modulus)
     told: list[str] = _told_interval((low, rest, high), error, found, whole)
     numbers = {"low": low, "high": high, "longest_relaxation_time": found.longest, "modes": found.modes}
@@ -204,7 +209,7 @@ def _told_interval(ends: tuple[float, float, float], error: float, found: Interv
         if high < LARGE * whole:
             return []
         return [
-            f"a solid follows the data as well as the fluid. Its equilibrium modulus may be 0 to {high:.3g} Pa (95 %), "
+            f"a solid fits the data as well as the fluid. Its equilibrium modulus may be 0 to {high:.3g} Pa (95 %), "
             f"{where}: only a longer test can decide"
         ]
     if max(rest - low, high - rest) <= max(WIDER * NORMAL * error, LARGE * rest):

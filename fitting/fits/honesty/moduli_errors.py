@@ -14,7 +14,7 @@ from fitting.methods.estimate import Estimate, errors_and_correlation, estimated
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 
-#: Weight below which a model is left out.
+#: Models with a weight below this value are ignored.
 NEGLIGIBLE = 1e-4
 
 

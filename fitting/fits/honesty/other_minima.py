@@ -1,5 +1,5 @@
-"""Other parameters of a law may follow the tests equally well. This module checks whether they predict the same stress
-in tension and compression.
+"""Other parameter values of a law may fit the test data equally well. This module checks whether they predict the same
+stress in tension and compression.
 
 In simple shear and pure shear one principal stretch is 1 and the other two are l and 1/l. In these tests, one term (mu,
 alpha) of Ogden's law equals the term (-mu, -alpha). In tension and compression, the stresses of the two terms differ by
@@ -51,8 +51,8 @@ def of_other_minima(
         if not 1 / _RATIO < ratios[k] < _RATIO:
             numbers = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, other, strict=True))
             return [
-                f"other parameters follow these tests as well ({numbers}). At a stretch of {stretches[k]:.2g}, their "
-                f"stress is {ratios[k]:.2g} times the stress of the given parameters: add a test in tension or "
-                "compression"
+                f"other parameter values fit these tests equally well ({numbers}). At a stretch of "
+                f"{stretches[k]:.2g}, they give {ratios[k]:.2g} times the stress of the fitted values: add a test in "
+                "tension or compression"
             ]
     return []

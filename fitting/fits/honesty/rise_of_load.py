@@ -18,8 +18,8 @@ SHOWN = 2.0
 
 
 def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
-    """Return the fit with a warning, if G0 changes by more than `SHOWN` standard errors when each change of the load
-    between rows is a step. A fit of Prony modes also gets the changes of its parameters.
+    """Return the fit. A warning is added if steps of the load, instead of linear changes between rows, change G0 by
+    more than `SHOWN` standard errors. A fit of Prony modes also gets the changes of its parameters.
 
     Args:
         fit: fit of any model.
@@ -50,12 +50,13 @@ def _assumed_between_rows(test: TimeTest) -> str:
     begin, end = test.time[test.jumps[0] - 1], test.time[test.jumps[0]]
     if test.rise == BEFORE_ROWS:
         return (
-            f"no row shows how the load rose before {end:.4g} s: a straight rise is assumed. If it was a step at 0 s,"
+            f"no row shows how the load rose before {end:.4g} s: a linear rise is assumed. "
+            "If the load was a step at 0 s,"
         )
     more = f", and in {len(test.jumps) - 1} more jumps" if len(test.jumps) > 1 else ""
-    steps = "they were steps at the later rows" if more else f"it was a step at {end:.4g} s"
+    steps = "the changes were steps at the later rows" if more else f"the change was a step at {end:.4g} s"
     return (
-        f"no row shows how the load changed between {begin:.4g} and {end:.4g} s{more}: straight changes are assumed. "
+        f"no row shows how the load changed between {begin:.4g} and {end:.4g} s{more}: linear changes are assumed. "
         f"If {steps},"
     )
 
@@ -63,9 +64,9 @@ def _assumed_between_rows(test: TimeTest) -> str:
 def _remedy_of_jumps(test: TimeTest) -> str:
     name = "ramp = 0 in the description" if test.described else "--ramp 0"
     if test.rise == BEFORE_ROWS:
-        return f"give the rows of the rise, or {name} for a step at 0 s"
-    seconds = "" if test.described else ", or --ramp with the seconds of the change until the later row"
-    return f"give more rows there, or {name} for a step{seconds}"
+        return f"add the rows measured while the load rose to the file, or give {name} if the load was a step at 0 s"
+    seconds = "" if test.described else ", or --ramp with the duration [s] of the change until the later row"
+    return f"add the rows measured during the change to the file, or give {name} if the change was a step{seconds}"
 
 
 def share_of_rise(fit: TimeFit, names: list[str]) -> dict[str, float]:

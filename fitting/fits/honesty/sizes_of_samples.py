@@ -18,7 +18,7 @@ from fitting.waves.dispersion import Dispersion
 
 def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, float]]:
     """Return the errors of each parameter due to noise and due to the sizes of the samples. The strengths of a spectrum
-    are left out.
+    are not included.
 
     Args:
         fit: the common fit.

@@ -30,11 +30,11 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
 
 
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
-    """Return the errors by source and then by parameter, with the names of `edges.values`.
+    """Return the errors of the parameters: for each source, a dictionary with the names of `edges.values` as keys.
 
-    The share `band` is the larger change of a parameter if one end of the band is left out. It counts only if noise
-    does not explain the change (`edges.decided_by`), and the square of the change due to noise is subtracted from its
-    square. If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter. The share
+    The share `band` is the larger change of a parameter if one end of the band is left out. This change counts only if
+    it is larger than expected from noise (`edges.decided_by`). The square of the change due to noise is subtracted from
+    its square. If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter. The share
     `long_times` comes from the farther end of `long_times.equilibrium_interval`, as a standard deviation. The share
     `short_times` is the part of G0 that `short_times` finds to be missing. The share `rise_of_load` is the change if
     the load was a step at the row that shows it first.

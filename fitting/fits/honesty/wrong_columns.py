@@ -24,8 +24,9 @@ _stress = jax.jit(homogeneous.nominal_stress)
 
 
 class _Cause(NamedTuple):
-    """Another meaning of the columns of a curve. The function `driven` computes the true driven quantity from (driven,
-    number). The function `column` computes the stress column from (nominal stress, driven, number).
+    """Another meaning of the columns of a curve. The driven quantity is the imposed one, for example the stretch. The
+    function `driven` computes the true driven quantity from (driven column, number). The function `column` computes the
+    stress column from (nominal stress, driven column, number).
 
     The fitted number is in units of the range of `driven`, or in units of the stress scale of the curve.
     """
@@ -79,14 +80,15 @@ def _model(law: Law, curve: Curve, F: np.ndarray | None = None) -> np.ndarray:
 
 
 def _nearest_factor(law: Law, curve: Curve, named: bool) -> float:
-    """Return the factor that brings the stress of the law nearest to the curve, or 1 if the fit reported no factors."""
+    """Return the factor that brings the stress of the law nearest to the curve, or 1 if `named` is false (the fit
+    reported no factors)."""
     P = _model(law, curve) / curve.scale
     return float(P @ (curve.stress / curve.scale) / (P @ P)) if named and P @ P > 0 else 1.0
 
 
 def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
-    """Return the cause that lowers the criterion most and leaves random residuals. The text is empty if there is no
-    such cause."""
+    """Return a string that states the cause that lowers the criterion most and leaves random residuals. The string is
+    empty if there is no such cause."""
     found = [(_criterion(fit.law, curves, odd, None), "")]
     limit = found[0][0].value - _BETTER
     for cause in _CAUSES:
@@ -99,7 +101,7 @@ def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
             words = cause.words.format(driven="stretch", number=number)
             modulus = _slope_at_rest(refit.law)
             found.append(
-                (refit, f"the same law would follow the curve {words}, with G0 {modulus:.4g} Pa: check the columns")
+                (refit, f"the same law would fit the curve {words}, with G0 {modulus:.4g} Pa: check the columns")
             )
     return min(found, key=lambda each: each[0].value)[1]
 
@@ -112,7 +114,8 @@ class _Refit(NamedTuple):
 
 
 def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | None) -> _Refit:
-    """Fit the law again from its best parameters, with another meaning of the columns of the curves `odd`."""
+    """Fit the law again from its best parameters. `cause` states another meaning of the columns of the curves `odd`
+    (None: the stated meaning)."""
     leaves, tree = jax.tree.flatten(law)
     every = np.array([float(leaf) for leaf in leaves])
     start = every[every != 0]

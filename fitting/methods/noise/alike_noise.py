@@ -28,8 +28,8 @@ ORDERS = ("3/2", "1/2")
 #: FEW: maximum number of groups for which the likelihood is computed. MOST: maximum number of points in each group.
 #: Half of these points are near each other, half are scattered over the body.
 FEW, MOST = 12, 400
-#: Noise counts as correlated if the correlation raises the log likelihood by more than this value. By chance, this
-#: happens once in a thousand cases.
+#: Noise counts as correlated if the correlation raises the log likelihood by more than this value. With uncorrelated
+#: noise, this happens once in a thousand cases.
 GAIN = 7.0
 #: If the root mean square of the residuals is below this value, they are not the stated noise, for example in synthetic
 #: data without noise.
@@ -37,11 +37,11 @@ LEAST = 0.2
 #: Residuals are clipped at this many robust standard deviations: a single wrong point must not look like correlated
 #: noise.
 OUTLIER = 5.0
-#: An unknown counts if the norm of its derivatives in the chosen groups, divided by their norm in all groups, exceeds
-#: this value.
+#: An unknown is considered if the norm of its derivatives in the chosen groups, divided by their norm in all groups,
+#: exceeds this value.
 SHOWN = 1e-9
-#: If a singular value of the scaled derivatives, divided by the largest one, is below this value, its direction is left
-#: out.
+#: If a singular value of the scaled derivatives, divided by the largest one, is below this value, its direction is
+#: ignored.
 LOST = 1e-6
 #: Number of rows of the covariance C that are computed at once.
 ROWS = 500
@@ -52,7 +52,7 @@ class Alike(NamedTuple):
 
     length: float  # [m]
     part: float  # correlated part a of the variance
-    level: float  # level s: standard deviation / stated standard deviation
+    level: float  # level s: standard deviation divided by the stated standard deviation
     root: np.ndarray  # (p, p) square root of the covariance of the unknowns
     gain: float  # gain of the log likelihood compared with independent noise
     independent: float  # number of independent residuals with the same information
@@ -61,8 +61,8 @@ class Alike(NamedTuple):
 def alike_noise(
     places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray, inverse: np.ndarray | None = None
 ) -> Alike | None:
-    """Estimate the noise that is correlated between neighbouring points. Returns None if chance may explain the
-    correlation.
+    """Estimate the noise that is correlated between neighbouring points. Returns None if uncorrelated noise may explain
+    the residuals.
 
     Args:
         places: position of each residual (n, 3) [m].
@@ -121,8 +121,8 @@ def _determined(J: np.ndarray) -> np.ndarray:
 
 
 def along_rows(counts: list[int], r: np.ndarray, J: np.ndarray, deviation: float, inverse: np.ndarray) -> Alike | None:
-    """Estimate correlated noise, as `alike_noise` does, for series that were measured one row after the other. Lengths
-    are numbers of rows.
+    """Estimate correlated noise (see `alike_noise`) for series that were measured one row after the other. Lengths are
+    numbers of rows.
 
     Args:
         counts: number of rows of each series. The noise of different series is uncorrelated.
@@ -161,7 +161,7 @@ def _subset(places: np.ndarray, own: np.ndarray) -> np.ndarray:
 
 
 def _matern(distance: np.ndarray, order: str, length: float) -> np.ndarray:
-    """Matérn's function of order 3/2 or 1/2."""
+    """Return the Matérn function of order 3/2 or 1/2, with the length scale `length`, at the distances `distance`."""
     if order == "1/2":
         return np.exp(-distance / length)
     x = np.sqrt(3) * distance / length

@@ -7,15 +7,17 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-#: The residuals show factors if these raise the logarithm of the restricted likelihood by at least this value. By
-#: chance, this happens in 1 of 140 cases.
+#: The residuals show factors if these raise the logarithm of the restricted likelihood by at least this value. Without
+#: factors, this happens in 1 of 140 cases.
 _GAIN = 3.0
-#: At the end of a 95 % interval of the factors' standard deviation, this logarithm is below its maximum by this value.
+#: At the end of a 95 % interval of the factors' standard deviation, the logarithm of the restricted likelihood is below
+#: its maximum by this value.
 _FALL = 1.92
 #: Upper bound of the standard deviation of factors if the residuals do not show them. The value is typical of the
 #: errors of sample sizes.
 HIDDEN = 0.1
-#: Singular values below this part of the norm of F are roundoff: the unknowns can compensate these factors.
+#: Singular values of the matrix F (one column for each factor) below this fraction of its norm are roundoff: the
+#: unknowns can compensate these factors.
 _ROUNDOFF = 1e-8
 #: Lower bound for the part of the squared residuals that the factors do not explain. If repeated measurements are
 #: identical, this part is only roundoff.
@@ -39,9 +41,9 @@ def factors_of_series(
     single series or too few residuals.
 
     There are few factors, so their standard deviation is uncertain. If the residuals show factors, their standard
-    deviation is enlarged by Student's t with K - 1 degrees of freedom. If chance may explain the factors, it is not
-    enlarged. If the unknowns can compensate most of the factors, the residuals hardly show them. Then `hidden` and
-    `moves` describe the factors that the residuals do not exclude.
+    deviation is enlarged by Student's t with K - 1 degrees of freedom. If noise alone may explain the factors, their
+    standard deviation is not enlarged. If the unknowns can compensate most of the factors, the residuals hardly show
+    them. Then `hidden` and `moves` describe the factors that the residuals do not exclude.
 
     Args:
         counts: number of rows of each of the K series.

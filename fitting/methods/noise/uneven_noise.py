@@ -73,7 +73,7 @@ def grouped_root(J: np.ndarray, r: np.ndarray, second: np.ndarray, slope: np.nda
 
 def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarray | None:
     """Return the standard deviation of each residual (n,) if two groups of residuals (for example of G' and G'') have
-    noise of different size. Returns None if chance may explain the difference, or if the data hardly determine some
+    noise of different size. Returns None if the difference may be random, or if the data hardly determine some
     combination of the unknowns. Arguments: see `grouped_root`.
     """
     scale = np.linalg.norm(J, axis=0)

@@ -17,7 +17,7 @@ import scipy.special
 
 #: Number of independent runs, and smallest number of particles in each.
 CHAINS, FEWEST = 4, 500
-#: In each step, the power rises as far as possible while at least this part of the particles stays effective.
+#: In each step, the power rises as far as possible while at least this fraction of the particles stays effective.
 EFFECTIVE = 0.5
 #: The moves of a step end if the correlation with the positions before the step is below FORGOTTEN, or in the last step
 #: below FORGOTTEN_LAST. MOST: maximum number of moves in a step.
@@ -40,7 +40,7 @@ class Chains(NamedTuple):
 
     draws: np.ndarray  # (CHAINS, N, P)
     log_evidence: np.ndarray  # (CHAINS,) log of the evidence (the mean likelihood under the prior)
-    steps: int  # number of steps of the power, in all runs together
+    steps: int  # number of increases of the power, in all runs together
     moves: int  # number of moves of each particle, in all runs together
     acceptance: float  # accepted fraction of the last moves
     remembered: float  # largest correlation of the draws with the positions before the last moves
@@ -95,7 +95,8 @@ def _finite_only(values: np.ndarray) -> np.ndarray:
 
 
 def _rise(likelihood: np.ndarray, left: float) -> float:
-    """Return the largest allowed increase of the power, by bisection on the effective number of particles."""
+    """Return the largest increase of the power, at most `left`, at which the fraction `EFFECTIVE` of the particles
+    stays effective. The increase is found by bisection."""
 
     def effective(rise: float) -> float:
         w = np.exp(rise * (likelihood - likelihood.max()))

@@ -60,8 +60,8 @@ def _of_frequency(path: str, column: Column, unit: str) -> float:
 
 
 def fault_of(column: Column, written: float, value: float, smallest: float, largest: float) -> tuple[str, str] | None:
-    """Return the fault of a value (in SI) and the remedy, or None if the value is good. The text quotes the value as
-    written in the file."""
+    """Return the fault of a value (in SI) and the remedy, or None if the value is good. The message quotes the value
+    as written in the file."""
     if not np.isfinite(value):
         if np.isnan(written):
             return f"{column.name} is empty", "fill it in or remove the line"
@@ -86,7 +86,7 @@ def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
         if sheared:
             raise InputError(
                 f"column {columns[tensile[0]][0].name} is of tension or bending and {sheared[0]} of shear: name both "
-                "alike"
+                "in the same way"
             )
         tensile = moduli
     for q in tensile:

@@ -66,7 +66,7 @@ def header_columns(cells: list[str]) -> list[Column]:
     """Return the columns of a sweep: first those with a known unit, and angular frequencies before frequencies.
 
     The first column of a quantity is used. Further columns of the same quantity are compared with the first. If the
-    columns are enough for a sweep, columns that it does not need are left out.
+    columns are enough for a sweep, columns that the sweep does not need are ignored.
     """
     found = [(k, cell, quantity_of(cell)) for k, cell in enumerate(cells)]
     columns = [Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]

@@ -22,6 +22,7 @@ from fitting.readers.tables.sweep_columns import (
 from fitting.readers.tables.sweep_headings import DEVIATION_WORDS
 from fitting.readers.tables.text_tables import (
     decimal_sign,
+    delimiter_of_header,
     find_delimiter,
     means_nothing,
     split_cells,
@@ -63,7 +64,8 @@ def choose_table(
 ) -> tuple[int, list[str]]:
     """Return the index of the table to read, and a note if there are several tables.
 
-    If `wanted` is None, this is the table with the largest `size`; by default, the largest number of frequencies.
+    If `wanted` is None, the function chooses the table with the largest `size`. By default, `size` is the number of
+    frequencies.
     """
     names = [f"{k} {t.name!r}" if t.name else str(k) for k, t in enumerate(tables, 1)]
     if wanted is not None:
@@ -79,7 +81,7 @@ def choose_table(
 
 
 def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int:
-    """Return the index of the table with the number or name `wanted`, or of the only table whose name contains it."""
+    """Return the index of the table with number or name `wanted`, or of the only table whose name contains `wanted`."""
     wanted = str(wanted)
     if wanted.isdecimal() and 1 <= int(wanted) <= len(tables):
         return int(wanted) - 1
@@ -90,7 +92,7 @@ def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int
         return matches[0]
     found = f"is in the names of {len(matches)} tables" if matches else "is no table of the file"
     offered = ", ".join(names[k] for k in matches) if matches else ", ".join(names)
-    raise InputError(f"{path}: --table {wanted} {found}; give the number or the whole name of one: {offered}")
+    raise InputError(f"{path}: --table {wanted} {found}; give the number or the whole name of one table: {offered}")
 
 
 def tables_of(path: str, lines: list[str]) -> list[Table]:
@@ -128,7 +130,7 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
         k += 1
         if not line.strip() or line.lstrip().startswith(COMMENTS):
             continue
-        delimiter = find_delimiter(line)
+        delimiter = delimiter_of_header(line, _names_all)
         cells = split_cells(line, delimiter)
         columns = header_columns(cells)
         if not is_complete(columns):
@@ -137,15 +139,10 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
         name = _title(lines[free : k - 1])
         columns, k = _with_unit_row(columns, lines, k, delimiter)
         above = k
-        rows, numbers, k = _rows_below(path, columns, lines, k, delimiter, len(cells))
+        rows, numbers, notes, k = _rows_below(path, columns, lines, k, delimiter, len(cells))
         if rows:
             units = [split_cells(line, delimiter) for line in lines[headers[-1] : above]]
             own = [split_cells(lines[n - 1], delimiter) for n in numbers]
-            left_out = summary_rows(own)
-            notes = [
-                f"line {numbers[j]} is a summary of other rows ({word}) and is left out" for j, word in left_out.items()
-            ]
-            rows, numbers, own = ([v for j, v in enumerate(a) if j not in left_out] for a in (rows, numbers, own))
             sign = decimal_sign(row[c.place] for row in own for c in columns if c.place < len(row))
             raw = _raw(cells, units, own, delimiter, sign)
             unit = raw_torque.unit_of("strain", cells, units[-1] if units else [])
@@ -187,8 +184,8 @@ def _perhaps_tensile(cells: list[str], columns: list[Column]) -> list[str]:
         return []
     names = " and ".join(dict.fromkeys(c.name for c in moduli))
     return [
-        f"{names}: taken as shear, G, although the column {sign.strip()!r} belongs to tests in tension, compression "
-        "or bending; if these are moduli E, three times as large, name them E' and E''"
+        f"{names}: read as shear moduli G, although the column {sign.strip()!r} belongs to tests in tension, "
+        "compression or bending; if these are moduli E, three times as large, name them E' and E''"
     ]
 
 
@@ -206,14 +203,14 @@ def _perhaps_thousands(rows: list[list[str]], columns: list[Column], sign: str |
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
     """Return raw torque, angle, phase, strain and temperature in SI units, for the rows of a table.
 
-    An empty cell is NaN. A temperature column with an empty cell is left out. `sign` is the table's decimal sign.
+    An empty cell is NaN. A temperature column with an empty cell is ignored. `sign` is the table's decimal sign.
     """
     found, units = {}, unit_rows[-1] if unit_rows else []
     measured = {q: (place, factor, 0.0) for q, (place, factor) in raw_torque.known_columns(cells, units).items()}
     for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():
         values = _cells_of(place, rows, delimiter, sign)
         known = np.isfinite(values)
-        # For the other columns, later steps leave out points without a value.
+        # For the other columns, later steps ignore points without a value.
         if known.all() if quantity == "temperature" else known.any():
             found[quantity] = factor * values + offset
     return found
@@ -245,7 +242,7 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
         cells = split_cells(lines[ahead], delimiter)
         units = {c.place: cells[c.place].strip('"[]() ') for c in columns if c.place < len(cells)}
         moduli = [units.get(c.place) in MODULUS_UNITS for c in columns if c.quantity in MODULI]
-        # If only the unit of the frequency is known, the units of the moduli are refused later.
+        # If only the unit of the frequency is known, a later step raises the error for the units of the moduli.
         known = [units.get(c.place, "").lower() in FREQUENCY_UNITS for c in columns if c.quantity == "frequency"]
         if any(moduli) or any(known):
             return [c._replace(unit=units.get(c.place) or c.unit) for c in columns], ahead + 1
@@ -258,18 +255,18 @@ def _rows_below(path, columns, lines, k, delimiter, width):
     """Return the rows of numbers below a header, their line numbers, and the index of the line after them. An empty
     cell is NaN."""
     needed = [c for c in columns if not c.quantity.endswith("_sd")]
-    kept, numbers = [], []
+    every, numbers = [], []
     while k < len(lines):
         line = lines[k]
         if line.lstrip().startswith(COMMENTS) or not line.strip(f"{delimiter} \t-=+:"):
             k += 1
-            if kept and not line.strip() and any(later.startswith("[") or _complete(later) for later in lines[k:]):
+            if every and not line.strip() and any(later.startswith("[") or _complete(later) for later in lines[k:]):
                 break  # the next table of an export begins
             continue
         cells = split_cells(line, delimiter)
         words = _is_words(cells, needed)
         if words and (
-            not kept or line.startswith("[") or delimiter == "\t" or not _goes_on(lines, k, delimiter, needed)
+            not every or line.startswith("[") or delimiter == "\t" or not _goes_on(lines, k, delimiter, needed)
         ):
             break  # the header was only a title, or this table ends
         k += 1
@@ -277,9 +274,13 @@ def _rows_below(path, columns, lines, k, delimiter, width):
             raise InputError(
                 f"{path}: line {k}: {len(cells)} cells under {width} headings; write decimals with a point"
             )
-        kept.append([cells[c.place] if c.place < len(cells) else "" for c in columns])
+        every.append(cells)
         numbers.append(k)
-    return _numbers_of_cells(path, columns, kept, numbers, delimiter), numbers, k
+    summaries = summary_rows(every)
+    notes = [f"line {numbers[j]} is a summary of other rows ({word}) and is ignored" for j, word in summaries.items()]
+    every, numbers = ([v for j, v in enumerate(a) if j not in summaries] for a in (every, numbers))
+    kept = [[cells[c.place] if c.place < len(cells) else "" for c in columns] for cells in every]
+    return _numbers_of_cells(path, columns, kept, numbers, delimiter), numbers, notes, k
 
 
 def _is_words(cells: list[str], needed: list[Column]) -> bool:
@@ -311,4 +312,8 @@ def _numbers_of_cells(path, columns, kept, numbers, delimiter):
 
 
 def _complete(line: str) -> bool:
-    return is_complete(header_columns(split_cells(line, find_delimiter(line))))
+    return _names_all(split_cells(line, delimiter_of_header(line, _names_all)))
+
+
+def _names_all(cells: list[str]) -> bool:
+    return is_complete(header_columns(cells))

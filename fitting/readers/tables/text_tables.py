@@ -4,13 +4,13 @@ import codecs
 import csv
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from fitting.readers import trios_json, workbook
 from liverjax.core.errors import InputError
 
-#: Maximum length of a line: Python's CSV reader refuses longer cells.
+#: Maximum length of a line: Python's CSV reader cannot read longer cells.
 LONGEST_LINE = 131072
 
 
@@ -47,12 +47,12 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
     return _with_whole_headings(text)
 
 
-#: A quoted cell that the line does not close.
+#: A quoted cell without a closing quote in the same line.
 _OPEN = re.compile(r'(?:^|[,;\t])\s*"[^"]*$')
 
 
 def _with_whole_headings(text: str) -> str:
-    """The text in which quoted headings with line breaks stand on one line. Line numbers below stay the same."""
+    """Join the two lines of each quoted heading that contains a line break. Numbers of later lines stay the same."""
     lines = text.splitlines()
     for k in range(min(len(lines), _HEAD) - 1):
         if _OPEN.search(lines[k]) and re.match(r'[^",;\t]*"\s*(?:[,;\t]|$)', lines[k + 1]):
@@ -60,7 +60,7 @@ def _with_whole_headings(text: str) -> str:
     return "\n".join(lines)
 
 
-#: Headings stand in the first lines of a file.
+#: Number of lines at the beginning of a file that may contain headings.
 _HEAD = 200
 
 
@@ -80,15 +80,24 @@ def _decoded(path: Path, data: bytes) -> str:
 
 
 def find_delimiter(line: str) -> str:
-    """Return the delimiter of a line: the most frequent of tab, semicolon, comma and bar; or else spaces.
+    """Return the delimiter of a line: the most frequent of tab, semicolon, comma and bar; or else spaces."""
+    return _delimiters(line)[0]
 
-    In "Frequency, Hz;Modulus, Pa" the commas are within the cells. So a comma with a space counts only if there is no
-    tab and no semicolon.
-    """
+
+def _delimiters(line: str) -> list[str]:
+    """Return the possible delimiters of a line, the most frequent first."""
     plain = re.sub(r"\|\s*\w+\s*\*?\s*\|", "", line) if "*|" in line else line  # the bars of |G*| are not delimiters
-    plain = re.sub(r", +", "", plain) if re.search(r"[\t;]", plain) else plain
-    best = max("\t;,|", key=plain.count)
-    return best if best in plain else ("  " if "  " in line.strip() else " ")
+    found = sorted((sign for sign in "\t;,|" if sign in plain), key=plain.count, reverse=True)
+    return found or ["  " if "  " in line.strip() else " "]
+
+
+def delimiter_of_header(line: str, complete: Callable[[list[str]], bool]) -> str:
+    """Return the most frequent delimiter whose cells are complete, or else the most frequent delimiter.
+
+    In "Frequency, Hz;Modulus, Pa" the commas are more frequent, but only the semicolon gives two complete headings.
+    """
+    every = _delimiters(line)
+    return next((sign for sign in every if complete(split_cells(line, sign))), every[0])
 
 
 def split_line(line: str, delimiter: str | None = None) -> tuple[str, list[str]]:
@@ -104,7 +113,7 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
-#: Texts in cells without a measurement.
+#: Strings in cells without a measurement.
 EMPTY = {"", "-", "--", "---", "–", "—", "*", "n/a", "#n/a", "na", "n.a.", "none", "null", "nan", "?"}
 #: _GROUPED: spaces and apostrophes that separate thousands. _THOUSANDS: patterns of numbers in which commas or points
 #: separate thousands.
@@ -128,7 +137,7 @@ def decimal_sign(cells: Iterable[str]) -> str | None:
 
 
 def to_number(text: str, delimiter: str, sign: str | None = None) -> float | None:
-    """Return the number in a cell: NaN for an empty cell, None for any other text. A decimal comma and separated
+    """Return the number in a cell: NaN for an empty cell, None for any other string. A decimal comma and separated
     thousands are allowed.
 
     Args:
@@ -157,22 +166,23 @@ def means_nothing(cells: Iterable[str]) -> bool:
     return not any(re.match(r"[-+]?[.,]?\d|nan|[-+]?inf", cell.strip('" ').lower()) for cell in cells)
 
 
-#: Words that mark a row as a summary of other rows.
+#: Words at the beginning of a row that mark the row as a summary of other rows, for example "Mean (n = 3)".
 _SUMMARY = re.compile(
-    r"(mean|average|avg|median|sd|std|st\.? ?dev|std\.? ?dev|standard deviation|sem|standard error|min|max|minimum"
-    r"|maximum|range|cv|mittelwert|mittel|standardabweichung|moyenne|.cart[- ]type|media|promedio)\.?( ?\(?%?\)?)?:?",
+    r"±? ?(mean|average|avg|median|sd|std|st\.? ?dev|std\.? ?dev|standard deviation|sem|standard error|min|max|minimum"
+    r"|maximum|range|cv|mw|mittelwert|mittel|standardabweichung|moyenne|.cart[- ]type|media|promedio)"
+    r"( value)?\.?( ?± ?\w+)?( ?\([^)]*\))?:?",
     re.I,
 )
 
 
 def summary_rows(rows: list[list[str]]) -> dict[int, str]:
-    """Rows such as "Mean" and "SD" below a table, and the word that each one has in one of its cells.
+    """Return the indices of rows such as "Mean" and "SD" at the end of a table, and the first word of each row.
 
-    If most rows have such a word, it does not mark a summary.
+    A row that repeats the word of another row is no summary: the word may be the name of a sample or of a range.
     """
-    found: dict[int, str] = {}
-    for k, row in enumerate(rows):
-        word = next((cell.strip('" ') for cell in row if _SUMMARY.fullmatch(cell.strip('" '))), None)
-        if word is not None:
-            found[k] = word
-    return found if 2 * len(found) < len(rows) else {}
+    firsts = [next((cell.strip('" ') for cell in row if cell.strip('" ')), "") for row in rows]
+    end = len(rows)
+    while end and _SUMMARY.fullmatch(firsts[end - 1]):
+        end -= 1
+    words = firsts[end:]
+    return dict(enumerate(words, end)) if end and len(set(words)) == len(words) else {}

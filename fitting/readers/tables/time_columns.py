@@ -13,7 +13,9 @@ import numpy as np
 from fitting.readers.tables.text_tables import (
     EMPTY,
     decimal_sign,
+    delimiter_of_header,
     means_nothing,
+    split_cells,
     split_line,
     summary_rows,
     text_of,
@@ -128,7 +130,7 @@ OWN_TIME = "step time"
 
 
 def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the columns of a test by quantity, in SI units, and notes. The times rise and begin at 0 s or later.
+    """Return the columns of a test by quantity, in SI units, and notes. The times increase, and begin at 0 s or later.
 
     Raises:
         InputError: the file cannot be used; the message names the column or line, the value and the remedy.
@@ -144,7 +146,8 @@ def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[s
         order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"
         if time[0] >= 0 and time[k] == time[k - 1]:
             raise InputError(
-                f"{path}: two rows have the time {time[k]:g} s: write times with more digits, or replace both by a mean"
+                f"{path}: two rows have the time {time[k]:g} s: write times with more digits, or "
+                "replace both rows by their mean"
             )
         raise InputError(f"{path}: {order}; the times must begin at 0 s or later, and increase")
     return columns, notes
@@ -153,7 +156,8 @@ def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[s
 def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the columns, in SI units, of the first table that has the time and one of `FORMS`; and notes."""
     for k, line in enumerate(lines):
-        delimiter, cells = split_line(line.lstrip("# "))
+        delimiter = delimiter_of_header(line.lstrip("# "), _names_a_test)
+        cells = split_cells(line.lstrip("# "), delimiter)
         found = _heading(cells)
         form = next((f for f in FORMS if set(f) <= set(found)), None)
         if "time" in found and form is not None:
@@ -166,8 +170,9 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
         raise InputError(f"{path}: unit {unknown[1]!r} of {unknown[0]} is not known; {_known_units(unknown[0])}")
     first = next((line.strip() for line in lines if line.strip()), "")[:80]
     raise InputError(
-        f"{path}: no header names time_s and relaxation_modulus_Pa, creep_compliance_1/Pa, E(t), strain and stress_Pa, "
-        f"angle_rad and torque_N.m, or displacement_m and force_N (the first line is {first!r}); add that header"
+        f"{path}: no header names time_s together with one of these: relaxation_modulus_Pa; creep_compliance_1/Pa; "
+        "E(t); strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. Add such a header (first "
+        f"line: {first!r})"
     )
 
 
@@ -178,7 +183,7 @@ def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[st
         shear, factor = TENSILE[name]
         columns[shear] = factor * columns.pop(name)
     if tensile:
-        verb = "is taken as that" if len(tensile) == 1 else "are taken as those"
+        verb = "is assumed to be that" if len(tensile) == 1 else "are assumed to be those"
         notes = [*notes, f"{' and '.join(tensile)} {verb} of an incompressible sample: G = E / 3"]
     if "tensile stress" in tensile:
         notes += beyond_small(float(np.nanmax(np.abs(columns["strain"]))))
@@ -234,13 +239,18 @@ def _told_of_tables(below: list[str]) -> list[str]:
 
 
 def _begins_a_table(line: str) -> bool:
-    found = _heading(split_line(line.lstrip("# "))[1])
+    plain = line.lstrip("# ")
+    return _names_a_test(split_cells(plain, delimiter_of_header(plain, _names_a_test)))
+
+
+def _names_a_test(cells: list[str]) -> bool:
+    found = _heading(cells)
     return "time" in found and any(set(f) <= set(found) for f in FORMS)
 
 
 def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """Return for each quantity the column index and unit of the first cell that names the quantity. A step time comes
-    before other times."""
+    """Return for each quantity the column index and unit of the first cell that names the quantity. A step time is
+    preferred to other times."""
     found: dict[str, tuple[int, str | None]] = {}
     for k, cell in sorted(enumerate(cells), key=lambda each: not _is_own_time(each[1])):
         text = cell.strip().strip('"')
@@ -316,16 +326,18 @@ def _rows_in_time(path, lines, k, delimiter, found):
         elif kept and any(c.strip().lower() not in EMPTY for c in own) and not line.lstrip().startswith("#"):
             if not _rows_follow(lines[k:], delimiter, list(needed.values())):
                 break
-            notes.append(f"line {k}, {line.strip()[:40]!r}, has no numbers and is left out")
+            notes.append(f"line {k}, {line.strip()[:40]!r}, has no numbers and is ignored")
     left_out = summary_rows(every)
-    notes += [f"line {numbers[j]} is a summary of other rows ({word}) and is left out" for j, word in left_out.items()]
+    notes += [f"line {numbers[j]} is a summary of other rows ({word}) and is ignored" for j, word in left_out.items()]
     kept, numbers = ([v for j, v in enumerate(a) if j not in left_out] for a in (kept, numbers))
     sign = decimal_sign(cell for own in kept for cell in own)
     rows = [[to_number(cell, delimiter, sign) for cell in own] for own in kept]
     for number, row in zip(numbers, rows, strict=True):
         if any(v is None for v in row):
             shown = lines[number - 1].strip()[:40]
-            raise InputError(f"{path}: line {number}: {shown!r} has a cell that is no number; correct or remove it")
+            raise InputError(
+                f"{path}: line {number}: {shown!r} has a cell that is not a number; correct or remove the line"
+            )
     if len(rows) < 4:
         raise InputError(f"{path}: {len(rows)} rows of numbers are below the header; give four or more")
     return rows, units, notes
@@ -357,5 +369,5 @@ def _in_si(path, found, rows, units):
         columns[quantity] = rows[:, j] * TIME_TEST_UNITS[quantity][_plain_heading(unit)]
     good = np.all(np.isfinite(rows), axis=1)
     if not good.all():
-        notes.append(f"{(~good).sum()} of {len(good)} rows are left out: a cell in them is empty or not finite")
+        notes.append(f"{(~good).sum()} of {len(good)} rows are ignored: a cell in them is empty or not finite")
     return {q: v[good] for q, v in columns.items()}, notes

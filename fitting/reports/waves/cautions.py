@@ -15,7 +15,7 @@ from fitting.waves.wave_field import WaveField
 #: Below this radius [voxels], the modulus of a region is unreliable. In tests, the moduli of cylinders of this radius
 #: were right within 8 %.
 LEAST_RADIUS = 2.5
-#: Above this chi^2 per equation, a warning says that the model does not explain the data.
+#: Above this chi^2 per equation, the program warns that the model does not explain the data.
 TOO_FAR = 1.5
 #: Below this chi^2 per equation, the stated noise is too large, if there are FEW equations or more.
 TOO_NEAR, FEW = 0.4, 50
@@ -94,8 +94,8 @@ def _of_small_regions(field: WaveField, labels: np.ndarray) -> list[str]:
     if not small:
         return []
     return [
-        f"regions {', '.join(small)}: below a radius of {LEAST_RADIUS:g} voxels, a modulus is a guess, and its error "
-        "does not show this. Measure with smaller voxels, or give the region the label of its surroundings"
+        f"regions {', '.join(small)}: below a radius of {LEAST_RADIUS:g} voxels, a modulus is not reliable, and its "
+        "error does not show this. Measure with smaller voxels, or give the region the label of its surroundings"
     ]
 
 
@@ -112,7 +112,7 @@ def _of_no_motion(field: WaveField, f: int) -> list[str]:
         return []
     return [
         f"{field.frequencies[f]:g} Hz: the displacements ({size:.2g} m) are hardly larger than their noise "
-        f"({field.noise[f]:.2g} m), so the waves are unknown: leave this frequency out"
+        f"({field.noise[f]:.2g} m), so the waves are unknown: remove the data of this frequency"
     ]
 
 
@@ -121,7 +121,7 @@ SKEW = 0.15
 
 
 def _of_long_waves(hertz: float, found: Found, f: int) -> list[str]:
-    """Return the interval of each modulus whose error is so large that the interval is not symmetric.
+    """Return a warning with the interval of each modulus whose error is so large that the interval is not symmetric.
 
     Waves much longer than the organ determine the compliance 1/G, and the error of 1/G is symmetric.
     """
@@ -264,10 +264,10 @@ def _sign(organ: Organ, found: Found) -> list[str]:
         return []
     return [
         f"the loss modulus is negative at {', '.join(wrong)}, which no tissue has. Here the motion is the real part of "
-        "U exp(+i omega t): if your waves have the other sign, take their complex conjugate"
+        "U exp(+i omega t): if your waves have the other sign, use their complex conjugate"
     ]
 
 
 def chi2_text(chi2: float) -> str:
-    """Return chi^2 as text with two decimals; from 1e4 on in scientific notation."""
+    """Return chi^2 as a string with two decimals; from 1e4 on in scientific notation."""
     return f"{chi2:.2f}" if chi2 < 1e4 else f"{chi2:.1e}"

@@ -66,8 +66,8 @@ def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) 
     """Return one dictionary per region, with lists over the frequencies.
 
     The errors contain the noise, the uncertain position of the edges, and the discretisation error of the elements. The
-    relative discretisation error has two parts: its mean `bias` (F, R) over the directions of the waves, and the rest
-    `left` (F, R, D) for each direction.
+    relative discretisation error has two parts: its mean `bias` (F, R) over 2 D plane waves, and the contribution
+    `left` (F, R, 2 D) of each wave to the uncertainty of this mean.
     """
     omega, rows = organ.waves.omega, []
     for r in range(own.modulus.shape[1]):

@@ -1,1 +1,1 @@
-"""File formats of waves, and unwrapping of phases."""
+"""Read wave data from files of several formats, and unwrap phases."""

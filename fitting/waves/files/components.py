@@ -1,8 +1,8 @@
 """Check from the data alone whether the components of the displacement are in the directions of the voxel axes.
 
 Shear waves do not change the volume, so the divergence of the displacement is small. The divergence is large if two
-components are exchanged, or if one has the wrong sign. Such errors occur when data move between a program that stores
-arrays by rows and a program that stores arrays by columns.
+components are exchanged, or if one has the wrong sign. Such errors occur when data are moved between programs, if one
+program stores arrays by rows and the other by columns.
 """
 
 import itertools
@@ -13,17 +13,18 @@ from fitting.waves.wave_field import WaveField
 
 #: Minimum number of voxels with all six neighbours.
 FEWEST = 100
-#: Another order or sign of the components is better if it reduces the mean square divergence below this fraction.
+#: Another order or sign of the components is regarded as better if the mean square divergence is below this fraction of
+#: its value for the given order.
 SMALLER = 0.8
 
 
 def other_order(field: WaveField) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-    """Return the component and the sign for each axis that give the smallest divergence. Return None if the given order
-    is nearly as good."""
+    """Return for each axis the component and the sign with which the divergence is smallest. Return None if the given
+    order is nearly as good."""
     slopes = _central_differences(field)
     if slopes.shape[2] < FEWEST:
         return None
-    # The products of all derivatives d_a u_c give the mean square divergence for every order and sign.
+    # The mean products of all derivatives d_a u_c give the mean square divergence for every order and sign.
     flat = slopes.reshape(9, -1)
     products = (flat @ flat.conj().T).real.reshape(3, 3, 3, 3)
     best: tuple[tuple[int, ...], tuple[int, ...]] = ((0, 1, 2), (1, 1, 1))
@@ -46,14 +47,14 @@ def order_sentence(field: WaveField) -> str | None:
     whole = -1 if sum(signs) < 0 else 1  # a common sign of all components does not matter
     names = ", ".join(("-" if whole * s < 0 else "") + "xyz"[c] for c, s in zip(order, signs, strict=True))
     return (
-        f"the components of the displacement do not follow the axes of the voxels: as ({names}) they change the volume "
-        "much less, which is expected of shear waves. Give them in the order and with the signs of the axes"
+        f"the components of the displacement may have a wrong order or sign: as ({names}), they change the volume much "
+        "less, as expected for shear waves. Give the components in the order and with the signs of the voxel axes"
     )
 
 
 def _central_differences(field: WaveField) -> np.ndarray:
-    """Return central differences d_a u_c (3, 3, n) at voxels with six measured neighbours. They are scaled to a root
-    mean square of 1 at each frequency."""
+    """Return central differences d_a u_c (3, 3, n) at voxels with six measured neighbours. The differences are scaled
+    to a root mean square of 1 at each frequency."""
     U, rows = field.displacement, []
     middle = tuple(slice(1, -1) for _ in range(3))
     for u in U:

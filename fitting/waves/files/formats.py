@@ -1,11 +1,13 @@
 """Read files of waves on voxels (.npz, .npy, HDF5, MATLAB, CSV and NIfTI) as named arrays.
 
-The names are displacement (complex), frequencies [Hz], spacing [m], origin [m], mask, labels and unit. Instead of
-displacement, a file may have real and imag, phases (real values at instants of a period), or wrapped (phases between
+The possible names are displacement (complex), frequencies [Hz], spacing [m], origin [m], mask, labels and unit. Instead
+of displacement, a file may have real and imag, phases (real values at instants of a period), or wrapped (phases between
 -pi and pi).
 """
 
+import difflib
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,11 +35,13 @@ NAMES = (
     "unit",
 )
 WAVES = ("displacement", "real", "imag", "phases", "wrapped")
-#: Name for the position of the voxels in space (3, 4) [m]: the three axes, then the first voxel. Only NIfTI files have
-#: this entry.
+#: Name of the entry for the position of the voxels in space (3, 4) [m]: the vectors of the three axes, then the first
+#: voxel. Only NIfTI files have this entry.
 PLACE = "(place)"
-#: Name for a message if a file states two different voxel sizes.
+#: Name of the entry for an error message if a file states two different voxel sizes.
 CONFLICT = "(conflict)"
+#: Name for notes on arrays that are not used, but whose names are similar to a known name.
+NEARLY = "(nearly)"
 HDF5 = (".h5", ".hdf5")
 
 
@@ -76,10 +80,10 @@ def arrays(path: Path) -> Content:
 
 
 def single(path: Path, name: str, spacing_given: bool = False) -> tuple[np.ndarray, object, object]:
-    """Return one array (nx, ny, nz), and the spacing and `PLACE` of the file. The array is the one of this name, or the
-    only array of the file.
+    """Return one array (nx, ny, nz), and the entries `spacing` and `PLACE` of the file. The array is the one with this
+    name, or the only array of the file.
 
-    Spacing and `PLACE` are None if the file states two different spacings and the user gives the spacing.
+    Both entries are None if the file states two different spacings and the user gives the spacing.
     """
     found = arrays(path)
     if CONFLICT in found and not spacing_given:
@@ -89,7 +93,9 @@ def single(path: Path, name: str, spacing_given: bool = False) -> tuple[np.ndarr
         return np.asarray(found[name]), *place
     own = [v for k, v in found.items() if k in ("displacement", "mask", "labels") and v is not None]
     if len(own) != 1:
-        raise InputError(f"{path}: the file has no array {name}: give the array the name {name}")
+        raise InputError(
+            f"{path}: no array of the file has the name {name}: give this name to the array that contains the {name}"
+        )
     a = np.asarray(own[0])
     a = a.reshape(a.shape[:3]) if a.ndim > 3 and a.size == np.prod(a.shape[:3]) else a
     return a, *place
@@ -100,8 +106,8 @@ def _numpy(path: Path) -> Content:
         if path.suffix.lower() == ".npy":
             return {"displacement": np.load(path, allow_pickle=False)}
         with np.load(path, allow_pickle=False) as file:
-            found = {name: file[name] for name in file}
-    except ValueError:  # NumPy's message would be about pickled objects, even for a text file
+            found = {name: file[name] for name in file} | _nearly_known(file)
+    except ValueError:  # NumPy's message is about pickled objects, even for a text file
         raise InputError(
             f"{path}: the file has no arrays of numbers: write it with numpy.save or numpy.savez"
         ) from None
@@ -117,11 +123,24 @@ def _matlab(path: Path) -> Content:
         return _hdf5(path)
     from scipy.io import loadmat
 
-    return _with_plain_unit({name: value for name, value in loadmat(path).items() if name in NAMES})
+    every = loadmat(path)
+    return _with_plain_unit({name: value for name, value in every.items() if name in NAMES} | _nearly_known(every))
+
+
+def _nearly_known(names: Iterable[str]) -> Content:
+    """Return notes on unknown names that are similar to a known one, under `NEARLY`. A mask of a wrong name would
+    otherwise be ignored without a word."""
+    names = list(names)
+    wanted = [name for name in NAMES if name not in WAVES or not set(WAVES) & set(names)]
+    unknown = [name for name in names if name not in NAMES]
+    near = {name: difflib.get_close_matches(name.lower(), wanted, n=1, cutoff=0.75) for name in unknown}
+    notes = [f"the array {name!r} is not used: did you mean {own[0]}?" for name, own in near.items() if own]
+    return {NEARLY: notes} if notes else {}
 
 
 def _with_plain_unit(found: Content) -> Content:
-    """Return the arrays with the unit as text. Programs may store the unit as bytes, or as an array of one word."""
+    """Return the arrays, with the unit as a Python string. Programs may store the unit as bytes, or as an array with
+    one string."""
     if found.get("unit") is None:
         return found
     word = np.ravel(found["unit"])[0] if np.size(found["unit"]) else ""
@@ -132,7 +151,7 @@ def _hdf5(path: Path) -> Content:
     import h5py
 
     with h5py.File(path) as file:
-        found: Content = {name: _values(file[name]) for name in NAMES if name in file}
+        found: Content = {name: _values(file[name]) for name in NAMES if name in file} | _nearly_known(file)
         # The names may also be attributes of the file or of the array of waves.
         for own in (file, *(file[name] for name in WAVES if name in file)):
             found = {name: own.attrs[name] for name in NAMES if name in own.attrs} | found
@@ -160,12 +179,12 @@ ALSO = {"frequency_hz": "frequency", "hertz": "frequency", "labels": "label", "r
 _KNOWN = (*COLUMNS, "frequency", "label", "mask")
 
 
-#: Units that may stand at the end of a heading of positions or displacements, and their factors to metres.
+#: Units at the end of a heading of positions or displacements, and the factors that convert them to metres.
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
 
 
 def _without_units(path: Path, head: list[str]) -> tuple[list[str], dict[str, str]]:
-    """Return the headings without units, and the units of the positions (key "x") and displacements (key "u") if the
+    """Return the headings without units, and the units of positions (key "x") and displacements (key "u"), if the
     headings state units.
 
     Examples of headings with units are `x_mm`, `x [mm]` and `u_re_x (um)`.
@@ -200,7 +219,7 @@ def _voxel_table(path: Path) -> Content:
     missing = [name for name in COLUMNS if name not in head]
     if missing:
         raise InputError(
-            f"{path}: no column {missing[0]}: give {','.join(COLUMNS)}, and frequency if there are several"
+            f"{path}: no column {missing[0]}: give {','.join(COLUMNS)}, and frequency if there are several frequencies"
         )
     rows = np.full((len(lines) - 1, len(head)), np.nan)
     for k, (number, line) in enumerate(lines[1:]):
@@ -244,8 +263,8 @@ def _voxel_table(path: Path) -> Content:
 
 
 def _quick_number(text: str, between: str) -> float | None:
-    """Return the number in a cell, or None. Plain numbers are read by Python's fast conversion, because there may be
-    millions of cells."""
+    """Return the number in a cell, or None if the cell contains no number. Plain numbers are read by Python's fast
+    conversion, because there may be millions of cells."""
     try:
         return float(text)
     except ValueError:
@@ -253,7 +272,8 @@ def _quick_number(text: str, between: str) -> float | None:
 
 
 def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Return the grid indices (n, 3) of points X on a regular grid, and the spacing, origin and shape of the grid."""
+    """Return the grid indices (n, 3) of the points X (n, 3) [m], and the spacing [m], origin [m] and shape of their
+    regular grid."""
     if not np.all(np.isfinite(X)) or not len(X):
         raise InputError(f"{path}: no rows, or rows without x, y, z: give the position of every voxel in metres")
     spacing = np.empty(3)
@@ -263,7 +283,7 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
             raise InputError(f"{path}: all voxels have the same {'xyz'[a]}: waves need a volume, not a single slice")
         spacing[a] = steps[steps < 1.5 * steps.min()].mean()
     origin = X.min(axis=0)
-    # Positions in a file are rounded, so the whole length gives a more exact spacing than single steps.
+    # Positions in a file are rounded, so the total length gives a more exact spacing than single steps.
     spacing = np.ptp(X, axis=0) / np.rint(np.ptp(X, axis=0) / spacing)
     at = np.rint((X - origin) / spacing).astype(int)
     off = np.abs(X - origin - at * spacing).max(axis=0) / spacing
@@ -273,15 +293,15 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _nifti(path: Path) -> Content:
-    """Read complex data (nx, ny, nz, 3) or (nx, ny, nz, F, 3) from a NIfTI file. Real data are read as labels, for a
-    mask or labels. Voxel sizes are in mm unless the file states another unit."""
+    """Read complex data (nx, ny, nz, 3) or (nx, ny, nz, F, 3) from a NIfTI file. Real data are regarded as labels or a
+    mask. Voxel sizes are in mm, unless the file states another unit."""
     try:
         import nibabel
     except ImportError:
         raise InputError(f"{path}: NIfTI files need nibabel: pip install '.[nifti]', or give a .npz file") from None
     image: Any = nibabel.load(path)
     data = np.asarray(image.dataobj)
-    unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm if it is not stated
+    unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm if the unit is not stated
     size, axes = _voxel_size(path, image), unit * np.asarray(image.affine)[:3]
     found: Content = {"spacing": unit * size} if size.any() else {}
     stated = np.abs(np.asarray(image.header["pixdim"][1:4], float))
@@ -304,7 +324,7 @@ def _has_place(image: "nibabel.Nifti1Image") -> bool:
 
 
 def _voxel_size(path: Path, image: "nibabel.Nifti1Image") -> np.ndarray:
-    """Return the size of the voxels (3,) in the unit of the file; zeros if the file states no size."""
+    """Return the size of the voxels (3,) in the unit of the file. Return zeros if the file states no size."""
     if not _has_place(image):
         stated = np.abs(np.asarray(image.header["pixdim"][1:4], float))
         return stated if np.all(stated) else np.zeros(3)

@@ -1,17 +1,17 @@
-"""Unwrap phases that a scanner has wrapped into (-pi, pi], so that they are continuous in space and in time."""
+"""Unwrap phases that a scanner has wrapped into (-pi, pi]. Unwrapped phases are continuous in space and in time."""
 
 import numpy as np
 
 from liverjax.core.errors import InputError
 
-#: If the wrapped phases of two neighbours differ by more than _STEEP times pi, their difference is nearly ambiguous. A
-#: note is given if this holds for more than the fraction _MANY of the neighbours.
+#: If the phases of two neighbouring voxels differ by more than _STEEP times pi, a jump may be hidden. A note is given
+#: if this holds for more than the fraction _MANY of the neighbours.
 _STEEP, _MANY = 0.8, 0.01
 
 
 def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Return phases without jumps (NaN where they are not measured), and notes. A note is given if jumps are left, or
-    if phases change so fast from voxel to voxel that jumps cannot be distinguished from waves.
+    """Return phases [rad] without jumps, and notes. Phases are NaN where they are not measured. A note is given if
+    jumps are left, or if phases change so fast from voxel to voxel that jumps cannot be distinguished from waves.
 
     In space, pairs of neighbouring voxels are unwrapped in the order of their reliability (Herraez et al. 2002, Appl.
     Opt. 41, 7437). Then the mean phase of each volume is known except for multiples of 2 pi. These multiples are chosen
@@ -37,7 +37,7 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
     out = np.full(phases.shape, np.nan)
     for f, t, c in np.ndindex(phases.shape[0], phases.shape[1], phases.shape[-1]):
         one = phases[f, t, ..., c]
-        volume = np.ma.masked_array(np.nan_to_num(one), np.isnan(one))  # with NaN, `unwrap_phase` would not end
+        volume = np.ma.masked_array(np.nan_to_num(one), np.isnan(one))  # with NaN, `unwrap_phase` would run forever
         out[f, t, ..., c] = np.ma.filled(unwrap_phase(volume, rng=0), np.nan)
     levels = np.nanmedian(out, axis=(2, 3, 4))  # (F, T, 3)
     left = sum(int(np.sum(np.abs(np.diff(out, axis=a)) > np.pi)) for a in (2, 3, 4))
@@ -50,8 +50,8 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
 
 def _of_steep_phases(phases: np.ndarray) -> list[str]:
-    """Return a note for each frequency with many neighbouring voxels that differ by nearly pi. This is the largest
-    difference that wrapped phases can show."""
+    """Return a note for each frequency at which the phases of many neighbouring voxels differ by nearly pi. This is the
+    largest difference that wrapped phases can show."""
     notes = []
     for f, one in enumerate(phases):
         steps = [np.diff(one, axis=a) for a in (1, 2, 3)]

@@ -17,13 +17,13 @@ class ArrudaBoyce(Law):
     """
 
     mu: Number = param("Pa", "n k_B Theta", above=0.0, typical=730.0)
-    chain_length: Number = param("1", "rigid links of a chain, N", above=0.0, typical=8.0)
+    chain_length: Number = param("1", "number N of rigid links in a chain", above=0.0, typical=8.0)
     bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """Energy of the series. The factor (Ibar1 - 3) is taken out, so that there is no cancellation at rest."""
+        """Energy, the sum of the series. The factor (Ibar1 - 3) is factored out to avoid cancellation at rest."""
         total = 0.0
         for k, c in enumerate(COEFFICIENTS, start=1):
             # (I^k - 3^k) = (I - 3) sum_m I^m 3^(k-1-m), by Horner's rule.

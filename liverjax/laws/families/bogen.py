@@ -24,7 +24,7 @@ class Bogen(Law):
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
-        """The exponent alpha."""
+        """Return the exponent alpha."""
         return (self.alpha,)
 
     def stretch_energy(self, X):

@@ -15,7 +15,7 @@ from liverjax.tensors.material_axes import SIX, symmetric
 
 @struct
 class Costa(Law):
-    """W = c/2 (exp Q - 1) + U(J), Q = sum b_AB E_AB^2 over fibre, sheet, normal, shear pairs counted twice.
+    """W = c/2 (exp Q - 1) + U(J), Q = sum of b_AB E_AB^2 over fibre, sheet and normal (shears twice).
 
     Q = b_ff E_ff^2 + b_ss E_ss^2 + b_nn E_nn^2 + 2 (b_fs E_fs^2 + b_fn E_fn^2 + b_sn E_sn^2). Costa, Holmes and
     McCulloch 2001. The book chapter names this law (section 4.1.2 i, for heart muscle) but prints no formula for it. E
@@ -67,14 +67,14 @@ class Costa(Law):
     def check_directions(self):
         """Raise `InputError` if a direction has length 0, or the sheet is parallel to the fibre.
 
-        Traced directions are not checked.
+        Directions inside jit, grad or vmap are not checked.
         """
         if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves((self.fibre, self.sheet))):
             return
         f, s = np.asarray(self.fibre, float), np.asarray(self.sheet, float)
         if f.shape[-1:] != (3,) or s.shape[-1:] != (3,):
             raise InputError(
-                f"law costa: fibre and sheet have shapes {f.shape} and {s.shape}: give (3,) or a row of 3 per element"
+                f"law costa: fibre and sheet have shapes {f.shape} and {s.shape}: give (3,), or (E, 3) for E elements"
             )
         size = np.linalg.norm(f, axis=-1) * np.linalg.norm(s, axis=-1)
         if np.any(np.linalg.norm(np.cross(f, s), axis=-1) <= 1e-9 * size):

@@ -26,7 +26,7 @@ class Exponential(Law):
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
-        """The exponent alpha."""
+        """Return the exponent alpha."""
         return (self.alpha,)
 
     def stretch_energy(self, X):

@@ -24,7 +24,7 @@ class Logarithmic(Law):
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
-        """The exponent alpha."""
+        """Return the exponent alpha."""
         return (self.alpha,)
 
     def stretch_energy(self, X):
@@ -32,7 +32,7 @@ class Logarithmic(Law):
         return -self.c1 * jnp.log1p(-self._filled(X))
 
     def _filled(self, X):
-        """Return c2 X, and NaN at the pole c2 X = 1 and above."""
+        """Return c2 X, or NaN if c2 X is 1 (the pole of the energy) or more."""
         return jnp.where(self.c2 * X < 1, self.c2 * X, jnp.nan)
 
     def stretch_derivatives(self, X):

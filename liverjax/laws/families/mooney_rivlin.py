@@ -27,7 +27,7 @@ def _monomial(coefficient: float, *factors: tuple[Any, int]) -> Number:
 class MooneyRivlin(Law):
     """W = sum c_ij (Ibar1 - 3)^i (Ibar2 - 3)^j + U(J), i + j <= 3.
 
-    Book chapter, Table 1. A coefficient that is not given is left out: it needs no computation and cannot be fitted.
+    Book chapter, Table 1. A coefficient that is not given is 0. It needs no computation and cannot be fitted.
     """
 
     c10: Number = param("Pa", "coefficient of (Ibar1 - 3)", typical=300.0)
@@ -53,7 +53,7 @@ class MooneyRivlin(Law):
         return sum(c * _monomial(1.0, (a, i), (b, j)) for c, i, j in self.terms())
 
     def isochoric_derivatives(self, I1, I2):
-        """First and second derivatives of the polynomial. Terms that are always 0 are left out."""
+        """First and second derivatives of the polynomial. They do not contain terms that are always 0."""
         a, b = I1 - 3, I2 - 3
         first, second = {}, {}
         for c, i, j in self.terms():

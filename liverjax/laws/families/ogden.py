@@ -19,14 +19,16 @@ class Ogden(Law):
     law is stable for every stretch if each mu_k alpha_k > 0.
     """
 
-    mu: Sequence[float] | Array = param("Pa", "mu_k, one per term", each=True, typical=(700.0, -40.0))
-    alpha: Sequence[float] | Array = param("1", "alpha_k, one per term", nonzero=True, each=True, typical=(2.5, -4.0))
+    mu: Sequence[float] | Array = param("Pa", "mu_k, one for each term", each=True, typical=(700.0, -40.0))
+    alpha: Sequence[float] | Array = param(
+        "1", "alpha_k, one for each term", nonzero=True, each=True, typical=(2.5, -4.0)
+    )
     bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
-        """The exponents alpha_k."""
+        """Return the exponents alpha_k."""
         return tuple(self.alpha)
 
     def stretch_energy(self, *X):
@@ -44,4 +46,6 @@ class Ogden(Law):
     def check(self):
         """Raise `InputError` if mu and alpha have different numbers of terms."""
         if len(self.mu) != len(self.alpha):
-            raise InputError(f"law ogden has {len(self.mu)} mu and {len(self.alpha)} alpha: give one each per term")
+            raise InputError(
+                f"law ogden has {len(self.mu)} mu and {len(self.alpha)} alpha: give one mu and one alpha for each term"
+            )

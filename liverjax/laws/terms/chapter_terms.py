@@ -88,7 +88,7 @@ def _state_at(law: Energies, F: Matrix) -> _At:
 
 
 def _stress_of_product(t: _Term, s: _At) -> Matrix:
-    """Return S^k = 2 dg/dC. No matrix is inverted."""
+    """Return S^k = 2 dg/dC of the term k = g(I1, I2) h(J). No matrix is inverted."""
     return add_matrices(scale_matrix(2 * t.g1, IDENTITY), scale_matrix(2 * t.g2, s.B))
 
 
@@ -109,11 +109,11 @@ def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, jax.A
 
 
 class Layout(NamedTuple):
-    """Parts that are stored in memory. The default is the fastest choice (experiments/chapter)."""
+    """Which values are stored in memory. The default is the fastest choice (experiments/chapter)."""
 
-    #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes. None: they are computed when used.
+    #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes. None means: computed when used.
     constant: list | None = None
-    #: Whether values that blocks share are written to memory, as in `invariant_terms`. Here this is slower.
+    #: Whether values that several blocks need are written to memory, as `invariant_terms` does. Here this is slower.
     write: bool = False
 
 
@@ -201,7 +201,7 @@ def _linear_matrices(t: _Term, i: _Node, j: _Node, constant: tuple[Matrix, Numbe
 
 
 def _slope(terms: list[_Term], node: _Node, n: int) -> Vector:
-    """Return the derivative d(sum_k g h)/dx at a node, for the terms of group n."""
+    """Return the derivative d(sum_k g h)/dx with respect to the position of a node, for the terms of group n."""
     v = scale(sum(t.h1 * t.g for t in terms), node.cof)
     for t, FS in zip(terms, node.FS[n], strict=True):
         v = tuple(a + t.h * b for a, b in zip(v, FS, strict=True))

@@ -45,7 +45,7 @@ def stress(law: Energies, F: Matrix) -> Matrix:
 
 
 def blocks(law: Energies, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """Material part of the stiffness d2w/dx_i dx_j, for pairs of indices (i, j) into the shape vectors D."""
+    """Return the material stiffness blocks d2w/dx_i dx_j per reference volume, for index pairs (i, j) into D."""
     A = law.material_axes(F[0][0])
     FA = matmul(F, A)
     E, turned = green_strain(FA), [matvec(transpose(A), d) for d in D]

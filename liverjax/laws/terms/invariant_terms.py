@@ -1,7 +1,8 @@
 """Hand-derived terms at one deformation gradient: stress, tangent and the blocks of the stiffness.
 
 They are the terms of section 4.1.2 of the book chapter, summed over the products g^k h^k. J is an additional invariant.
-With W_a = dW/dI_a, W_ab = d2W/dI_a dI_b and v_a,i = dI_a/dx_i,
+With the energy W, the invariants I_a, the positions x_i of the nodes, W_a = dW/dI_a, W_ab = d2W/dI_a dI_b and
+v_a,i = dI_a/dx_i,
 
     d2W/dx_i dx_j = sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j
 
@@ -38,7 +39,7 @@ from liverjax.tensors.subsets import Subsets, in_subset, put_together
 
 
 class Stress(NamedTuple):
-    """Stress P = F S + p cof F, with p = dW/dJ. `S` is a symmetric matrix, or one array if it is spherical."""
+    """Stress P = F S + p cof F, with p = dW/dJ. `S` is a symmetric matrix, or one array if it is a multiple of Id."""
 
     S: Matrix | Any
     p: jax.Array
@@ -52,7 +53,7 @@ class Scalars(NamedTuple):
 
 
 class State(NamedTuple):
-    """Values at one deformation gradient that force and stiffness share."""
+    """Values at one deformation gradient that both force and stiffness need."""
 
     laws: tuple  # summands with energies of stretches or of Green's strain, which add up
     F: Matrix
@@ -104,7 +105,7 @@ def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
 
 
 def stress(s: State | Pieces) -> Stress:
-    """Return S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J. A missing derivative adds no term."""
+    """Return S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … (fibre a) and p = W_J. A missing W_k adds 0."""
     if isinstance(s, Pieces):
         return _put_together(s.subsets, [stress(own) for own in s.states])
     W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
@@ -176,7 +177,7 @@ def first_piola(law: Energies, F: Matrix) -> Matrix:
 def slopes(s: State, D: Vector) -> dict[str, Vector]:
     """Return derivatives at a node with shape vector D: dJ/dx = cof F D, and half of dI/dx for I1, I2 and I4.
 
-    Half of dI/dx is F D for I1, F (I1 Id - C) D for I2, and (a.D) F a for I4.
+    Half of dI/dx is F D for I1, F (I1 Id - C) D for I2, and (a.D) F a for I4 with the fibre a.
     """
     FD = matvec(s.F, D)
     v = {"I1": FD, **{key: scale(dot(a, D), matvec(s.F, a)) for key, a in s.fibres.items()}}
@@ -240,7 +241,7 @@ def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
         for r in range(3):
             for c in range(3):
                 K[r][c] = K[r][c] + swapped[r] * vi["I1"][c] + metric * s.left[r][c]
-    # W_1 d2I1 and the first part of W_2 d2I2 together: D_i . S D_j Id.
+    # W_1 d2I1 and the first term of W_2 d2I2 together: D_i . S D_j Id.
     diagonal = s.diagonal[pair]
     if W_JJ is not None:
         eps = jnp.clip(1 - s.J, 0, 1)
@@ -265,7 +266,7 @@ def blocks(
     Args:
         s: `state` of the element.
         D: shape vectors of its nodes [1/m].
-        pairs: which blocks, as indices (i, j) into D.
+        pairs: indices (i, j) into D of the blocks to compute.
         regularised: whether to replace G as in section 4.1.2 iii of the book chapter. Here eps/3 is used where the
             chapter prints eps, so that the trace does not change.
     """

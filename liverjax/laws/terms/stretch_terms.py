@@ -10,7 +10,7 @@ C_mnmn is computed as a divided difference that is exact if stretches are equal.
 (section 4.1.2) has a geometric mean instead, which is wrong except for alpha = 2 and 4.
 
 Values are computed with these formulas. Their derivatives are computed from the energy, expanded in frozen principal
-axes (`liverjax.tensors.principal`). If stretches are equal, this expansion is smooth, but the axes are not.
+axes (`liverjax.tensors.principal`). If stretches are equal, this expansion is smooth, but the principal axes are not.
 """
 
 from functools import partial
@@ -41,7 +41,7 @@ Frame = tuple[Vector, Matrix]
 
 
 class Principal(NamedTuple):
-    """Values at one F that stress and moduli share."""
+    """Values at one F that both stress and moduli need."""
 
     logs: Vector  # ln lambda_m
     axes: Matrix
@@ -111,12 +111,12 @@ def stress(law: Energies, F: Matrix, frame: Frame) -> Matrix:
 
 
 def moduli(law: Energies, F: Matrix, frame: Frame) -> list[list]:
-    """Moduli dS/dE [Pa] of w only: 6 x 6 components in the coordinate axes; `frame` is `principal(F)`."""
+    """Return the moduli dS/dE [Pa] of w only, 6 x 6 components in the coordinate axes; `frame` is `principal(F)`."""
     return _square(_moduli_of_axes(_arrays(law, F), F, frame))
 
 
 def blocks(law: Energies, F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """Material part of the stiffness d2w/dx_i dx_j, for pairs of indices (i, j) into the shape vectors D."""
+    """Return the material stiffness blocks d2w/dx_i dx_j per reference volume, for index pairs (i, j) into D."""
     C = stored(moduli(law, F, frame))
     half = stored([half_contracted(C, d) for d in D])
     return [pushed(F, anisotropic(half[j], D[i])) for i, j in pairs]
@@ -209,7 +209,7 @@ def _vanishes(t: Number) -> bool:
 
 
 def _expanded_energy(law: Energies, logs: Vector, axes: Matrix, log_J0: Number, Y: tuple) -> jax.Array:
-    """Return w at C = diag(lambda^2) + N^T Y N, in the frozen principal axes N."""
+    """Return w at C = diag(lambda^2) + N^T Y N, with a change Y of C, in the frozen principal axes N."""
     X = six_of(rotated(symmetric(Y), transpose(axes)))
     relative = [x * jnp.exp(-logs[i] - logs[j]) for x, (i, j) in zip(X, SIX, strict=True)]
     one_plus = symmetric(tuple(r + (1.0 if i == j else 0.0) for r, (i, j) in zip(relative, SIX, strict=True)))

@@ -41,7 +41,7 @@ def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.nd
         name: name of the vessel, for messages.
 
     Raises:
-        InputError: a file that cannot be read, or without triangles.
+        InputError: the file cannot be read, or contains no triangles.
     """
     import meshio
 
@@ -110,7 +110,7 @@ def _edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarray:
-    """Distances (n,) along the edges from a corner at one end of the surface."""
+    """Return the distances (n,) [m] of all corners from a corner at one end of the surface, along the edges."""
     from scipy.sparse.csgraph import dijkstra
 
     first = dijkstra(graph, directed=False, indices=own[0])
@@ -118,7 +118,10 @@ def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarra
 
 
 def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> float:
-    """Distance between rings from the mean radius (area over length), large enough that no edge crosses two rings."""
+    """Return the distance [m] between rings: `_BAND` times the mean radius, or more if an edge would cross two rings.
+
+    The mean radius is the area of the surface, divided by its length and by 2 pi.
+    """
     a, b, c = (points[triangles[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     longest = max(np.ptp(away[triangles], axis=1).max(), 1e-300)
@@ -157,7 +160,8 @@ def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _R
 
 
 def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
-    """Join the two ring centres of every band by a line, and the last ring of every branch with the branch's end."""
+    """Join the centres of the two rings of every band by a line. Where a branch ends, add a line from the centre of its
+    last ring to the end of the surface."""
     count = np.bincount(r.ring)
     centre = np.stack([np.bincount(r.ring, r.points[:, k]) for k in range(3)], axis=1) / count[:, None]
     r, real = _without_tips(r, np.flatnonzero(count >= _LEAST))
@@ -184,7 +188,7 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
 
 
 def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
-    """Remove the last ring of each branch, since it may go around a corner of the end. Its two bands are merged."""
+    """Remove the last ring of each branch, since it may go around a corner of the end. Merge the bands beside it."""
     keep, band, below, above = set(real.tolist()), r.band.copy(), r.below.copy(), r.above.copy()
     sides = np.concatenate([below[real], above[real]])
     for a in real:

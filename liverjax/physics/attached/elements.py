@@ -1,8 +1,9 @@
 """Elements between nodes of the body: membranes, springs, bars. Their energy depends on their lengths and angles.
 
 At every integration point an element has d tangent vectors f_k = sum_a p_ka y_a, with the positions y_a of its nodes
-and constant factors p_ka. The energy of the element is a function W of the metric C_kl = f_k . f_l. With T_kl =
-dW/dC_kl + dW/dC_lk, the forces g_a and the stiffness blocks K_ab of nodes a and b are
+and constant factors p_ka. The energy of the element is a function W of the metric C_kl = f_k . f_l. The stress is
+T_kl = dW/dC_kl + dW/dC_lk. C_v and C_w are components of the metric, and I is the identity. The forces g_a on nodes a,
+and the stiffness blocks K_ab between nodes a and b, are
 
     g_a = sum p_ka T_kl f_l,    K_ab = sum p_ka p_lb (T_kl I + d2W/dC_v dC_w (dC_v/df_k) (dC_w/df_l)).
 """
@@ -32,11 +33,11 @@ class Elements(NodalForce):
         raise TypeError(f"{type(self).__name__} lacks energies(mesh, C)")
 
     def away(self) -> jax.Array | None:
-        """Vectors (d, 3, Q, m) that are subtracted from the tangent vectors, for ends that are not nodes, or None."""
+        """Vectors (d, 3, Q, m) to subtract from the tangent vectors if an end is not a node, otherwise None."""
         return None
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Forces (V, 3) [N]: the gradient of the energy."""
+        """Nodal forces (V, 3) [N]: the gradient of the energy with respect to the positions x (V, 3)."""
         p, nodes = self.tangents(mesh), self.nodes(mesh)
         f = self._vectors(p, x[nodes])
         T = _tension(jax.grad(lambda C: jnp.sum(self.energies(mesh, C)))(_metric(f)))
@@ -50,7 +51,7 @@ class Elements(NodalForce):
         return jnp.sum(self.energies(mesh, _metric(f)))
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Stiffness: second derivatives of the energy."""
+        """Stiffness of the elements: second derivatives of the energy with respect to the positions x (V, 3)."""
         p, nodes = self.tangents(mesh), self.nodes(mesh)
         f = self._vectors(p, x[nodes])
         C = _metric(f)
@@ -71,13 +72,13 @@ class Elements(NodalForce):
         return Attached(nodes, jnp.einsum("kaqm,kibjqm->aibjm", p, right))
 
     def _vectors(self, p: jax.Array, y: jax.Array) -> jax.Array:
-        """Tangent vectors (d, 3, Q, m)."""
+        """Tangent vectors (d, 3, Q, m) of the elements, from the positions y (n, m, 3) of their nodes."""
         f, away = jnp.einsum("kaqm,ami->kiqm", p, y), self.away()
         return f if away is None else f - away
 
 
 def _metric(f: jax.Array) -> tuple[jax.Array, ...]:
-    """Components C_kl (Q, m) of the metric, for k <= l."""
+    """Components C_kl = f_k . f_l (Q, m) of the metric, for k <= l. f: tangent vectors."""
     return tuple(jnp.sum(f[k] * f[l], axis=0) for k in range(len(f)) for l in range(k, len(f)))
 
 
@@ -89,7 +90,8 @@ def _tension(slopes: tuple[jax.Array, ...]) -> list[list[jax.Array]]:
 
 
 def _changes(f: jax.Array) -> list[list[jax.Array]]:
-    """Derivatives dC_v/df_k (3, Q, m) of the components C_v of the metric with respect to the tangent vectors."""
+    """Derivatives dC_v/df_k (3, Q, m) of the components C_v of the metric with respect to the tangent vectors f_k, as
+    nested lists [v][k]."""
     if len(f) == 1:
         return [[2 * f[0]]]
     zero = jnp.zeros_like(f[0])

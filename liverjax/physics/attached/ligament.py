@@ -30,9 +30,9 @@ class Ligament(Physics):
 
     nodes: Indices = param("1", "node numbers (n, m)", lower=0)
     weights: Array = param(
-        "1", "weights of these nodes in the fibre's vector (n, m): sum 0, or sum 1 if it ends outside"
+        "1", "weights of these nodes in the fibre's vector (n, m): sum 0, or sum 1 if the fibre ends outside"
     )
-    to: Numbers | None = param("m", "end of the fibres outside the body (3,); None: both ends are in it", default=None)
+    to: Numbers | None = param("m", "end of the fibres outside the body (3,); None: both ends are inside", default=None)
     stiffness: Number = param("N/m", "total stiffness of all fibres", above=0.0)
     pre_tension: Number | None = param(
         "N", "total tension of all fibres in the reference shape", lower=0.0, default=None
@@ -102,7 +102,7 @@ class Ligament(Physics):
         return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes and fibre directions, for fibres that end outside the body and are taut at the beginning."""
+        """Return the nodes and directions of the fibres that end outside the body and are taut at the beginning."""
         if self.to is None:
             return np.zeros(0, int), np.zeros((0, 3))
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
@@ -162,11 +162,11 @@ class Fibres(Elements):
     spring: Any = param("N/m", "stiffness of one fibre")
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Nodes at which the fibres pull."""
+        """Numbers (n, m) of the nodes at which the fibres pull."""
         return self.at
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Factors p (1, n, 1, m): the tangent vector is the vector of the whole fibre."""
+        """Weights p (1, n, 1, m) of the nodes. The tangent vector is the vector from end to end of a fibre."""
         return jnp.asarray(self.weights)[None, :, None, :]
 
     def away(self) -> jax.Array | None:

@@ -1,4 +1,4 @@
-"""A membrane on a part of the surface, for example the capsule: it stretches with the surface and bends without force.
+"""A membrane on a part of the surface, for example the capsule. It follows the surface and has no bending stiffness.
 
 The law of the membrane acts in its plane. The stress through the thickness is 0 (plane stress). A law with an isochoric
 part is treated as incompressible: the stretch of the thickness is 1 divided by the area ratio. For another law the
@@ -63,7 +63,7 @@ class Membrane(Physics):
         layers.check(self.law, name)
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Membrane":
-        """The membrane on the same triangles of the mesh of higher order."""
+        """Return the membrane on the same triangles of the mesh of higher order."""
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def freeze(self, memory: None, step: Step) -> "Stretched":
@@ -83,7 +83,7 @@ class Stretched(Elements):
     solved: object = param("1", "not None if the stretch of the thickness is an unknown", default=None)
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Nodes of the triangles: three or more per triangle."""
+        """Node numbers (n, m) of the m triangles, with n = 3 or more nodes per triangle."""
         return jnp.stack(surface.triangle_nodes(mesh, self.triangles))
 
     def tangents(self, mesh: TetMesh) -> jax.Array:

@@ -117,7 +117,7 @@ def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
 
 
 def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "vessel", **given: object) -> Vessel:
-    """Create a vessel along a line (n, 3) [m], with one radius [m] or one per point (n,). Parts outside are left out.
+    """Create a vessel along a line (n, 3) [m], with one radius [m] or one per point (n,). Parts outside are ignored.
 
     Raises:
         InputError: the whole line is outside the body.
@@ -132,7 +132,7 @@ def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "v
 
 
 def crossing(mesh: TetMesh, lines: CentreLines, law: Law, name: str = "vessel", **given: object) -> Vessel:
-    """Create a vessel along several centre lines, for example of a tree. Parts outside the body are left out.
+    """Create a vessel along several centre lines, for example of a tree. Parts outside the body are ignored.
 
     Raises:
         InputError: all lines are outside the body.
@@ -171,7 +171,7 @@ class Bars(Elements):
     law: Law = param("1", "law of the wall")
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Nodes of the elements that the vessel crosses."""
+        """Node numbers (n, m) of the elements that the vessel crosses."""
         count = 4 if mesh.order == 1 else 10
         return jnp.stack([nodes[self.element] for nodes in mesh.element_nodes[:count]])
 

@@ -3,7 +3,7 @@
 Every contact point has an elastic slip e [m] along the obstacle's surface, which is stored from step to step. Within a
 step, the slip grows with the motion of the point relative to the obstacle. The maximum slip is mu times the depth of
 the point in the obstacle. At the maximum slip the point slides. The shear stress is `stiffness` times e, and the
-pressure is `stiffness` times the depth. So a sticking point moves by at most mu times its depth, and it does not creep.
+pressure is `stiffness` times the depth. So a sticking point moves by at most mu times its depth, and does not creep.
 When a contact opens, its slip is set to 0.
 
 The force has no energy, since sliding dissipates energy. The tangent is exact. It is not symmetric if points slide.
@@ -65,7 +65,7 @@ class RoughObstacle(Obstacle):
         return jnp.zeros_like(contact_points(self, start.mesh, start.x))
 
     def freeze(self, memory: Any, step: Step) -> "Rubbing":
-        """Force term with the slip, and with the contact points relative to the obstacle, at the step's beginning."""
+        """Return the force term. It stores slip and contact points (relative to the obstacle) of the beginning."""
         plain = super().freeze(memory, step)
         moved = plain.moved
         # In a static run the first positions are only a guess, so slip is measured from the reference shape.
@@ -176,7 +176,7 @@ class Rubbing(Touching):
 
 
 def _of_slip(trial: jax.Array) -> jax.Array:
-    """Length (Q, m) of slips (3, Q, m), limited from below to avoid division by 0."""
+    """Lengths (Q, m) [m] of slips (3, Q, m), at least 1e-100 to avoid a division by 0."""
     return jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
 
 

@@ -59,7 +59,9 @@ class Obstacle(Physics):
     half_angle: Number = param("deg", "angle between axis and side of a cone", above=0.0, default=45.0)
     by: Numbers | None = param("m", "displacement (3,), reached at the last step", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
-    history: Numbers | None = param("m", "displacements at these times (T, 3), or factors of by (T,)", default=None)
+    history: Numbers | None = param(
+        "m", "displacements at these times (T, 3), or factors (T,) that multiply `by`", default=None
+    )
     stiffness: Any = param(
         "Pa/m", "pressure per depth, one number or one per triangle (m,); None: from the law", above=0.0, default=None
     )
@@ -121,7 +123,7 @@ class Obstacle(Physics):
         if self.history is not None and np.ndim(self.history) == 2 and self.by is not None:
             raise InputError(f"{name} has by and a history of displacements: remove one of them")
         if self.history is not None and np.ndim(self.history) == 1 and getattr(self, self.driven) is None:
-            raise InputError(f"{name} history has factors of by, but there is no by: give by")
+            raise InputError(f"{name} history has factors, but the vector by that they multiply is missing: give by")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
         """Raise InputError if the obstacle is inside the body at the beginning."""
@@ -148,8 +150,8 @@ class Obstacle(Physics):
     def in_body(self, mesh: TetMesh, law: Law) -> "Obstacle":
         """Compute the default stiffness from the law.
 
-        It is `HARDNESS` times the stiffness of a layer with the modulus K + 4/3 mu. The bulk modulus K is limited to 3
-        mu, with the shear modulus mu.
+        The default is `HARDNESS` times the modulus K + 4/3 mu, divided by the size of the triangle. mu is the shear
+        modulus. The bulk modulus K is limited to 3 mu.
         """
         if self.stiffness is not None:
             return self
@@ -159,11 +161,11 @@ class Obstacle(Physics):
         return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
 
     def at_beginning(self) -> "Obstacle":
-        """The obstacle at time 0 of its history. Without a history it is at its initial position."""
+        """Return the obstacle at time 0 of its history. Without a history, the obstacle is at its initial position."""
         return replace(self, by=None) if self.history is None else self
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Obstacle":
-        """The obstacle for the same triangles of the mesh of higher order."""
+        """Return the obstacle for the same triangles of the mesh of higher order."""
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
@@ -206,7 +208,7 @@ class Touching(NodalForce):
         return self.force_at(mesh, x, self.place(x, s))
 
     def force_at(self, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-        """Forces (V, 3) [N] as in `force`, with the obstacle displaced by `moved` (3,) [m]."""
+        """Return the same forces (V, 3) [N] as `force`, for an obstacle that is displaced by `moved` (3,) [m]."""
         return contact_force(self.obstacle, mesh, x, moved)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
@@ -215,7 +217,7 @@ class Touching(NodalForce):
         return 0.5 * jnp.sum(weighted_stiffness(self.obstacle, mesh) * depth**2)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of the energy: a part along the normal plus a part from the change of the normal."""
+        """Second derivative of the energy: a part along the normal, plus a part due to the change of the normal."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
         # A surface that just touches counts as pressed. Otherwise a body on a plane would have no support at first.
@@ -229,7 +231,7 @@ class Touching(NodalForce):
         return Attached(touching_nodes(self.obstacle, mesh), between_nodes(mesh, H))
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Stiffness along the normal. The part from the change of the normal is never positive and is left out."""
+        """Stiffness along the normal. The part due to the change of the normal is never positive, so it is omitted."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         k = k * just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack([jnp.stack([k * a * b for b in d.normal]) for a in d.normal])
@@ -239,7 +241,7 @@ class Touching(NodalForce):
 def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
     """Force (V, 3) [N] of each node on the obstacle at positions x (V, 3), with the obstacle displaced by `moved` (3,).
 
-    It is the gradient of the energy.
+    This force is the gradient of the contact energy.
     """
     d = _distances(obstacle, mesh, x, moved)
     depth = depths(d, touching_distance(obstacle, mesh))
@@ -250,8 +252,8 @@ def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
 def depths(d: Distance, near: jax.Array) -> jax.Array:
     """Negative distances (Q, m) [m] of the points inside the obstacle, 0 for other points.
 
-    Points nearer than `near` (m,) count as pressed, as in the stiffness. At a point that just touches, `minimum` would
-    give half the derivative.
+    Points nearer than `near` (m,) [m] count as pressed, also in the stiffness. At a point that just touches, the
+    function `minimum` would give half of the derivative.
     """
     pressed = d.value - jax.lax.stop_gradient(jnp.maximum(d.value, 0.0))
     return jnp.where(d.value <= near[None], pressed, 0.0)
@@ -273,12 +275,13 @@ def between_nodes(mesh: TetMesh, H: jax.Array) -> jax.Array:
 def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
     """Maximum depth () [m] of the surface in the obstacle at positions x (V, 3); 0 if all points are outside."""
     deepest = -jnp.min(_distances(obstacle, mesh, x, moved).value)
-    return jnp.where(deepest >= 0, deepest, 0.0)  # `maximum` would have half the derivative at a point that touches
+    return jnp.where(deepest >= 0, deepest, 0.0)  # `maximum` would give half the derivative at a point that touches
 
 
 @jax.jit  # compiled, since the checks of a sweep call it for each run
 def _depth_at_beginning(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Depth () [m] of the surface in the obstacle at the beginning of a run; minus the distance if they are apart."""
+    """Depth () [m] of the surface in the obstacle at the beginning of a run. If body and obstacle do not touch, this is
+    minus their distance."""
     return -jnp.min(_distances(obstacle, mesh, mesh.points, obstacle.displacement(0, 1, 0.0)).value)
 
 
@@ -293,9 +296,10 @@ def point_functions(mesh: TetMesh, dtype: DTypeLike) -> jax.Array:
 
 
 def _rule(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Weights and contact points of a triangle.
+    """Weights and barycentric coordinates of the contact points of a triangle.
 
-    A triangle of order 3 has more than three points, since its surface could enter an obstacle between three points.
+    A triangle of order 3 has more than three points. With only three points, the surface between them could enter an
+    obstacle.
     """
     return triangle_rule() if mesh.order == 3 else _POINTS
 
@@ -335,7 +339,7 @@ _FEWEST, _MOST = 6, 24
 
 
 def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> tuple[float, float]:
-    """Depth [m] of a round obstacle that the contact points miss, and the approach [m] of the obstacle.
+    """Return the depth [m] of a round obstacle that the contact points do not show, and its approach [m].
 
     The obstacle is displaced by `moved` (3,), and the body is at positions x (V, 3). The approach is the depth of the
     obstacle in the undeformed body. If this depth is 0, the approach is a tenth of the radius.

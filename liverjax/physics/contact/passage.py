@@ -1,7 +1,7 @@
 """Check whether a sphere or a cylinder passes through the surface of the body within a step.
 
 Contact depends only on the distance between the surface and the obstacle. So a sphere deep inside the body touches
-nothing, and the contact forces on a sphere with its centre inside the body point to the wrong side.
+nothing. If the centre of a sphere is inside the body, the contact forces point in the wrong direction.
 """
 
 import numpy as np
@@ -57,7 +57,7 @@ def _of_touching_body(mesh: TetMesh, elements: np.ndarray, triangles: np.ndarray
 def passed_in_step(
     shape: str, axis: np.ndarray, mesh: TetMesh, positions: np.ndarray, centres: np.ndarray, triangles: np.ndarray
 ) -> str:
-    """Describe how an obstacle passes the body within a long step: "has its centre in", "went through", or "".
+    """Return how an obstacle passes the body within a long step: "has its centre in", "went through", or "" (no).
 
     The obstacle went through if a position on its path is in the body both at the beginning and at the end of the step.
     Without a passage there is no such position: the body recovers behind an obstacle that leaves it, and moves away in
@@ -66,7 +66,7 @@ def passed_in_step(
     Args:
         positions: (2, V, 3) [m] at the beginning and at the end of the step.
         centres: positions of the obstacle at these times (2, 3) [m].
-        shape, axis, mesh, triangles: as in `in_body`.
+        shape, axis, mesh, triangles: the same arguments as for `in_body`.
     """
     way = centres[1] - centres[0]
     size = float(np.cbrt(np.median(np.abs(np.asarray(mesh.volumes)))))

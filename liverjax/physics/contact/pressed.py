@@ -58,7 +58,7 @@ class PressedObstacle(Obstacle):
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError as `Obstacle` does, and for a missing force, a prescribed motion or negative factors."""
+        """Raise InputError as `Obstacle` does, also for a missing force, a prescribed motion or negative factors."""
         super().check(mesh, name)
         history.check_times(self.times, self.history, name, (1,))
         if self.history is not None and np.any(np.asarray(self.history) < 0):
@@ -73,7 +73,7 @@ class PressedObstacle(Obstacle):
             raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give them")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError as `Obstacle` does, and for a force that moves the obstacle past the body."""
+        """Raise InputError as `Obstacle` does, also for a force that moves the obstacle past the body."""
         super().check_place(mesh, name)
         if not self._meets(mesh, contact_points):
             if self._meets(mesh, near_points):
@@ -104,7 +104,7 @@ class PressedObstacle(Obstacle):
         return np.zeros(0, int), np.zeros((0, 3))
 
     def at_beginning(self) -> "PressedObstacle":
-        """The obstacle under the force at time 0. Without a history this force is 0."""
+        """Return the obstacle under the force at time 0. Without a history this force is 0."""
         return self if self.history is not None else replace(self, times=jnp.zeros(1), history=jnp.zeros(1))
 
     def direction(self) -> jax.Array:
@@ -116,7 +116,7 @@ class PressedObstacle(Obstacle):
         """Magnitude () [N] of the force at the end of step k; step 0 is the beginning of the run."""
         whole = jnp.linalg.norm(jnp.asarray(self.force, float))
         factor = k / steps if self.history is None else history.value_at(1.0, k * dt, self.times, self.history)
-        # `maximum` would have half the derivative at a factor of 0.
+        # `maximum` would give half of the derivative at a factor of 0.
         return jnp.where(factor >= 0, whole * factor, 0.0)
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
@@ -133,7 +133,7 @@ class PressedObstacle(Obstacle):
         return True
 
     def freeze(self, memory: Any, step: Step) -> "Pressing":
-        """Force term with the force at both ends of the step, and the obstacle's displacement at the beginning."""
+        """Return the force term. It stores the force at both ends of the step, and the initial displacement."""
         dt, dtype = 0.0 if step.dt is None else step.dt, step.x.dtype
         load = jnp.stack([jnp.asarray(self.load(n, step.steps, dt), dtype) for n in (step.k - 1, step.k)])
         return Pressing(
@@ -185,14 +185,16 @@ class Pressing(Touching):
         """Displacement () [m] along the force at which the contact balances the force; NaN if none is found."""
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))
-        # Newton steps from the solution change only its derivatives. One step gives the first, two give the second.
+        # Newton steps from the solution change only its derivatives. One step gives the first derivative, two steps
+        # give the second.
         for _ in range(2):
             held, slope, _ = self._resistance(at, found)
             found = found + (load - held) / jnp.where(slope > 0, slope, 1.0)
         return found
 
     def _resistance(self, at: jax.Array, travel: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Force dE/dt [N], its derivative [N/m] with respect to the displacement, and the minimum distance [m]."""
+        """Contact force [N] against the displacement `travel` along the line of the force, the derivative [N/m] of this
+        force with respect to `travel`, and the minimum distance [m] of the points `at` from the obstacle."""
         d = distances(self.obstacle, at, travel * self.direction)
         depth, inside = depths(d, self.near), (d.value <= self.near[None]).astype(at.dtype)
         along = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
@@ -201,7 +203,7 @@ class Pressing(Touching):
         return -jnp.sum(self.hardness * depth * along), jnp.sum(slope), jnp.min(d.value)
 
     def _found(self, at: jax.Array, load: jax.Array) -> jax.Array:
-        """Find the displacement by Newton's method, with steps of at most twice the depth.
+        """Find the displacement () [m] by Newton's method, with steps of at most twice the depth; NaN if none is found.
 
         The contact force grows with the displacement.
         """
@@ -241,7 +243,7 @@ class Pressing(Touching):
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay:
         """Loss of stiffness because the obstacle can move.
 
-        If `definite` is true, the change of the normals is left out, as in the method `definite` of the contact.
+        If `definite` is true, the change of the normals is ignored, as the method `definite` of the contact does.
         """
         at = self.points(x)
         d = distances(self.obstacle, at, self.travel(at, s) * self.direction)

@@ -52,7 +52,7 @@ def distance(shape: str, y: list[jax.Array], axis: Any, radius: Number, half_ang
 
 
 def _normal_to(y: list[jax.Array], axis: Array) -> list[jax.Array]:
-    """Part of y perpendicular to the axis."""
+    """Return the part of the vectors y perpendicular to the axis."""
     along = sum(a * c for a, c in zip(axis, y, strict=True))
     return [c - along * a for a, c in zip(axis, y, strict=True)]
 
@@ -60,7 +60,7 @@ def _normal_to(y: list[jax.Array], axis: Array) -> list[jax.Array]:
 def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Distance:
     """Distance of the points y from a sphere centred at 0, or from a cylinder with an axis through 0.
 
-    For a cylinder, y has no component along the axis.
+    For a cylinder, pass only the part of y that is perpendicular to the axis.
     """
     # At the centre the normal is not defined; this bound avoids a division by 0.
     r = jnp.sqrt(jnp.maximum(sum(c * c for c in y), 1e-30))

@@ -5,7 +5,7 @@ the mean volume ratio J of the elements around node a, weighted by their volumes
 volumes. A mesh has about five times fewer nodes than elements. So there are five times fewer constraints if the bulk
 modulus is large. The pressure of a node is p_a = U'(J_a), and the pressure of an element is the mean over its nodes.
 The stiffness is the stiffness at given pressures plus G^T D^-1 G, with the derivative G of the nodal volumes and D =
-V_a/U''. The step of a porous body without flow has the same system.
+V_a/U''. A step of a porous body without flow leads to the same system of equations.
 
 If elements have different volumetric energies, a node has the mean of these energies, weighted by volume.
 """
@@ -103,7 +103,7 @@ class Averaged(VolumeStress):
         return scale_matrix(interpolated(mesh, pressure), cofactor(F))
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """Pressure of an element, with the derivative 0, since the pressures of the nodes are given."""
+        """Pressure [Pa] of the elements. Its derivative with respect to J is 0, since the nodal pressures are given."""
         p = interpolated(mesh, pressure)
         return Scalars({"J": p}, {("J", "J"): jnp.zeros_like(p)})
 

@@ -7,8 +7,8 @@ With pressures p the energy per volume is
 
 with p linear in every element and continuous. If p is optimal, this energy is U with g averaged by the shape functions
 of p. So volume changes are limited only on average, not at every point. The part gamma of the bulk modulus stays in the
-displacement terms, so that their matrix is positive. It is gamma = min(mu, K/2), with the shear modulus mu, and a
-quarter of this in linear elements. When the mesh is refined, the solution no longer depends on gamma. Pressures are
+displacement terms, so that their matrix is positive. gamma is min(mu, K/2), with the shear modulus mu; in linear
+elements it is a quarter of this. When the mesh is refined, the solution no longer depends on gamma. Pressures are
 unknowns together with the positions. If they were eliminated, Newton's method would not converge for large K.
 
 In linear elements, the positions do not determine all pressures: some pressures that alternate from node to node cause
@@ -69,11 +69,12 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
     return d * jnp.sqrt(jnp.where(jnp.abs(d) < 0.1, series, whole))
 
 
-#: gamma / min(mu, K/2) for each element order. In linear elements gamma causes locking, so smaller is more accurate.
+#: gamma divided by min(mu, K/2), for each element order. In linear elements gamma causes locking, so a smaller gamma is
+#: more accurate.
 _PART = {1: 0.25, 2: 1.0, 3: 1.0}
 
 
-#: Newton's method reaches relative residuals of this many times the machine precision.
+#: Smallest relative residual that Newton's method reaches, divided by the machine precision.
 _REACHED = 4096
 
 
@@ -88,7 +89,7 @@ class MixedVolume(Physics):
         return jnp.zeros(start.mesh.number_of_vertices, start.x.dtype)
 
     def freeze(self, memory: jax.Array, step: Step) -> "Mixed":
-        """Force term with the moduli, and with the pressures at the beginning of the step."""
+        """Return the force term. It stores the moduli, and the pressures at the beginning of the step."""
         U = volumetric_part(self.law)
         mu, bulk = self.law.shear_modulus(), self.law.bulk_modulus()
         part = _PART[step.mesh.order] * jnp.minimum(mu, bulk / 2)
@@ -115,11 +116,11 @@ class Mixed(VolumeStress):
     rest: Number = param("Pa", "K - gamma, part of K in the pressure terms")
     shear: Number = param("Pa", "shear modulus")
     before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
-    unit: jax.Array = param("N/m^3", "pressure of an unknown with the value 1 m; with it all residuals are forces")
+    unit: jax.Array = param("N/m^3", "pressure for an unknown of 1 m; in this unit all residuals are forces")
     counted: jax.Array = param(
         "1",
-        "mu/K, the part of all forces that sets the tolerance. The isochoric forces count in full. In a confined body "
-        "the pressures cause nearly all forces, but small volume changes determine the pressures",
+        "mu/K, the fraction of all forces on which the tolerance is based. Isochoric forces count in full. In a "
+        "confined body the pressures cause nearly all forces, but small volume changes determine the pressures",
     )
     kind: str = static(about="kind of the volumetric energy")
 

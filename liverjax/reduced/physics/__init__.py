@@ -1,1 +1,1 @@
-"""Fluid and supports of reduced models, in addition to the solid."""
+"""Forces in reduced models in addition to the stress of the solid: pressures of a fluid, and supports."""

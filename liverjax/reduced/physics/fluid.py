@@ -1,4 +1,5 @@
-"""The fluid of a porous reduced model: the pressure is a sum of a few modes, and Darcy's law gives their coordinates.
+"""The fluid of a porous reduced model: the pressure is a sum of a few modes. Darcy's law gives the coordinates of the
+modes.
 
 The pressure is P = sum_k p_k psi_k, with modes psi_k and coordinates p_k. The discrete equation of the full model
 (`liverjax.physics.porosity`) is projected onto the same modes. Its integrals are sums over the weighted points of the
@@ -9,10 +10,10 @@ reduced model:
     D_kl = sum_p w_p kappa / J_before (cof F_before grad psi_k) . (cof F_before grad psi_l),
 
 with the time step dt, the weight w_p of a point, the volume ratio J and the deformation gradient F at the end of the
-step. Values with `before` belong to the beginning of the step. K_lim is the bulk modulus of the storage, kappa the
-permeability, and N_a the shape function of vertex a. Storage is lumped at the vertices, as in the full model. Since A
-is positive definite, p is eliminated, and the remaining equations of motion have an energy. With all modes and all
-points, these are the full equations.
+step. Values with the index `before` belong to the beginning of the step. K_lim is the bulk modulus of the storage,
+kappa the permeability, and N_a the shape function of vertex a. Storage is lumped at the vertices, as in the full model.
+Since A is positive definite, p can be eliminated. The remaining forces on the body are conservative. With all modes and
+all points, these are the equations of the full model.
 """
 
 from typing import NamedTuple
@@ -36,7 +37,7 @@ from liverjax.tensors.places import given
 
 
 class ReducedFluid(NamedTuple):
-    """The state of the fluid between two steps."""
+    """State of the fluid at the end of a step, from which the next step starts."""
 
     pressure: jax.Array  # coordinates p (m,) [Pa]
     F: jax.Array  # deformation gradients (9, S)
@@ -54,7 +55,7 @@ class ReducedSponge(NamedTuple):
     """Data of the porous body that are the same in all steps."""
 
     porosity: Porosity  # with parameters at the points
-    lumped: Lumped | None  # None if the mesh has more than four vertices per point; then the points store the fluid
+    lumped: Lumped | None  # None if the mesh has more than 4 vertices per point; then each point stores its fluid
 
 
 class Flowing(NamedTuple):
@@ -62,14 +63,14 @@ class Flowing(NamedTuple):
 
     porosity: Porosity  # with parameters at the points
     inverse: jax.Array  # inverse of A (m, m) [Pa/m^3]
-    stored: jax.Array  # (m,) [m^3] S p_before; the lagged scheme subtracts the change of volume in the step before
+    stored: jax.Array  # (m,) [m^3] S p_before, minus the last step's change of volume in the lagged scheme
     averages: jax.Array  # modes at the points, times their weights (S, m) [m^3]
-    J: jax.Array  # volume ratios at the beginning (S,)
+    J: jax.Array  # volume ratios at the beginning of the step (S,)
 
 
 def reduced_sponge(model: ReducedModel, scene: Scene) -> ReducedSponge:
-    """Return the data of the porous body for a run. Storage is a sum over vertices, or over points if this sum has
-    fewer terms."""
+    """Return the data of the porous body that are the same in all steps. The storage is a sum over vertices, or over
+    points if a sum over points has fewer terms."""
     porosity, mesh = porosity_at_points(model, scene), scene.mesh
     if mesh.number_of_vertices > 4 * len(model.points):
         return ReducedSponge(porosity, None)
@@ -80,7 +81,7 @@ def reduced_sponge(model: ReducedModel, scene: Scene) -> ReducedSponge:
 
 
 def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
-    """Return the porosity with parameters at the points (S,) instead of one value per element."""
+    """Return the porosity with one value of each parameter per point (S,), instead of one per element."""
     assert scene.porosity is not None
     own = porosity_of_elements(scene.porosity, scene.region, scene.mesh)
     elements = model.points % scene.mesh.number_of_elements
@@ -90,7 +91,7 @@ def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
 
 
 def fluid_at_rest(model: ReducedModel, scene: Scene) -> ReducedFluid:
-    """Return the fluid with the initial pressure and the reference volumes."""
+    """Return the state of the fluid at the beginning: the initial pressure, and a body without deformation."""
     modes, porosity, S = model.pressures, scene.porosity, model.weights.shape[0]
     assert modes is not None and porosity is not None
     volumes = integrals(scene.mesh, jnp.ones_like(scene.mesh.weights))
@@ -101,7 +102,8 @@ def fluid_at_rest(model: ReducedModel, scene: Scene) -> ReducedFluid:
 
 
 def flowing(model: ReducedModel, sponge: ReducedSponge, memory: ReducedFluid, dt: Number) -> Flowing:
-    """Return the data of the fluid for a step of length dt [s] that begins with the state `memory`."""
+    """Return the data of the fluid for a step of length dt [s]. `memory`: state of the fluid at the beginning of the
+    step."""
     assert model.pressures is not None
     porosity, lumped, J = sponge.porosity, sponge.lumped, determinant(as_matrix(memory.F))
     stores, flows = storage_and_flow(model, porosity, memory.F, dt)
@@ -113,8 +115,8 @@ def flowing(model: ReducedModel, sponge: ReducedSponge, memory: ReducedFluid, dt
 
 
 def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: Number) -> tuple[jax.Array, jax.Array]:
-    """Return vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5], for a step that begins at F (9, S). Their scalar products
-    are the matrices S and dt D."""
+    """Return vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5]. Their scalar products are the matrices S and dt D (module
+    docstring) for a step that begins with the deformation gradients F (9, S)."""
     modes, w = model.pressures, model.weights
     assert modes is not None
     matrix = as_matrix(F)
@@ -127,7 +129,7 @@ def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: 
 
 
 def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array) -> jax.Array:
-    """Return S (m, m) [m^3/Pa] at volume ratios J (S,), computed as a sum over vertices."""
+    """Return the storage matrix (m, m) [m^3/Pa] at volume ratios J (S,), computed as a sum over vertices."""
     modes, lumped = model.pressures, sponge.lumped
     assert modes is not None and lumped is not None
     capacity = model.weights * jnp.maximum(J, darcy.LEAST_J) / sponge.porosity.limit_bulk
@@ -152,8 +154,8 @@ def pressure_coordinates(own: Flowing, J: jax.Array) -> jax.Array:
 def volume_stress(model: ReducedModel, porosity: Porosity, p: jax.Array, F: jax.Array) -> jax.Array:
     """Return the volumetric part (sigma_Heq(J) - P) cof F (9, S) [Pa] of the first Piola-Kirchhoff stress.
 
-    `p` (m,) [Pa]: coordinates of the pressure P; `F` (9, S): deformation gradients. sigma_Heq is the equilibrium stress
-    of the drained body.
+    sigma_Heq is the volumetric stress of the drained body. `p` (m,) [Pa]: coordinates of the pressure P; `F` (9, S):
+    deformation gradients.
     """
     matrix = as_matrix(F)
     stress = _scalars(model, porosity, p, matrix).first["J"]
@@ -168,17 +170,19 @@ def _scalars(model: ReducedModel, porosity: Porosity, p: jax.Array, F: Matrix) -
 
 
 def volume_blocks(model: ReducedModel, own: Flowing, F: Matrix, pairs: tuple[tuple[int, int], ...]) -> list[Matrix]:
-    """Return the derivative of `volume_stress` with respect to F at constant pressures, as blocks for `pairs` of axes.
+    """Return the derivative of `volume_stress` with respect to F at constant pressures, as one block for each pair of
+    axes in `pairs`.
 
-    The blocks are those of `invariant_terms.blocks`, with unit vectors in place of the gradients of shape functions.
+    The function `invariant_terms.blocks` computes these blocks, with unit vectors instead of the gradients of shape
+    functions.
     """
     scalars = _scalars(model, own.porosity, pressure_coordinates(own, determinant(F)), F)
     return invariant_terms.blocks(invariant_terms.state_of(scalars, F), list(IDENTITY), pairs)
 
 
 def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.Array:
-    """Return the part of the tangent (n, n) [N/m] that comes from the change of the pressures with the coordinates of
-    the motion."""
+    """Return the stiffness (n, n) [N/m] due to the change of the pressures with the reduced coordinates of the
+    motion."""
     n = model.number_of_modes
     if own.porosity.scheme == "lagged":
         return jnp.zeros((n, n), model.slopes.dtype)
@@ -188,6 +192,6 @@ def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.
 
 
 def advanced_fluid(own: Flowing, F: jax.Array) -> ReducedFluid:
-    """Return the state of the fluid after a step with deformation gradients F (9, S) at the end of the step."""
+    """Return the state of the fluid at the end of a step, where the deformation gradients are F (9, S)."""
     lagged = own.porosity.scheme == "lagged"
     return ReducedFluid(pressure_coordinates(own, determinant(as_matrix(F))), F, own.J if lagged else None)

@@ -1,13 +1,14 @@
 """The error of a porous reduced run: the response of the linearised poroelastic body to the out-of-balance forces.
 
-To first order, the error e of the motion and the error p of the pressure follow linear equations at the reference
-shape,
+To first order, the error e of the motion and the error p of the pressure are the solution of linear equations at the
+reference shape,
 
     (K + K_p) e - B^T p = load,    A p + B (e - e_before) = S p_before,
 
-with the stiffness and inertia K of the solid and the volumetric stiffness K_p of the drained body. B gives the change
-of volume at the vertices. A and S are the matrices of `liverjax.reduced.physics.fluid`, here on the full mesh. The
-lagged scheme uses the change of volume of the previous step.
+with the matrix K of stiffness and inertia of the solid, the volumetric stiffness K_p of the drained body, and the
+out-of-balance forces `load` with the forces from earlier steps. B e is the change of volume at the vertices. A and S
+are the matrices of `liverjax.reduced.physics.fluid`, here on the full mesh. The index `before` means the end of the
+previous step. The lagged scheme uses the change of volume of the previous step.
 """
 
 from collections.abc import Callable
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
 
 
 class LinearFluid(NamedTuple):
-    """Sparse matrices of the linearised porous body, for f free degrees of freedom and v unknown pressures."""
+    """Sparse matrices of the linearised porous body. f: number of free degrees of freedom; v: number of unknown
+    pressures."""
 
     stiffness: "scipy.sparse.csr_array"  # K_p, volumetric stiffness of the drained body (f, f) [N/m]
     volumes: "scipy.sparse.csr_array"  # B, change of the volume at the vertices (v, f) [m^2]
@@ -39,16 +41,16 @@ class LinearFluid(NamedTuple):
 
 
 class ErrorBefore(NamedTuple):
-    """Errors at the end of the last step, and at the end of the step before."""
+    """Errors of motion at the ends of the last two steps, and error of pressure at the end of the last step."""
 
     motion: np.ndarray  # (f,) [m]
-    motion_before: np.ndarray  # one step earlier (f,) [m]
+    motion_before: np.ndarray  # motion one step earlier (f,) [m]
     pressure: np.ndarray  # (v,) [Pa]
 
 
 def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
-    """Return the matrices of the poroelastic equations, linearised at the reference shape. Parameters of the scene must
-    be numbers or have one value per element."""
+    """Return the matrices of the poroelastic equations, linearised at the reference shape. Each parameter of the scene
+    must be one number, or have one value for each element. `free`: numbers of the free degrees of freedom."""
     import scipy.sparse
 
     mesh, porosity, dt = scene.mesh, scene.porosity, scene.solve.dt
@@ -60,7 +62,7 @@ def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
 
     shape = mesh.weights.shape
     J = scipy.sparse.hstack([slopes[i] for i in range(3)]).tocsc()
-    # Reorder the columns from all x, all y, all z to 3 node + component.
+    # Reorder the columns: from all x, then all y, then all z, to the column 3 * node + component.
     J = J[:, np.arange(3 * mesh.number_of_nodes).reshape(3, -1).T.ravel()][:, free]
     unknown = np.flatnonzero(np.asarray(unknown_pressures(porosity, mesh, mesh.points.dtype)))
     values, vertex_slopes = values[:, unknown], [g[:, unknown] for g in vertex_slopes]
@@ -77,8 +79,8 @@ def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
 
 
 def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list]":
-    """Return sparse matrices that give at the integration points: the values of a vertex field, the derivatives of a
-    nodal field, and the derivatives of a vertex field."""
+    """Return sparse matrices for the integration points: one for the values of a vertex field, three for the
+    derivatives of a nodal field, and three for the derivatives of a vertex field."""
     import scipy.sparse
 
     E, D = mesh.number_of_elements, np.asarray(mesh.shape_vectors)
@@ -88,7 +90,8 @@ def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list
     rows = np.arange(Q * E).reshape(Q, E)
 
     def matrix(entries: np.ndarray, count: int) -> "scipy.sparse.csr_array":
-        """Return the matrix from entries (n, Q, E) for the n nodes of every element."""
+        """Assemble the sparse matrix (Q E, count) from its entries (n, Q, E): n nodes and Q integration points in each
+        of E elements."""
         nodes = np.broadcast_to(mesh.element_nodes_on_host[: len(entries), None], entries.shape)
         at = (np.broadcast_to(rows, entries.shape).ravel(), nodes.ravel())
         return scipy.sparse.csr_matrix((entries.ravel(), at), shape=(Q * E, count))
@@ -102,12 +105,12 @@ def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list
 def coupled_solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """Return a function for one step: (load (f,) [N], earlier errors) -> errors of motion (f,) [m] and pressure (v,)
+    """Return a function for one step: (load (f,) [N], `ErrorBefore`) -> errors of motion (f,) [m] and pressure (v,)
     [Pa] at the end of the step.
 
     Args:
-        K: stiffness and inertia without the porous body (f, f) [N/m].
-        fluid: `LinearFluid`.
+        K: matrix of stiffness and inertia of the solid (f, f) [N/m], without the porous part.
+        fluid: matrices of the porous part.
     """
     import scipy.sparse
     from scipy.sparse.linalg import splu

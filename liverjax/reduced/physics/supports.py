@@ -1,7 +1,8 @@
-"""Supports in reduced models: springs between the body and a wall, and nodes that slide in a plane normal to an axis.
+"""Supports in reduced models: springs between the body and a wall, and nodes that slide in a plane normal to x, y or z.
 
-Springs are linear in the motion, so their forces on the modes are exactly a matrix (n, n) times the coordinates. The
-modes come from motions with sliding nodes, so all modes keep these nodes in their planes.
+The forces of the springs are linear in the displacements. So their forces on the modes are exactly a matrix (n, n)
+times the reduced coordinates. In all training runs the sliding nodes stay in their planes, so they also stay there in
+all modes.
 """
 
 from typing import TYPE_CHECKING
@@ -35,13 +36,13 @@ def refuse_other_physics(scene: Scene) -> None:
                     "plane of [[support]] is normal to an axis, or run the full model"
                 )
         elif not isinstance(own, ElasticSupport):
-            raise InputError(f"a reduced model cannot have [[{own.section}]]: leave it out, or run the full model")
+            raise InputError(f"a reduced model cannot have [[{own.section}]]: remove it, or run the full model")
         elif own.history is not None:
             raise InputError("a reduced model cannot have a history of [[support]]: remove it, or run the full model")
 
 
 def identity_of_supports(scene: Scene) -> list[object]:
-    """Return the kinds and the nodes of the supports, without their parameters."""
+    """Return the kind and the nodes of each support, without the parameters of the supports."""
     found: list[object] = []
     for own in scene.physics:
         if isinstance(own, SlidingSupport):
@@ -53,7 +54,7 @@ def identity_of_supports(scene: Scene) -> list[object]:
 
 
 def _springs(scene: Scene) -> list[NodalForce]:
-    """Return the springs of all elastic supports."""
+    """Return the forces of all elastic supports, one physics object for each support."""
     points = scene.mesh.points
     step = Step(scene.mesh, points, 1, 1, None, False, None, Free(jnp.ones_like(points)))
     return [own.freeze(None, step) for own in scene.physics if isinstance(own, ElasticSupport)]
@@ -71,14 +72,15 @@ def forces_of_springs(scene: Scene, u: jax.Array) -> jax.Array:
 
 
 def reduced_springs(modes: jax.Array, scene: Scene) -> jax.Array | None:
-    """Return the stiffness (n, n) [N/m] of all springs for modes (n, V, 3), or None without springs."""
+    """Return the reduced stiffness (n, n) [N/m] of all springs for the modes (n, V, 3). Return None without springs."""
     if not has_springs(scene):
         return None
     return jnp.tensordot(jax.lax.map(lambda mode: forces_of_springs(scene, mode), modes), modes, axes=((1, 2), (1, 2)))
 
 
 def spring_matrix(scene: Scene) -> "scipy.sparse.csr_array":
-    """Return the stiffness (3 V, 3 V) [N/m] of all springs as a sparse matrix. The scene must not be traced."""
+    """Return the stiffness (3 V, 3 V) [N/m] of all springs as a sparse matrix. The scene must have known numbers (not
+    inside jit, grad or vmap)."""
     import scipy.sparse
 
     V = scene.mesh.number_of_nodes

@@ -1,4 +1,4 @@
-"""Are the choices of the scene known and compatible? Numbers are not checked, so the scene may be traced."""
+"""Are the choices of the scene known and compatible? Numbers are not checked, and may be unknown inside jit."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ CHOICES = {
 
 
 def check_choices(scene: Scene) -> None:
-    """Check that the choices are known and compatible. Numbers are not checked, so the scene may be traced.
+    """Check that the choices are known and compatible. Numbers are not checked, and may be unknown inside jit.
 
     Raises:
         InputError: a choice is unknown or incompatible; a load or a motion is given twice, not at all or in a wrong
@@ -63,7 +63,7 @@ def check_choices(scene: Scene) -> None:
 
 
 def _refuse_what_moves_in_time(scene: Scene) -> None:
-    """Raise InputError if a part has a history, or if an obstacle moves, in harmonic motion."""
+    """Raise InputError, for harmonic motion, if an entry of the scene has a history or if an obstacle moves."""
     for name in histories(scene):
         raise InputError(f"{name}.history cannot be used with kind = 'harmonic': give only the amplitudes")
     for name, part in named_physics(scene):
@@ -89,13 +89,15 @@ def _mixed(scene: Scene) -> None:
 def _own_volumes(scene: Scene) -> None:
     name = f"[solve] volumetric = {scene.solve.volumetric!r}"
     if scene.porosity is not None:
-        raise InputError(f"{name} needs the volumetric energy of the law, which [porosity] replaces: use 'element'")
+        raise InputError(
+            f"{name} needs the volumetric energy of the law, which [porosity] replaces: use volumetric = 'element'"
+        )
     several = laws_of(scene.law, scene.region)
     for law in several:
         if laws.isochoric_part(law) is None or laws.volumetric_part(law) is None:
             raise InputError(
                 f"{name} needs a law with separate isochoric and volumetric energies, unlike {type(law).__name__}: use "
-                "another law, or 'element'"
+                "another law, or volumetric = 'element'"
             )
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":
         raise InputError(f"{name} has no relaxation of volumes: use part = 'isochoric' in [viscosity] or [springpots]")

@@ -1,4 +1,4 @@
-"""Do two parts of the scene prescribe the motion of one node?"""
+"""Do two entries of the scene prescribe the motion of one node?"""
 
 import jax
 import numpy as np
@@ -14,7 +14,7 @@ _NO_MOTION = 1e-12
 
 
 def check_moved_where_fixed(scene: Scene) -> None:
-    """Raise InputError if a node is moved and fixed along one axis. Not checked: traced arrays and motions of 0."""
+    """Raise InputError if a node is moved (not by 0) and fixed along one axis. Arrays inside jit are not checked."""
     for k, motion in enumerate(scene.displaced):
         by = motion.history if motion.by is None else motion.by
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((by, motion.nodes))):
@@ -37,7 +37,7 @@ def check_moved_where_fixed(scene: Scene) -> None:
 
 
 def check_plates_alone(scene: Scene) -> None:
-    """Raise InputError if nodes of a rigid plate have other supports or motions. Traced arrays are not checked."""
+    """Raise InputError if nodes of a rigid plate have other supports or motions. Arrays inside jit are not checked."""
     named = [(f"{kind}.{k}", part) for kind in ("fixed", "displaced") for k, part in enumerate(getattr(scene, kind))]
     every = named_physics(scene)
     plates = [(name, physics) for name, physics in every if physics.ties]
@@ -58,7 +58,7 @@ def check_plates_alone(scene: Scene) -> None:
 def check_normals(scene: Scene) -> None:
     """Raise InputError if a node slides in two oblique planes, or is fixed along only some axes of its normal.
 
-    Traced arrays are not checked.
+    Arrays inside jit, grad or vmap are not checked.
     """
     slides = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, SlidingSupport)]
     nodes = [*(f.nodes for f in scene.fixed), *(d.nodes for d in scene.displaced), *(s.nodes for _, s in slides)]
@@ -91,7 +91,7 @@ def check_normals(scene: Scene) -> None:
 
 
 def check_prescribed_once(scene: Scene) -> None:
-    """Raise InputError if a node is moved along an axis along which it is fixed or moved already. Runs on the host."""
+    """Raise InputError if a node is moved along an axis along which it is fixed or moved already. Not for jit."""
     taken: dict[tuple[int, str], str] = {}
     for kind in ("fixed", "displaced"):
         for k, condition in enumerate(getattr(scene, kind)):
@@ -105,7 +105,7 @@ def check_prescribed_once(scene: Scene) -> None:
 
 
 def check_motion_in_planes(scene: Scene) -> None:
-    """Check that prescribed motions do not move nodes out of their sliding planes. Runs on the host.
+    """Check that prescribed motions do not move nodes out of their sliding planes. Not for use inside jit.
 
     Raises:
         InputError: the message begins with the name of the motion.

@@ -1,4 +1,4 @@
-"""Does every part of the scene have the right type?"""
+"""Does every entry of the scene have the right type?"""
 
 from liverjax import laws
 from liverjax.core.errors import InputError
@@ -12,7 +12,7 @@ from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.springpots import SpringpotSeries
 
-#: Types of the parts of a scene. A scene has at most one part of each of PARTS, and any number of each of SEVERAL.
+#: Types of the entries of a scene: of each type in PARTS at most one entry, of each type in SEVERAL any number.
 PARTS = {
     "mesh": TetMesh,
     "law": laws.Law,
@@ -26,7 +26,7 @@ SEVERAL = {"region": Region, "fixed": Fixed, "displaced": Displaced, "traction":
 
 
 def check_kinds(scene: Scene) -> None:
-    """Raise InputError if a part has a wrong type, for example node numbers instead of a `Fixed`."""
+    """Raise InputError if an entry has a wrong type, for example node numbers instead of a `Fixed`."""
     for key, kind in PARTS.items():
         own = getattr(scene, key)
         if own is not None and not isinstance(own, kind):
@@ -41,6 +41,6 @@ def check_kinds(scene: Scene) -> None:
 
 
 def _remedy(kind: type) -> str:
-    """Words for a message, which show how a user writes a value of this type."""
+    """Return words for a message that show how a user writes a value of this type."""
     families: dict[object, str] = {laws.Law: "a law of lj.laws", Physics: "a physics object, such as lj.Obstacle"}
     return families.get(kind, f"an lj.{kind.__name__}")

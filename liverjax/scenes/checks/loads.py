@@ -46,7 +46,7 @@ def _check_traction(load: Traction, name: str) -> None:
 def _check_motion(motion: Displaced, name: str) -> None:
     history.check_times(motion.times, motion.history, name, (3,) if motion.by is None else (1,))
     check_axes(motion.axes, name)
-    # NumPy cannot determine the shape of a tuple of traced numbers.
+    # NumPy cannot determine the shape of a tuple of JAX tracers (numbers inside jit).
     by: Any = motion.by
     shape = (3,) if isinstance(by, tuple | list) and len(by) == 3 and np.ndim(by[0]) == 0 else np.shape(by)
     if by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
@@ -58,7 +58,7 @@ def _check_motion(motion: Displaced, name: str) -> None:
 def _check_body(body: Body, nodes: int) -> None:
     if body.mass not in MASSES:
         raise InputError(f"[body] mass = {body.mass!r} is not known: use {' or '.join(MASSES)}")
-    # NumPy cannot determine the shape of a tuple of traced numbers.
+    # NumPy cannot determine the shape of a tuple of JAX tracers (numbers inside jit).
     gravity = (len(body.gravity),) if isinstance(body.gravity, tuple) else np.shape(body.gravity)
     density = np.shape(body.density)
     if density not in ((), (nodes,)):

@@ -11,7 +11,7 @@ from liverjax.scenes.springpots import check_springpots
 def check_bounds(scene: Scene) -> None:
     """Check that numbers are within their bounds, and that directions do not have length 0. Nothing is compiled.
 
-    Traced numbers are not checked. `check_mesh` checks the mesh.
+    Numbers inside jit, grad or vmap are not checked. `check_mesh` checks the mesh.
 
     Raises:
         InputError: the message contains the dotted name of the number, its value, its bound and a remedy.
@@ -30,7 +30,7 @@ def check_bounds(scene: Scene) -> None:
 
 
 def check_numbers(scene: Scene) -> None:
-    """Check that each number, and their combination, can be used. The mesh is not checked. Runs on the host.
+    """Check that the numbers, each and in combination, can be used. The mesh is not checked. Not for use inside jit.
 
     Raises:
         InputError: numbers are out of bounds, or contradict each other in law, viscosity or porosity.

@@ -1,4 +1,4 @@
-"""Are the nodes and triangles of every part in the mesh, and can the part act on them?"""
+"""Are the nodes and triangles of every entry of the scene in the mesh, and does every inlet have an effect?"""
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from liverjax.scenes.scene import Scene
 
 
 def check_known_nodes(scene: Scene) -> None:
-    """Raise InputError if nodes are not in the mesh, or if elements are inverted. Traced arrays are not checked."""
+    """Raise InputError if nodes are not in the mesh, or if elements are inverted. Arrays inside jit are not checked."""
     mesh = scene.mesh
     named: dict[str, object] = {f"fixed.{k}.nodes": hold.nodes for k, hold in enumerate(scene.fixed)}
     named |= {f"displaced.{k}.nodes": motion.nodes for k, motion in enumerate(scene.displaced)}
@@ -58,7 +58,7 @@ def _has_vertices(mesh: TetMesh, nodes: object, name: str) -> None:
 
 
 def _inlets_that_act(sponge: Porosity) -> None:
-    """Raise InputError if the pressure is already given in all of an inlet. The node sets may share an edge."""
+    """Raise InputError if the pressure is already given at all nodes of an inlet. Inlets may share some nodes."""
     given = [] if sponge.drained is None else [set(np.asarray(sponge.drained).tolist())]
     pressures = [(k, inlet) for k, inlet in enumerate(sponge.inlet) if inlet.nodes is not None]
     for k, inlet in pressures:

@@ -16,10 +16,11 @@ from liverjax.scenes.scene import Scene
 
 
 def check_region_numbers(scene: Scene) -> None:
-    """Check the parameters of all regions. Traced parameters are not checked.
+    """Check the parameters of all regions. Parameters inside jit, grad or vmap are not checked.
 
     Raises:
-        InputError: the scene does not have the part; an unknown name; values out of bounds; a wrong number of modes.
+        InputError: the scene has no [viscosity] or [porosity]; an unknown name; values out of bounds; a wrong number
+            of modes.
     """
     for k, region in enumerate(scene.region):
         _check_law(scene.law, region, f"region.{k}")
@@ -28,7 +29,7 @@ def check_region_numbers(scene: Scene) -> None:
 
 
 def check_region_elements(scene: Scene) -> None:
-    """Check the elements of all regions. Runs on the host.
+    """Check the elements of all regions. Not for use inside jit.
 
     Raises:
         InputError: a region has no elements, has unknown elements or changes nothing; an element has two laws.
@@ -52,7 +53,7 @@ def _check_law(law: Law, region: Region, name: str) -> None:
 
 
 def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> None:
-    """Check the viscous parameters of a region. Traced parameters are not checked.
+    """Check the viscous parameters of a region. Parameters inside jit, grad or vmap are not checked.
 
     Raises:
         InputError: the scene has no [viscosity]; a wrong number of modes; values out of bounds.
@@ -82,7 +83,7 @@ def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> No
 
 
 def check_region_porosity(porosity: Porosity | None, region: Region, name: str) -> None:
-    """Check the porous parameters of a region. Traced parameters are not checked.
+    """Check the porous parameters of a region. Parameters inside jit, grad or vmap are not checked.
 
     Raises:
         InputError: the scene has no [porosity]; an unknown name; values out of bounds.
@@ -123,7 +124,7 @@ def _check_hidden(regions: tuple[Region, ...], elements: int) -> None:
 
 
 def _names_of(region: Region) -> set[str]:
-    """Names of the parameters that a region changes."""
+    """Return the names of the parameters that a region changes."""
     own = {"law"} if isinstance(region.law, Law) else {f"law.{name}" for name in changed_numbers(region)}
     own |= {f"viscosity.{name}" for name in region.viscosity or {}}
     return own | {f"porosity.{name}" for name in region.porosity or {}}

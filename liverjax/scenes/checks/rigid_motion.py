@@ -12,13 +12,13 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
-    """Return name (as in `check_physics`) -> number of nodal directions that each further physics fixes at first."""
+    """Return {name of a further physics: number of nodal directions that it fixes at the beginning of the run}."""
     named = [(name, physics) for name, physics in named_physics(scene) if only is None or name in only]
     return {name: len(physics.holds(scene.mesh)[0]) for name, physics in named}
 
 
 def check_hold(scene: Scene, before: dict[str, int]) -> None:
-    """Check that a static body is not loose because changed numbers let a physics fix fewer directions than `before`.
+    """Check that a static body is still supported if, with changed numbers, a physics fixes fewer nodal directions.
 
     Args:
         scene: `Scene` with the changed numbers.
@@ -69,7 +69,7 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
 
 
 def _rigid_rank(points: np.ndarray, directions: np.ndarray, size: float) -> int:
-    """Rank of the six rigid motions, projected on fixed directions (n, 3) at points (n, 3) of a body of this size."""
+    """Return the rank of the six rigid motions, projected on fixed directions (n, 3) at points (n, 3) of a body."""
     if not len(points):
         return 0
     # A rotation about e moves x by cross(e, x). The component of this motion along d is cross(x, d) . e.

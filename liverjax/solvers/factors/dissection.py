@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-#: A group of at most LEAF nodes is not divided. With more than MANY nodes, diagonal planes and minimum cuts are tried.
+#: LEAF: a group of at most this number of nodes is not divided. MANY: for a group of more nodes than this, diagonal
+#: planes and minimum cuts are also tried.
 LEAF, MANY = 40, 400
 #: LEAST: minimum fraction of the elements on each side of a plane. BESIDE: a minimum cut stays among this fraction of
 #: the elements on each side of the plane.
@@ -118,9 +119,10 @@ def _first_and_last(nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray]) -> N
 
 
 def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.ndarray], at: slice) -> np.ndarray:
-    """Estimated work of cuts. A cut divides elements in an order, with nodes (n, E), after one of the elements `at`.
+    """Estimate the work of cuts. A cut divides elements in an order, with nodes (n, E), after one of the elements `at`.
 
-    It is the work for the shared nodes plus twice the work of the next cut on each side, as if each side were a cube.
+    The estimate is the work for the nodes that both sides share, plus twice the work of the next cut on each side. The
+    next cut of a side with n nodes is assumed to contain n^(2/3) nodes, as in a cube.
     """
     n, m = nodes.shape[1], len(part.border)
     _first_and_last(nodes, span)
@@ -135,13 +137,13 @@ def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.nda
 def _smallest_cuts(
     near: np.ndarray, nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray], ends: tuple[int, int]
 ) -> list[np.ndarray]:
-    """Return which elements (h,) are on the first side, for the first and the last of all minimum cuts.
+    """Return, for the first and the last of all minimum cuts, which elements (h,) are on the first side.
 
     Args:
         near: nodes (n, h) of the h elements from low to high - 1 of an order.
         nodes: (k,) nodes, in ascending order, through which a cut may pass. Other nodes do not connect the parts.
         span: first and last element of each node in this order.
-        ends: low and high. Elements before low are on the first side, and elements from high on are on the second side.
+        ends: low and high. Elements before low are on the first side. Elements from high on are on the second.
     """
     import scipy.sparse
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow

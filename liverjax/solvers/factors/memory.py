@@ -1,9 +1,9 @@
-"""Find out how much memory of the machine a factorisation may use."""
+"""Determine how much memory (RAM) a factorisation may use."""
 
 import os
 from pathlib import Path
 
-#: Files of Linux: memory that is free or can be freed [kB]; limit of a container, and its memory in use [bytes].
+#: Files of Linux with three numbers: free memory [kB], memory limit of the container, and its used memory [bytes].
 _FREE, _LIMIT, _USED = Path("/proc/meminfo"), Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
 
 

@@ -1,8 +1,8 @@
-"""Multifrontal factorisation, on the host, of sparse matrices of a mesh that are real or complex symmetric.
+"""Multifrontal factorisation of real or complex symmetric sparse matrices of a mesh, on the CPU.
 
 `liverjax.solvers.factors.dissection` gives the order of elimination. Each group of nodes is eliminated in a dense
-matrix of the group and its border, the later unknowns that are coupled with it (Duff and Reid 1983, ACM TOMS 9, 302).
-`PIVOTS` unknowns are eliminated at a time, so that nearly all work is in matrix products. By symmetry the lower
+matrix of the group and its border: the later unknowns that are coupled with the group (Duff and Reid 1983, ACM TOMS 9,
+302). `PIVOTS` unknowns are eliminated at a time, so that nearly all work is in matrix products. By symmetry the lower
 triangles are enough. Groups are eliminated in parallel, one per core, as soon as their children are done. If only one
 piece can run, the parts of its matrix products (tiles) run in parallel instead. Pivots are chosen only among unknowns
 that are eliminated together.
@@ -29,11 +29,12 @@ if TYPE_CHECKING:
 
 #: Number of unknowns from which on single precision saves time.
 SINGLE_FROM = 20_000
-#: Number of unknowns of a group that are eliminated together; number of columns of a tile.
+#: PIVOTS: number of unknowns of a group that are eliminated together. TILE: number of columns of a tile.
 PIVOTS, TILE = 128, 192
-#: A group and its descendants are eliminated in one piece if their work is less than this part of all work.
+#: A group and its descendants are eliminated in one piece if their work is less than this fraction of all work.
 PIECE = 1 / 32
-#: Maximum number of refinement steps; backward error that ends them; backward error above which a solution is wrong.
+#: STEPS: maximum number of refinement steps. ENOUGH: backward error at which they end. WRONG: a solution with a larger
+#: backward error is wrong.
 STEPS, ENOUGH, WRONG = 12, 4e-16, 1e-11
 
 
@@ -52,7 +53,7 @@ class Eliminated(NamedTuple):
     after: np.ndarray  # (m,)
     inverse: np.ndarray  # (n, n) A^-1
     X: np.ndarray  # (n, m) A^-1 B; as 16-bit integers (n, m), or (n, 2 m) if complex
-    sizes: np.ndarray | None = None  # (n,) factor on the integers of each row
+    sizes: np.ndarray | None = None  # (n,) factor by which the integers of each row are multiplied
 
     def times(self, y: np.ndarray) -> np.ndarray:
         """Product X y (n,)."""
@@ -71,7 +72,7 @@ class Factor(NamedTuple):
     """Result of a factorisation."""
 
     matrix: "scipy.sparse.csr_array"  # with scaled rows and columns
-    scale: np.ndarray  # (N,) the factors on rows and columns
+    scale: np.ndarray  # (N,) factors that multiply rows and columns
     steps: list[Eliminated]
 
     @property
@@ -120,9 +121,9 @@ def single_bytes(plan: list[Front], kind: np.dtype) -> float:
 
 
 def needed_bytes(plan: list[Front], kind: np.dtype, single: bool, small: bool) -> float:
-    """Memory [bytes] that an elimination in the order of the plan needs. Groups in parallel need more.
+    """Memory [bytes] for an elimination in the order of the plan. Groups that run in parallel need more.
 
-    It contains the factor, the matrix of one group, and the lower triangles that groups have left to their parents.
+    This includes the factor, the matrix of one group, and the lower triangles that groups have left to their parents.
     """
     each = (8 if kind.kind == "c" else 4) * (1 if single else 2)
     of_factor, waiting, most = 0.0, 0.0, 0.0
@@ -169,7 +170,7 @@ class _Elimination(NamedTuple):
     running: dict[Future, int]  # pieces in progress
 
     def idle(self) -> int:
-        """Number of cores that a piece may use: one, and all cores without a piece."""
+        """Number of cores that a piece may use: one core, plus all cores that work on no piece."""
         return max(1, cores() + 1 - len(self.running))
 
     def piece(self, groups: list[int]) -> None:
@@ -313,7 +314,8 @@ def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[
 
 
 def _solved_part(matrices: tuple[np.ndarray, np.ndarray, np.ndarray], width: int, j: int) -> None:
-    """Compute `width` columns, from column j on, of the inverse times the transposed rows below."""
+    """Compute `width` columns, from column j on, of `inverse` times the transpose of `below`, and write them to `out`.
+    `matrices` contains these three matrices."""
     inverse, below, out = matrices
     np.matmul(inverse, below[j : j + width].T, out=out[:, j : j + width])
 
