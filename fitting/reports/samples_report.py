@@ -108,6 +108,20 @@ def _sample_entry(found: Samples, k: int) -> Content:
     return summary(fit, sweep) | {"band_sensitivity": band_sensitivity(fit)} | more
 
 
+#: Words in the warnings of single samples, and the sentence of the summary that counts these warnings.
+COUNTED = (
+    ("mark of the instrument", "the last points show the instrument"),
+    ("Kramers-Kronig", "G' and G'' are not consistent with each other"),
+    ("structured misfit", "the misfit has structure"),
+    ("half decade", "some parameters depend on the ends of the band"),
+    (SHORT, "the test ends before the material has relaxed, and no interval of G_inf contains the rest"),
+    ("(a fluid)", "the equilibrium modulus cannot be distinguished from zero"),
+    ("have merged", "two relaxation times have merged"),
+    ("extrapolated", "a relaxation time lies outside of the range that the frequencies resolve"),
+    ("use fewer modes", "a mode is not needed or not determined"),
+)
+
+
 def warnings(found: Samples) -> list[str]:
     """Return warnings about the population, and the number of samples that have each warning about single samples."""
     out = []
@@ -144,17 +158,7 @@ def warnings(found: Samples) -> list[str]:
     failed = [Path(s.source).name for f, s in _pairs(found) if not f.converged]
     if failed:
         out.append(f"the fit of {', '.join(failed)} did not converge; its best point is given: try fewer modes")
-    for words, told in (
-        ("mark of the instrument", "the last points show the instrument"),
-        ("Kramers-Kronig", "G' and G'' are not consistent with each other"),
-        ("structured misfit", "the misfit has structure"),
-        ("half decade", "some parameters depend on the ends of the band"),
-        (SHORT, "the test ends before the material has relaxed, and no interval of G_inf contains the rest"),
-        ("(a fluid)", "the equilibrium modulus cannot be distinguished from zero"),
-        ("have merged", "two relaxation times have merged"),
-        ("extrapolated", "a relaxation time lies outside of the range that the frequencies resolve"),
-        ("use fewer modes", "a mode is not needed or not determined"),
-    ):
+    for words, told in COUNTED:
         count = sum(any(words in w for w in f.warnings) for f in found.fits)
         if count:
             out.append(f"in {count} of {len(found.fits)} samples {told}; fit.json has the warnings of each sample")
