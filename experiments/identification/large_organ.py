@@ -5,7 +5,7 @@ random directions and phases, and 3 % of noise. One wavelength has 9 voxels. The
 parts. The alternative are means over blocks of 2 x 2 x 2 voxels (``--stride 2``), which need less memory but have only
 4.5 voxels in a wavelength.
 
-``python -m experiments large_organ`` (8 minutes, 8 GB) writes results/large_organ.json.
+``python -m experiments large_organ`` (5 minutes, 7 GB) writes results/large_organ.json.
 """
 
 import resource

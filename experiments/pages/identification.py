@@ -156,4 +156,18 @@ def plate_came_out() -> str:
     )
 
 
+def large_organ_came_out() -> str:
+    """Sentence for the overview."""
+    (data,) = load("large_organ")
+    true, said = complex(*data["true_Pa"]), []
+    for key, name in (("divided", "parts"), ("averaged", "means over 2 x 2 x 2 voxels")):
+        r = data[key]
+        said.append(
+            f"{name}: modulus wrong by {percent(abs(complex(*r['modulus_Pa']) / true - 1))} (stated mesh bias "
+            f"{percent(r['mesh_bias'])}), chi2 of the map {r['map_chi2']:.2f}, {r['seconds'] / 60:.1f} min, "
+            f"{r['peak_GB']:.1f} GB"
+        )
+    return f"{data['voxels']:,} voxels, {data['voxels_in_a_wavelength']:.0f} per wavelength; {'; '.join(said)}"
+
+
 PARTS = {"precision": precision, "jax_releases": jax_releases, "gradients": gradients, "lesion": lesion}

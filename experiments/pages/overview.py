@@ -383,6 +383,11 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         identification.liver_waves_came_out,
         "mentions elastography as a way to measure the liver of a patient",
     ),
+    "large_organ": (
+        "waves in an organ that needs too much memory (synthetic): divided into parts, or means over voxels?",
+        identification.large_organ_came_out,
+        "mentions elastography as a way to measure the liver of a patient",
+    ),
     "stability_rigs": (
         "error of simulated tension, indentation and creep tests against run time: mesh, elements",
         rigs.came_out,
