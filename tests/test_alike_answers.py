@@ -206,3 +206,7 @@ def test_errors_contain_the_error_of_a_subtracted_offset(tmp_path):
         ends = fit.details[INTERVAL]
         inside.append(ends["low"] <= truth <= ends["high"])
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.6 and np.mean(inside) > 0.8
+    # Two such tests together: the errors of their offsets are independent.
+    both = choose_together([test, test], "prony", 2)
+    one, two = (uncertainty.equilibrium_error(f.uncertainty) for f in (fit, both))
+    assert np.isclose(two, one / np.sqrt(2), rtol=0.05)

@@ -281,6 +281,20 @@ def test_a_loaded_lid_of_a_confined_body_moves_as_far_as_its_bulk_allows(order, 
     assert np.isclose(moved, exact, rtol=tolerance, atol=0)
 
 
+@pytest.mark.parametrize("dt", [1e-4, 1e-5])
+def test_short_time_steps_reach_the_tolerance(dt):
+    """Inertia counts mu/K times. Its roundoff in a short step was above the tolerance, and each step stalled."""
+    mesh = lj.shapes.box((0.04, 0.04, 0.04), (2, 2, 2))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=1000.0, bulk=1e8),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+        body=lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -9.81])),
+        solve=lj.Solve(kind="dynamic", dt=dt, steps=3, volumetric="mixed"),
+    )
+    assert int(np.max(lj.simulate(scene).check().statistics.iterations)) <= 3
+
+
 @pytest.mark.slow
 def test_the_estimate_sees_the_locking():
     """The estimate uses elements that do not lock."""

@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     for name in options.law:
         if name.endswith(".toml"):
             raise InputError(f"{name} is a scene: run it with liverjax simulate, and draw its result.h5")
-        if Path(name).exists() and not name.endswith((".h5", ".py")) and name not in laws.LAWS:
+        if Path(name).exists() and not name.endswith((".h5", ".py")) and name not in (*laws.LAWS, "all"):
             raise InputError(f"{name} is a file or a folder, and not a law: give the result.h5 of a run to draw it")
     for option, of_results in (("field", True), ("step", True), ("stretch", False)):
         if getattr(options, option) is not None and bool(results) != of_results:

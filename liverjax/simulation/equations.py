@@ -17,6 +17,7 @@ from liverjax.physics.prescribed import free_degrees, prescribed
 from liverjax.physics.registry import law_at_rest, physics_of
 from liverjax.scenes.scene import Scene
 from liverjax.solvers.block_matrix import columns, flat
+from liverjax.solvers.step_cutting import ROUNDINGS
 from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant
 
 
@@ -200,7 +201,10 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
     free = free_directions(scene)
     tolerance = jax.lax.stop_gradient(scene.solve.tolerance)
     step = _with_tied(physics, _first_step(scene, state.x, free)._replace(k=k, tolerance=tolerance))
-    free = step.free
+    free, noise = step.free, 20 * float(np.finfo(np.float64).eps) * sizes.unit_strain
+    if scene.solve.volumetric == "mixed":
+        # Inertia counts only mu/K times in the tolerance (`Mixed.counted`). In short time steps its roundoff is larger.
+        noise = noise + ROUNDINGS * sizes.roundoff
     return Equations(
         scene=scene,
         physics=physics,
@@ -208,7 +212,7 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
         state=state,
         k=k,
         free=free,
-        noise=20 * float(np.finfo(np.float64).eps) / tolerance * sizes.unit_strain,
+        noise=noise / tolerance,
         roundoff=sizes.roundoff,
         moved=_prescribed_motion(scene, k),
     )

@@ -29,9 +29,9 @@ from liverjax.solvers.problem import (
 )
 
 #: If Newton's method makes no progress, the residual counts as roundoff in two cases. It is below _PRECISIONS times the
-#: precision (in float32 5e-4 of the forces; measured: 1e-4), or below _ROUNDINGS times the effect of rounded positions.
+#: precision (in float32 5e-4 of the forces; measured: 1e-4), or below ROUNDINGS times the effect of rounded positions.
 #: Then shorter steps do not help.
-_PRECISIONS, _ROUNDINGS = 4096, 8
+_PRECISIONS, ROUNDINGS = 4096, 8
 
 #: If the derivative of the residual can jump (kinks) and halving does not help, the full direction is used, at most
 #: this many times per substep. The tangent is different beyond a kink.
@@ -365,7 +365,7 @@ def _judge(
     # If a direction of an earlier tangent does not help, a new tangent is made first. The direction is not halved.
     remake = ~better & ~c.launch & c.stale
     halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
-    small = (c.relative <= _PRECISIONS * float(jnp.finfo(size.dtype).eps)) | (c.size <= _ROUNDINGS * problem.roundoff)
+    small = (c.relative <= _PRECISIONS * float(jnp.finfo(size.dtype).eps)) | (c.size <= ROUNDINGS * problem.roundoff)
     leap = (halvings > options.max_halvings) & (c.leaps < _LEAPS) & ~small & problem.kinks
     spent = (c.iterations >= options.max_iterations) | ((halvings > options.max_halvings) & ~leap)
     failed = ~c.launch & ~converged & ~remake & (spent | (c.first & ~finite))

@@ -16,7 +16,7 @@ import numpy as np
 from fitting.fits import time_tests, together
 from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.honesty import common_factor
-from fitting.fits.honesty.alike_answers import fitted_by_its_noise, with_offset_error, with_own_noise
+from fitting.fits.honesty.alike_answers import fitted_by_its_noise, with_offset_errors, with_own_noise
 from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.honesty.rise_of_load import with_rise_of_load
 from fitting.fits.honesty.short_times import with_short_times
@@ -201,7 +201,7 @@ def _with_ends_of_record(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFi
     fit = fit._replace(details=fit.details | {CONSTANT_NOISE: test.constant_noise})
     if time_tests.ELASTIC in fit.details and not fit.converged:
         return fit  # its modes have no meaning
-    fit, of_offset = with_offset_error(fit, test)
+    fit, of_offset = with_offset_errors(fit, [test], [1.0])
     fit = with_rise_of_load(fit, test, prony)
     return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise], common=of_offset), test)
 
@@ -280,7 +280,9 @@ def choose_together(
     prony = together.fit(tests, modes, progress)
     fit = prony if model == "prony" else _best_of_models(tests, model, prony, progress)
     fit = fit._replace(warnings=(*fit.warnings, *common_factor.told(fit, relative)))
-    return with_interval(fit, fit.tests, [s.noise for s in fit.shares])
+    noises = [s.noise for s in fit.shares]
+    fit, of_offsets = with_offset_errors(fit, fit.tests, noises)
+    return with_interval(fit, fit.tests, noises, common=of_offsets)
 
 
 def _by_its_noise(test: Measured) -> Measured:

@@ -1,13 +1,15 @@
 """Noise that is correlated between neighbouring measured values of a relaxation or creep test. If the noise is treated
 as independent, the standard errors of the parameters are too small. This module corrects the standard errors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
 from fitting.fits import time_tests, viscoelastic
 from fitting.fits.time_tests import INDEPENDENT, TimeFit
+from fitting.fits.together import Measured, Together, reported_numbers
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation
 from fitting.methods.noise.alike_noise import alike_noise
@@ -149,27 +151,48 @@ def _of_such_noise(
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation, freedom=freedom)
 
 
-def with_offset_error(fit: TimeFit, test: TimeTest) -> tuple[TimeFit, float]:
-    """Return the fit with the error of the subtracted offset of the sensor in its standard errors.
+AFit = TypeVar("AFit", TimeFit, Together)
 
-    The second result is the standard error [Pa] of the equilibrium modulus due to this offset alone. All measured
-    values of the test contain the same error, so more values do not make it smaller.
+
+def with_offset_errors(fit: AFit, tests: Sequence[Measured], factors: Sequence[float]) -> tuple[AFit, float]:
+    """Return the fit with the errors of the subtracted offsets of sensors in its standard errors.
+
+    The second result is the standard error [Pa] of the equilibrium modulus due to these offsets alone. All measured
+    values of a test contain the same error, so more values do not make it smaller.
+
+    Args:
+        fit: the fit of these tests.
+        tests: one or more tests.
+        factors: for each test, the factor by which the fit multiplied its scales.
     """
-    if not test.offset_error > 0:
+    J, u, row, columns = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.u), 0, []
+    for test, factor in zip(tests, factors, strict=True):
+        scales = reported_numbers(test)[2] * factor
+        if isinstance(test, TimeTest) and test.offset_error > 0:
+            change = np.zeros(len(J))
+            change[row : row + len(scales)] = test.offset_error / scales
+            columns.append(change)
+        row += len(scales)
+    if not columns:
         return fit, 0.0
-    J, u = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.u)
-    shift = np.linalg.pinv(J)[:, : len(fit.scales)] @ (test.offset_error / fit.scales)
-
-    def wider(estimate: Estimate, natural_of: Callable) -> tuple[Estimate, np.ndarray]:
-        column = host.with_jacobian(natural_of, u)[1] @ shift
-        root = np.column_stack([estimate.root, column])
-        errors, correlation = errors_and_correlation(root)
-        errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
-        return estimate._replace(root=root, standard_errors=errors, correlation=correlation), column
-
-    modes, column = wider(fit.uncertainty, _modes_of(fit))
+    shifts = np.linalg.pinv(J) @ np.column_stack(columns)
+    modes, moved = _with_shifts(
+        fit.uncertainty, partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u, shifts
+    )
     own = fit.parameters
     if own is not None and fit.kind.values is not None:
-        own, _ = wider(own, fit.kind.values)
-    rest = float(np.abs(uncertainty.equilibrium_change(fit.uncertainty.values, column)))
+        own, _ = _with_shifts(own, fit.kind.values, u, shifts)
+    rest = float(np.linalg.norm(uncertainty.equilibrium_change(fit.uncertainty.values, moved)))
     return fit._replace(uncertainty=modes, parameters=own), rest
+
+
+def _with_shifts(
+    estimate: Estimate, natural_of: Callable, u: np.ndarray, shifts: np.ndarray
+) -> tuple[Estimate, np.ndarray]:
+    """Return the estimate with errors that move the unknowns u by the columns of `shifts`, and the changes of its
+    parameters."""
+    moved = host.with_jacobian(natural_of, u)[1] @ shifts
+    root = np.column_stack([estimate.root, moved])
+    errors, correlation = errors_and_correlation(root)
+    errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
+    return estimate._replace(root=root, standard_errors=errors, correlation=correlation), moved

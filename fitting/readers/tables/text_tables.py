@@ -55,8 +55,10 @@ def _with_whole_headings(text: str) -> str:
     """Join the two lines of each quoted heading that contains a line break. Numbers of later lines stay the same."""
     lines = text.splitlines()
     for k in range(min(len(lines), _HEAD) - 1):
-        if _OPEN.search(lines[k]) and re.match(r'[^",;\t]*"\s*(?:[,;\t]|$)', lines[k + 1]):
-            lines[k], lines[k + 1] = "", f"{lines[k]} {lines[k + 1]}"
+        if _OPEN.search(lines[k]) and re.match(r'[^"]*("\s*([,;\t]|$)|$)', lines[k + 1]):
+            closed = next((j for j in range(k + 1, min(k + 5, len(lines))) if '"' in lines[j]), None)
+            if closed is not None:
+                lines[k], lines[k + 1] = "", f"{lines[k]} {lines[k + 1]}"
     return "\n".join(lines)
 
 
@@ -168,9 +170,9 @@ def means_nothing(cells: Iterable[str]) -> bool:
 
 #: Words at the beginning of a row that mark the row as a summary of other rows, for example "Mean (n = 3)".
 _SUMMARY = re.compile(
-    r"±? ?(mean|average|avg|median|sd|std|st\.? ?dev|std\.? ?dev|standard deviation|sem|standard error|min|max|minimum"
-    r"|maximum|range|cv|mw|mittelwert|mittel|standardabweichung|moyenne|.cart[- ]type|media|promedio)"
-    r"( value)?\.?( ?± ?\w+)?( ?\([^)]*\))?:?",
+    r"±? ?(mean|average|avg|median|s\.?d|std|st\.? ?dev|std\.? ?dev|standard deviation|s\.?e\.?m|s\.?e|std\.? ?error"
+    r"|standard error|min|max|minimum|maximum|range|cv|rsd|variance|n|count|mw|mittelwert|mittel|standardabweichung"
+    r"|moyenne|.cart[- ]type|media|promedio)( value)?\.?( ?± ?\w+)?( ?%)?( ?[(\[][^)\]]*[)\]])?:?",
     re.I,
 )
 

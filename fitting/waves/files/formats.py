@@ -131,7 +131,8 @@ def _nearly_known(names: Iterable[str]) -> Content:
     """Return notes on unknown names that are similar to a known one, under `NEARLY`. A mask of a wrong name would
     otherwise be ignored without a word."""
     names = list(names)
-    wanted = [name for name in NAMES if name not in WAVES or not set(WAVES) & set(names)]
+    waves = set(WAVES) & set(names)
+    wanted = [name for name in NAMES if name not in names and not (waves and name in WAVES)]
     unknown = [name for name in names if name not in NAMES]
     near = {name: difflib.get_close_matches(name.lower(), wanted, n=1, cutoff=0.75) for name in unknown}
     notes = [f"the array {name!r} is not used: did you mean {own[0]}?" for name, own in near.items() if own]
