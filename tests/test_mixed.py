@@ -12,6 +12,7 @@ import scipy.optimize
 from conftest import ROOT
 
 import liverjax as lj
+from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.mesh import promotion
 from liverjax.mesh.shape_functions import basis
@@ -293,6 +294,20 @@ def test_short_time_steps_reach_the_tolerance(dt):
         solve=lj.Solve(kind="dynamic", dt=dt, steps=3, volumetric="mixed"),
     )
     assert int(np.max(lj.simulate(scene).check().statistics.iterations)) <= 3
+
+
+def test_single_precision_reports_that_a_small_load_is_lost_in_roundoff():
+    """If roundoff of single precision counted as a solution, this run had status 0 with a residual of 13 %."""
+    mesh = lj.shapes.box((0.04, 0.04, 0.04), (2, 2, 2))
+    area = jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets["x_max"]))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=1000.0, bulk=1e6),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+        traction=(lj.Traction(triangles=area, value=jnp.array([0.0, 0.0, 1e-3])),),
+        solve=lj.Solve(volumetric="mixed", precision="float32", tolerance=1e-5),
+    )
+    assert lj.simulate(scene).status[0] == status.STALLED
 
 
 @pytest.mark.slow

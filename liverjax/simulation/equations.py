@@ -201,10 +201,12 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
     free = free_directions(scene)
     tolerance = jax.lax.stop_gradient(scene.solve.tolerance)
     step = _with_tied(physics, _first_step(scene, state.x, free)._replace(k=k, tolerance=tolerance))
-    free, noise = step.free, 20 * float(np.finfo(np.float64).eps) * sizes.unit_strain
+    eps = float(np.finfo(np.float64).eps)
+    free, noise = step.free, 20 * eps * sizes.unit_strain
     if scene.solve.volumetric == "mixed":
         # Inertia counts only mu/K times in the tolerance (`Mixed.counted`). In short time steps its roundoff is larger.
-        noise = noise + ROUNDINGS * sizes.roundoff
+        # The roundoff is that of double precision, so that runs in single precision report if they stop above it.
+        noise = noise + ROUNDINGS * sizes.roundoff * (eps / float(jnp.finfo(state.x.dtype).eps))
     return Equations(
         scene=scene,
         physics=physics,

@@ -113,7 +113,7 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, sentence), details=details)
 
 
-def _modes_of(fit: TimeFit) -> Callable:
+def _modes_of(fit: TimeFit | Together) -> Callable:
     return partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
 
 
@@ -176,9 +176,7 @@ def with_offset_errors(fit: AFit, tests: Sequence[Measured], factors: Sequence[f
     if not columns:
         return fit, 0.0
     shifts = np.linalg.pinv(J) @ np.column_stack(columns)
-    modes, moved = _with_shifts(
-        fit.uncertainty, partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u, shifts
-    )
+    modes, moved = _with_shifts(fit.uncertainty, _modes_of(fit), u, shifts)
     own = fit.parameters
     if own is not None and fit.kind.values is not None:
         own, _ = _with_shifts(own, fit.kind.values, u, shifts)
