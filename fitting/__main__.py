@@ -1,4 +1,5 @@
-"""The command line ``python -m fitting SWEEP.csv …``; for other tests ``… curves | field | relaxation | … FILE …``."""
+"""The command lines ``python -m fitting SWEEP.csv …`` for frequency sweeps and ``python -m fitting COMMAND FILE …`` for
+other tests. COMMAND is one of `COMMANDS`."""
 
 import importlib
 import sys

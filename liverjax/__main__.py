@@ -1,6 +1,6 @@
 """Command line ``liverjax simulate | sweep | reduce | design | laws | check | plot | play | fit``.
 
-``python -m liverjax …`` is the same.
+``python -m liverjax …`` runs the same commands.
 """
 
 import argparse

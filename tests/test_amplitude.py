@@ -146,7 +146,7 @@ def test_what_no_law_follows_is_said(tmp_path, tanned):
     sweep = sweep._replace(storage=1000 * falls, loss=np.full(len(STRAIN), 100.0))
     (candidate,) = stress_stretch.candidates("fung_demiray")
     told = " ".join(law_fit.said_of(sweep, [law_fit.fit_law(candidate, sweep, law_fit.Memory(), "parallel")]))
-    assert "c2 may be off by several per cent" in told  # the memory is unknown
+    assert "c2 may be wrong by several per cent" in told  # the memory is unknown
     assert "the loss tangent changes" in told and "misses the moduli" in told and "slips, yields or tears" in told
 
 

@@ -164,7 +164,7 @@ def test_a_tie_between_two_points_changes_no_balance():
         ({"to": [True, 0.1, 0.1], "where": {"z_min": SIDE}, "stiffness": 1.0}, "ligament.0 to = True is not a number"),
         (
             {"to": [0, 0, 0.2], "where": {"z_min": SIDE}, "stiffness": 1.0, "pre_tension": 50.0},
-            "must be below its limit",
+            "N: give a smaller tension",
         ),
         ({"to": [0, 0, 0.1], "where": {"z_min": SIDE}, "stiffness": 1.0, "rest_length": 0.1}, "fibre without length"),
         ({"points": [[0, 0, 0], [0, 0, 1]], "stiffness": 1.0, "rest_length": 0.1}, "is outside the body"),

@@ -186,13 +186,13 @@ def _spring(**given) -> dict:
     [
         (
             {"fixed": (lj.Fixed(nodes=jnp.array([999])),)},
-            "fixed.0.nodes names node 999, but the nodes are 0 to 26: renumber them",
+            "fixed.0.nodes contains node 999, but the mesh has only the nodes 0 to 26: give node numbers in this range",
         ),
         ({"fixed": (lj.Fixed(nodes=jnp.array([0.0, 1.0])),)}, "fixed.0.nodes has numbers of type float64: give whole"),
-        ({"fixed": (lj.Fixed(nodes=TOP),)}, "fixed.0.nodes has shape (2, 3): give whole node numbers (n,)"),
+        ({"fixed": (lj.Fixed(nodes=TOP),)}, "fixed.0.nodes has shape (2, 3): give a list (n,) of whole node numbers"),
         (
             {"displaced": (lj.Displaced(nodes=jnp.array([27]), by=jnp.zeros(3)),)},
-            "displaced.0.nodes names node 27, but the nodes are",
+            "displaced.0.nodes contains node 27, but the mesh has only the nodes",
         ),
         (
             {"traction": (lj.Traction(triangles=LOST, pressure=1.0),)},
@@ -204,11 +204,11 @@ def _spring(**given) -> dict:
         ),
         (
             {"porosity": replace(SOUND.porosity, drained=jnp.array([27]))},
-            "porosity.drained names node 27, but the nodes are",
+            "porosity.drained contains node 27, but the mesh has only the nodes",
         ),
         (
             {"porosity": replace(SOUND.porosity, inlet=(Inlet(nodes=jnp.array([99]), pressure=1.0),))},
-            "porosity.inlet.0.nodes names node 99, but the nodes are 0 to 26",
+            "porosity.inlet.0.nodes contains node 99, but the mesh has only the nodes 0 to 26",
         ),
         (
             {"porosity": replace(SOUND.porosity, inlet=(Inlet(triangles=LOST, flux=1.0),))},
@@ -224,13 +224,13 @@ def _spring(**given) -> dict:
         (_plate(stiffness=jnp.ones(3)), "obstacle.0.stiffness has shape (3,): give one number or shape (2,)"),
         (
             _plate(times=jnp.array([1.0, 0.0]), history=jnp.zeros((2, 3))),
-            "obstacle.0 history must have increasing times, but has 0 s after 1 s: sort them",
+            "obstacle.0 history must have increasing times, but has 0 s after 1 s: sort the times",
         ),
         (_spring(triangles=LOST, normal=1.0), "support.0.triangles has [1, 2, 4], which is not a face of an element"),
         (_spring(triangles=TOP, normal=jnp.ones(5)), "support.0.normal has shape (5,): give one number or shape (2,)"),
         (
             _spring(nodes=jnp.array([99]), stiffness=1.0),
-            "support.0.nodes names node 99, but the nodes are 0 to 26: renumber them",
+            "support.0.nodes contains node 99, but the mesh has only the nodes 0 to 26: give node numbers in",
         ),
         (
             _spring(triangles=TOP, normal=1.0, times=jnp.array([0.0, 1.0]), history=jnp.array([1.0, -1.0])),
@@ -313,7 +313,7 @@ MEANINGLESS = (
     ({"porosity": replace(SPONGE, bulk=jnp.array([400.0] * 5 + [2300.0]))}, "porosity limit_bulk = 2200 must be above"),
     (
         {"porosity": replace(SPONGE, drained=jnp.array([1, 990]))},
-        "porosity.drained names node 990, but the nodes are 0 to 7",
+        "porosity.drained contains node 990, but the mesh has only the nodes 0 to 7",
     ),
     ({"solve": lj.Solve(steps=2)}, "[solve] has no dt, which viscosity needs"),
     ({"solve": lj.Solve(steps=2, kind="dynamic", dt=0.05)}, "[solve] kind = 'dynamic' needs mass"),
@@ -323,13 +323,13 @@ MEANINGLESS = (
     (_moved(by=[0.01, 0.02]), "displaced.0 by has shape (2,)"),
     (_moved(by=0.01), "displaced.0 by has shape ()"),
     (_moved(by=jnp.zeros((3, 3))), "displaced.0 by has shape (3, 3)"),
-    (_moved(nodes=jnp.array([4, 700])), "displaced.0.nodes names node 700, but the nodes are 0 to 7"),
+    (_moved(nodes=jnp.array([4, 700])), "displaced.0.nodes contains node 700, but the mesh has only the nodes 0 to 7"),
     (_moved(axes="XYZ"), "displaced.0 axes = 'XYZ' is not known: give some of the letters xyz"),
     ({"fixed": (lj.Fixed(nodes=jnp.array([0, 1]), axes=""),)}, "fixed.0 axes = '' is not known"),
     ({"fixed": (lj.Fixed(nodes=jnp.array([0.0, 1.0])),)}, "fixed.0.nodes has numbers of type float64"),
     (
         {"traction": (lj.Traction(triangles=jnp.array([[0, 1, 30]]), pressure=4.0),)},
-        "traction.0.triangles names node 30",
+        "traction.0.triangles contains node 30",
     ),
     (
         {"physics": (Obstacle(triangles=jnp.array([[0, 1, 3]]), shape="Plane", position=jnp.zeros(3)),)},

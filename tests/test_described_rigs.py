@@ -210,7 +210,7 @@ def test_the_commands_take_a_description(tmp_path):
     file = written(tmp_path, {"test": "sphere", "thickness": 8e-3, "radius": 2e-3}, ramp)
     assert main(["relaxation", str(file), "--out", str(tmp_path / "one")]) == 0
     found = (tmp_path / "one" / "fit.json").read_text()
-    assert "contact begins where displacement is 0" in found
+    assert "contact is assumed to begin at displacement 0" in found
     omega = np.geomspace(0.05, 50, 20)
     G = moduli(TRUTH, omega)
     rows = "\n".join(f"{w},{a},{b}" for w, a, b in zip(omega, *G, strict=True))
@@ -235,14 +235,14 @@ def test_the_commands_take_a_description(tmp_path):
             {"radius": 0.001, "height": 0.02},
             "height = 0.02 m is 20 radii, but glued samples are computed only up to 10",
         ),
-        ({"radius": 0.001, "height": 0.02, "poisson": 0.4}, r"tensile stress / 2.8, that is 2 times 1 \+ poisson"),
+        ({"radius": 0.001, "height": 0.02, "poisson": 0.4}, r"tensile stress divided by 2 \(1 \+ poisson\) = 2.8"),
         ({"radus": 0.01}, "did you mean radius"),
         ({"poisson": 0.5}, "must be from 0 to 0.4995"),
         ({"drive": "torque"}, "use displacement or force"),
         ({"height": 1e-4}, "more than half of the height"),
         ({"data": 3}, "must name a file"),
         ({"ramp": 0.5}, "ramp = 0.5 cannot be used: remove ramp"),
-        ({"min_time": -3.0}, "min_time = -3 cannot be seconds after the load"),
+        ({"min_time": -3.0}, "min_time = -3 is negative: give the time after the load"),
         ({"data": "none.csv"}, "none.csv"),
         ({"data": "shear.csv"}, "needs columns of time, displacement and force"),
         ({"data": "still.csv"}, "displacement is zero throughout"),

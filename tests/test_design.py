@@ -37,7 +37,10 @@ def test_a_table_is_not_written_over_other_files(tmp_path, capsys):
     scene = '[mesh]\nshape = "box"\n'
     (tmp_path / "scene.toml").write_text(scene)
     assert main(["design", str(tmp_path / "scene.toml"), "law.mu=500:600"]) == 2
-    assert "is not a table of design" in capsys.readouterr().err and (tmp_path / "scene.toml").read_text() == scene
+    assert (
+        "is not a table of `liverjax design`" in capsys.readouterr().err
+        and (tmp_path / "scene.toml").read_text() == scene
+    )
     (tmp_path / "d.csv").touch()  # an empty file is not another table
     for rows in ("2", "4"):
         assert main(["design", str(tmp_path / "d.csv"), "law.mu=500:600", "--rows", rows]) == 0

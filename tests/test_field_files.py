@@ -91,7 +91,7 @@ def test_places_in_another_unit_than_the_displacements_are_refused(tmp_path):
     points = np.asarray(scene.mesh.points)
     rows = np.column_stack([points, 1e3 * 1e-3 * points])  # only the displacements in mm
     np.savetxt(tmp_path / "u.csv", rows, delimiter=",", header="x,y,z,ux,uy,uz", comments="")
-    with pytest.raises(lj.InputError, match=r"all points lie within .* --unit mm is for x, y, z and ux"):
+    with pytest.raises(lj.InputError, match=r"all points lie within .* --unit mm applies to x, y, z and ux"):
         displacements.read_displacements(tmp_path / "u.csv", scene, 1e-5, "mm")
 
 

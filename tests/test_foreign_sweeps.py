@@ -239,7 +239,10 @@ SPOILED = {
     "two angles": ("frequency_Hz,tan_delta,phase_deg\n1,2,3\n2,3,3\n", "no column for storage.*add"),
     "no frequency": ("time_s,complex_modulus_Pa,phase_deg\n1,2,3\n2,3,4\n", "no column for frequency.*add"),
     "only storage": ("frequency_Hz,G' [Pa]\n1,2\n2,3\n", "no column for loss"),
-    "phase of 90": (HEAD + "1,10,90\n2,11,91\n3,12,95\n", "line 2: phase_deg = 90 is no phase below 90 degrees.*check"),
+    "phase of 90": (
+        HEAD + "1,10,90\n2,11,91\n3,12,95\n",
+        "line 2: phase_deg = 90 is not a phase below 90 degrees.*check",
+    ),
     "negative phase": (
         HEAD + "1,10,-5\n2,11,-6\n3,12,-7\n",
         "line 2: phase_deg = -5 is not positive.*correct the sign",
@@ -255,7 +258,7 @@ SPOILED = {
     "all nan": (column("plain, tan_delta", 0, "NaN"), "line 2: frequency_Hz is empty"),
     "infinite": (column("plain, radians", 1, "inf"), "complex_modulus_Pa = inf is not finite.*remove the line"),
     "too large": (column("plain, radians", 1, "1e200"), "beyond any measurement.*check the unit"),
-    "one frequency": (column("plain, radians", 0, "1"), "fewer|at least two different ones"),
+    "one frequency": (column("plain, radians", 0, "1"), "fewer|at least two different frequencies"),
     "word": (
         changed("plain, radians", (r"\n0.0795\S*?,", "\nfast,")),
         "line 3: frequency_Hz = 'fast' is not a number.*correct",

@@ -307,8 +307,8 @@ def test_points_outside_the_limits_are_left_out_and_said():
     assert within(s, None, None) is s and within(s, None, 1e9) is s
     for low, high, sentence in (
         (None, 0.01, r"keep only 0 of 31 points .*keep 3 frequencies or more"),
-        (None, -1.0, "--max-frequency -1 is no frequency"),
-        (float("nan"), None, "--min-frequency nan is no frequency"),
+        (None, -1.0, "--max-frequency -1 is not a frequency"),
+        (float("nan"), None, "--min-frequency nan is not a frequency"),
     ):
         with pytest.raises(InputError, match=sentence):
             within(s, low, high)

@@ -300,7 +300,7 @@ def test_a_radius_in_millimetres_is_refused(tmp_path, capsys):
     of_cone = ["--shape", "cone", "--radius", "5", "--thickness", "0.01", "--out", str(tmp_path)]
     main(["indentation", str(tmp_path / "c.csv"), *of_cone])
     told = capsys.readouterr().err
-    assert "it changes nothing for a cone" in told and "in metres" not in told
+    assert "it has no effect for a cone" in told and "in metres" not in told
 
 
 def test_a_wrong_shape_is_told_behind_a_long_approach(tmp_path, capsys):

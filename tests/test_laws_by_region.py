@@ -270,7 +270,7 @@ def test_scene_files_name_a_law_for_a_region():
                 "viscosity": {"ratios": [0.5], "relaxation_times": [1.0], "part": "isochoric"},
                 "solve": {"dt": 0.1},
             },
-            "needs a law with an isochoric part, which SaintVenantKirchhoff has not",
+            "needs a law with an isochoric part, unlike SaintVenantKirchhoff",
         ),
     ],
 )

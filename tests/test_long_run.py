@@ -124,10 +124,10 @@ def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch,
     with monkeypatch.context() as patch:
         _stop_after(patch, 2)
         assert main([*command, str(stopped)]) == 130
-        assert "go on with --resume" in capsys.readouterr().err
+        assert "finished parts are kept: continue with --resume" in capsys.readouterr().err
     assert not (stopped / "result.h5").exists()
     assert main([*command, str(stopped)]) == 2
-    assert "go on with --resume" in capsys.readouterr().err
+    assert "unfinished run: continue with --resume" in capsys.readouterr().err
     # as if the machine had lost power while the file was written
     damaged = sorted(stopped.glob("result.h5.parts/part_*.h5"))[1]
     damaged.write_bytes(damaged.read_bytes()[:-1000])
@@ -178,7 +178,7 @@ def test_the_result_of_another_scene_is_not_replaced_by_resume(scene, tmp_path, 
     with h5py.File(out, "w") as file:
         file.attrs["scene"] = SCENE.replace("770.0", "700.0")
     assert main(["simulate", str(scene), "--resume", "--out", str(tmp_path)]) == 2
-    assert "result.h5 is the result of another scene: name another --out, or remove --resume" in capsys.readouterr().err
+    assert "result.h5 is the result of another scene: give another --out, or remove --resume" in capsys.readouterr().err
     long_run.refuse_unfinished(out, resume=False, text=SCENE)
     long_run.refuse_unfinished(out, resume=True, text="# of the same numbers\n" + SCENE.replace("770.0", "700.0"))
 

@@ -226,7 +226,7 @@ def test_the_command_says_which_temperature_it_took_and_prints_the_factors_on_th
     assert "log10 a_T" in text and "  reference" in text and "WLF: C1" in text
     with pytest.raises(SystemExit):
         main([*words, "--master", "nan"])
-    assert "'nan' is no temperature" in capsys.readouterr().err
+    assert "'nan' is not a temperature" in capsys.readouterr().err
 
 
 def test_a_sweep_at_several_temperatures_that_fits_nothing_gets_the_remedy(tmp_path, capsys):

@@ -39,7 +39,7 @@ def test_a_set_without_nodes_or_elements_is_no_place():
     """Such a set fixed nothing, and the body fell freely, with status 0."""
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
     mesh = replace(mesh, node_sets={"EMPTY": np.empty(0, int)}, element_sets={"EMPTY": np.empty(0, int)})
-    with pytest.raises(lj.InputError, match="fixed: the node set 'EMPTY' of the mesh holds no node"):
+    with pytest.raises(lj.InputError, match="fixed: the node set 'EMPTY' of the mesh contains no node"):
         lj.boundary.select(mesh, None, "EMPTY", "fixed")
     with pytest.raises(lj.InputError, match="the element set 'EMPTY' of the mesh is empty"):
         select_elements(mesh, None, "EMPTY")
@@ -141,7 +141,7 @@ def test_refusals(tmp_path):
     points, tets = np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 1, 2, 3]])
     inverted = lj.tet_mesh(points, tets[:, [0, 2, 1, 3]])
     _refused("1 of 1 tetrahedra are flat or inverted", lambda: lj.check_mesh(inverted))
-    _refused("name node 7", lambda: lj.check_mesh(lj.tet_mesh(points, [[0, 1, 2, 7]])))
+    _refused("largest number 7, number of nodes", lambda: lj.check_mesh(lj.tet_mesh(points, [[0, 1, 2, 7]])))
     _refused("no tetrahedron", lambda: lj.check_mesh(lj.tet_mesh(np.vstack([points, [5, 5, 5]]), tets)))
     _refused("finite coordinates", lambda: lj.check_mesh(lj.tet_mesh(points * np.nan, tets)))
     _refused("no such file", lambda: lj.read_mesh(tmp_path / "none.vtu"))
@@ -156,7 +156,7 @@ def test_refusals(tmp_path):
     import meshio
 
     meshio.Mesh(points, [("triangle", tets[:, :3])]).write(tmp_path / "surface.vtu")
-    _refused("holds triangle but no linear or quadratic tetrahedra", lambda: lj.read_mesh(tmp_path / "surface.vtu"))
+    _refused("contains triangle but no linear or quadratic tetrahedra", lambda: lj.read_mesh(tmp_path / "surface.vtu"))
 
 
 def test_copies_other_cells_and_millimetres_are_told(tmp_path):
@@ -167,10 +167,10 @@ def test_copies_other_cells_and_millimetres_are_told(tmp_path):
         lj.check_mesh(twice)
     cells = [("tetra", tets), ("hexahedron", np.array([[0, 1, 2, 3, 4, 5, 6, 7]]))]
     meshio.Mesh(points, cells).write(tmp_path / "mixed.vtk")
-    with pytest.raises(lj.InputError, match="it holds hexahedron beside linear tetrahedra"):
+    with pytest.raises(lj.InputError, match="contains hexahedron in addition to linear tetrahedra"):
         lj.read_mesh(tmp_path / "mixed.vtk")
     meshio.Mesh(280 * points, [("tetra", tets), ("triangle", tets[:1, :3])]).write(tmp_path / "large.vtk")
-    with pytest.warns(UserWarning, match="280 m long: if its numbers are millimetres write unit = 'mm'"):
+    with pytest.warns(UserWarning, match="280 m long: if its coordinates are in millimetres, write unit = 'mm'"):
         lj.read_mesh(tmp_path / "large.vtk")
     assert np.isclose(float(lj.read_mesh(tmp_path / "large.vtk", "mm").volumes.sum()), 0.28**3)
 

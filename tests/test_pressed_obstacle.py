@@ -163,7 +163,7 @@ def test_scene_files_press_an_obstacle():
         ({"force": [0, 0, -1], "by": [0, 0, 1]}, "obstacle.0 has force together with by: remove one"),
         ({"force": [0, 0, -1], "friction": 0.5}, "obstacle.0 has force together with friction: remove one"),
         ({"history": [[0, 0, 0, 1]]}, "history"),
-        ({"history": [[0, 1], [1, -0.5]]}, "factor -0.5: the force can only press"),
+        ({"history": [[0, 1], [1, -0.5]]}, "factor -0.5, but the force can only press"),
     ],
 )
 def test_obstacles_that_cannot_be_pressed_get_one_sentence(change, words):

@@ -229,7 +229,7 @@ def test_middles_in_another_order_are_refused(tmp_path):
     data = meshio.read(tmp_path / "body.vtu")
     data.cells[0].data[:, [8, 9]] = data.cells[0].data[:, [9, 8]]
     data.write(tmp_path / "swapped.vtu")
-    with pytest.raises(lj.InputError, match="not in the order of its format"):
+    with pytest.raises(lj.InputError, match="not in the order of the file format"):
         lj.read_mesh(tmp_path / "swapped.vtu")
 
 

@@ -60,7 +60,7 @@ def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, ca
     # A reduced run does not discard an interrupted run in the same folder.
     (tmp_path / "used" / "result.h5.parts").mkdir()
     assert main(["simulate", str(tmp_path / "used.toml"), "--out", str(tmp_path / "used")]) == 2
-    assert "holds an unfinished run" in capsys.readouterr().err and (tmp_path / "used" / "result.h5.parts").exists()
+    assert "contains an unfinished run" in capsys.readouterr().err and (tmp_path / "used" / "result.h5.parts").exists()
 
 
 def test_the_command_has_the_defaults_of_the_function():

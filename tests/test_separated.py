@@ -98,7 +98,7 @@ def test_traced_values_outside_of_the_range_have_no_answer(model):
 
 def test_a_loaded_mesh_is_refused(scene):
     """Displacements were measured from the given shape, in which the runs end, so they were only noise."""
-    with pytest.raises(InputError, match=r"no separated form: use the scene of lj.unloaded"):
+    with pytest.raises(InputError, match=r"cannot have a separated form: use the scene of lj.unloaded"):
         lj.separate(replace(scene, points_are="loaded"), RANGES)
 
 

@@ -278,9 +278,9 @@ pre_tension = 0.05
         ("obstacle.0.axis.2", -2.0, "of length 1"),
         ("obstacle.0.position.2", 0.05, "begins 0.05 m inside the body"),
         ("vessel.0.wall", 0.005, "thicker than the radius"),
-        ("obstacle.0.radius", 0.02, "changes nothing: a plane has none"),
+        ("obstacle.0.radius", 0.02, "has no effect on a plane"),
         # A fibre is at least 5 cm long. At 20 N/m times that, its rest length is zero.
-        ("ligament.0.pre_tension", 50.0, "must be below its limit, 1 N"),
+        ("ligament.0.pre_tension", 50.0, "must be below 1 N"),
     ],
 )
 def test_rows_are_checked_as_the_scene_is(files, column, value, words):
@@ -312,7 +312,7 @@ history = [[0, 0], [0.1, 1]]
 @pytest.mark.parametrize(
     "column, good, bad, words",
     [
-        ("support.0.stiffness", 0.0, 50.0, "changes nothing: springs on a surface have normal"),
+        ("support.0.stiffness", 0.0, 50.0, "has no effect: for springs on a surface give normal"),
         ("displaced.0.by.1", 0.0, 0.01, "displaced.0 moves node .* out of the plane of support.1"),
         ("traction.0.times.1", 0.1, -0.1, "increasing times"),
     ],
@@ -406,7 +406,7 @@ def test_writes_that_fail_keep_what_was_computed(processor, files):
 
     run = subprocess.run(call, capture_output=True, text=True, timeout=300, preexec_fn=limited, env=small)
     assert run.returncode == 1 and len(run.stderr.splitlines()) == 1
-    assert "File too large: finished chunks are kept, go on with --resume" in run.stderr
+    assert "File too large: finished chunks are kept, continue with --resume" in run.stderr
     assert sorted(files.glob("rows.h5.parts/part_*")) == finished and len(finished) == 2
     assert main(command(files, "--resume")) == 0
 
@@ -414,7 +414,7 @@ def test_writes_that_fail_keep_what_was_computed(processor, files):
 def test_no_room_for_the_joined_file_keeps_the_parts(files, monkeypatch, capsys):
     monkeypatch.setattr(sweep.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     assert main(command(files)) == 1
-    assert "No space left on device: finished chunks are kept, go on with --resume" in capsys.readouterr().err
+    assert "No space left on device: finished chunks are kept, continue with --resume" in capsys.readouterr().err
     monkeypatch.undo()
     assert main(command(files, "--resume")) == 0
 

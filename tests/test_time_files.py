@@ -104,7 +104,7 @@ BAD = {
         "since the load rose between 0 and 1 s: remove it",
     ),
     "late": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "5"], "2 usable responses remain"),
-    "early": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "-1"], "--min-time -1 cannot be seconds after"),
+    "early": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "-1"], "--min-time -1 must be 0 or more"),
     "modes": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--modes", "9"], "--modes 9 is out of range"),
     "radius": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--radius", "4"], "--radius 4 cannot be"),
 }

@@ -1,12 +1,12 @@
 """One steady cycle of large shear: complex modulus of the first harmonic, and relative amplitude of the third harmonic.
 
 The sample is incompressible and isotropic, with a strain energy function W. W gives the instantaneous second
-Piola-Kirchhoff stress S. The relaxation of S does not depend on the strain (chapter, section 4.2). In simple shear with
-the amount g(t) = a sin(wt), the shear stress is S12 + g S22, independently of the pressure. S is a sum of harmonics of
-w. Relaxation multiplies harmonic n by the modulus ratio m(nw) = G*(nw)/G0, with the complex modulus G* and the
-instantaneous modulus G0. In torsion between plates, every ring of the sample is in simple shear, with an amount of
-shear that depends on the radius (a universal deformation: Rivlin 1949). So the torque is a sum over rings. A rheometer
-converts this torque into moduli as if the sample were linear.
+Piola-Kirchhoff stress S. The relaxation of S does not depend on the strain (book chapter, section 4.2). In simple shear
+with the amount g(t) = a sin(wt), amplitude a and angular frequency w, the shear stress is S12 + g S22, whatever the
+pressure is. S is a sum of harmonics of w. Relaxation multiplies harmonic n by the modulus ratio m(nw) = G*(nw)/G0, with
+the complex modulus G* and the instantaneous modulus G0. In torsion between plates, every ring of the sample is in
+simple shear, with an amount of shear that depends on the radius (a universal deformation: Rivlin 1949). So the torque
+is a sum over rings. A rheometer converts this torque into moduli as if the sample were linear.
 """
 
 from typing import NamedTuple
@@ -19,8 +19,8 @@ from liverjax.laws.base import Law
 from liverjax.laws.terms.stretch_terms import stress_at_constant
 from liverjax.tensors.matrices import pack, unpack
 
-#: INSTANTS: number of instants in a cycle; harmonics of the stress above the 15th are neglected. RINGS: number of rings
-#: between the plates (Gauss points).
+#: INSTANTS: number of instants at which the stress of a cycle is computed; harmonics of the stress above the 15th are
+#: neglected. RINGS: number of rings between the plates (Gauss points).
 INSTANTS, RINGS = 32, 8
 #: Number of amounts of shear g at which the law is evaluated. S12/g and S22 are even functions of g, so they are
 #: interpolated by polynomials in g^2.
@@ -28,28 +28,30 @@ ASKED = 24
 
 
 class Reading(NamedTuple):
-    """Matrices that convert stresses at `ASKED` amounts of shear to the moduli that a rheometer reports. The matrices
-    are the same for every law."""
+    """Matrices that convert stresses at K = `ASKED` amounts of shear to the moduli that a rheometer reports. The
+    matrices are the same for every law."""
 
     shears: np.ndarray  # (K,) amounts of shear, above 0
     F: jax.Array  # (K, 3, 3) deformation gradients
-    harmonics: jax.Array  # (M, 2, A, 2, K) complex; M sets of modulus ratios, harmonic 1 or 3, A strain amplitudes
+    #: (M, 2, A, 2, K) complex. Axes: set of modulus ratios, harmonic (1 or 3), strain amplitude, component (S12/g or
+    #: S22), amount of shear.
+    harmonics: jax.Array
 
 
 def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel") -> Reading:
     """Compute the matrices for cycles with given strain amplitudes at the rim.
 
     Args:
-        strains: amplitudes (A,) at the rim.
-        memories: M sets of modulus ratios m(nw) for n = 0 to `INSTANTS` / 2, complex (M, n). The reported moduli are
-            linear in m.
+        strains: A strain amplitudes (A,) at the rim.
+        memories: M sets of modulus ratios m(nw), complex (M, `INSTANTS` / 2 + 1), for n = 0 to `INSTANTS` / 2. The
+            reported moduli are linear in m.
         plates: "parallel", or "cone" (cone and plate, where the strain is the same everywhere).
     """
     rho, weights = _radii_and_weights(plates)
     own = np.asarray(strains)[:, None] * rho
     shear = own[..., None] * np.sin(2 * np.pi * np.arange(INSTANTS) / INSTANTS)
     squares = 0.5 * np.max(own) ** 2 * (1 + np.cos(np.pi * (np.arange(ASKED) + 0.5) / ASKED))
-    lines = _lagrange(squares, shear**2)  # (A, R, T, K)
+    lines = _lagrange(squares, shear**2)  # (A, R, T, K) for R rings and T instants
     out = np.empty((len(memories), 2, len(own), 2, ASKED), complex)
     for c, S in enumerate((shear[..., None] * lines, lines)):
         spectrum = np.fft.rfft(S, axis=-2)
@@ -64,17 +66,18 @@ def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel")
 
 
 def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return radii of rings divided by the radius of the rim, and the weights of the moduli of these rings."""
+    """Return the radii of rings divided by the radius of the rim, and the weights of the moduli of these rings in the
+    modulus that a rheometer reports."""
     if plates == "cone":
         return np.ones(1), np.ones(1)
     x, w = np.polynomial.legendre.leggauss(RINGS)
     rho = 0.5 * (1 + x)
-    return rho, 0.5 * w * 4 * rho**3  # share of each ring in 2 M / (pi R^3) / (strain at the rim)
+    return rho, 0.5 * w * 4 * rho**3  # share of each ring in 2 torque / (pi radius^3) / (strain at the rim)
 
 
 def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the values (..., K) at the points `at` of the Lagrange polynomials for Chebyshev nodes (K,) (barycentric
-    form; Berrut, Trefethen 2004)."""
+    """Return the values (..., K), at the points `at` (...), of the K Lagrange polynomials for K Chebyshev nodes (K,)
+    (barycentric form; Berrut, Trefethen 2004)."""
     k = np.arange(len(nodes))
     w = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / len(nodes))
     off = at[..., None] - nodes
@@ -85,13 +88,14 @@ def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the complex modulus (A,) [Pa] of the first harmonic, and the amplitude (A,) of the third harmonic of the
-    torque divided by the amplitude of the first.
+    """Return two results at A strain amplitudes: the complex modulus (A,) [Pa] of the first harmonic, and the amplitude
+    (A,) of the third harmonic of the torque, divided by the amplitude of the first harmonic.
 
     Args:
         law: law of the instantaneous stress. Its volumetric energy is not used.
         r: the result of `reading`.
-        shares: factors (M,) of the M sets of modulus ratios. The ratios m are the sum of the sets times these factors.
+        shares: factors (M,) of the M sets of modulus ratios in `reading`. The modulus ratios m of the material are the
+            sum of the sets, each multiplied by its factor.
     """
     S = _instantaneous_stress(law, r.F)
     asked = jnp.stack([S[:, 0, 1] / r.shears, S[:, 1, 1]])
@@ -100,8 +104,8 @@ def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array,
 
 
 def _instantaneous_stress(law: Law, F: jax.Array) -> jax.Array:
-    """Return the second Piola-Kirchhoff stress (K, 3, 3) [Pa] of the isochoric energy. F must be constant, because the
-    function has no derivatives with respect to F."""
+    """Return the second Piola-Kirchhoff stress (K, 3, 3) [Pa] of the isochoric energy for K simple shears F (K, 3, 3).
+    The result has no derivatives with respect to F, so F must be constant."""
     split = law.isochoric_part()
     if split is not None and split.stretch_energy is not None:
         return pack(stress_at_constant(split, unpack(F)))

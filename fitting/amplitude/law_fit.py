@@ -21,19 +21,21 @@ from fitting.readers.frequency_sweep import smooth_curve
 from liverjax.core.errors import InputError
 from liverjax.laws import Law
 
-#: If the loss tangent changes by more than this fraction over the sweep, the relaxation depends on the strain.
+#: If the loss tangent changes by more than this fraction over the sweep, the program warns that the relaxation depends
+#: on the strain.
 CHANGED = 0.2
 
 
 class Memory(NamedTuple):
-    """Modulus ratio m(nw) = G*(nw)/G0 for each harmonic n (see `cycle`), from a Prony series. Without a series, the
+    """Modulus ratio m(nw) = G*(nw)/G0 for each harmonic n (see `cycle`), from a Prony series. If `series` is None, the
     ratio is 1 + i (loss tangent), with the same loss tangent for all harmonics n > 0."""
 
     series: Maxwell | None = None
 
     def of(self, omega: float) -> np.ndarray:
-        """Return the modulus ratios m(nw) (1, n) of the series at the angular frequency w = `omega` [rad/s]. Without a
-        series, return (2, n): m is the first row plus the loss tangent times the second row."""
+        """Return the modulus ratios m(nw) (1, N) of the series for N harmonics n = 0, 1, … of the angular frequency
+        `omega` [rad/s]. If there is no series, return (2, N): m is the first row plus the loss tangent times the second
+        row."""
         n = np.arange(cycle.INSTANTS // 2 + 1)
         if self.series is None:
             return np.array([np.ones(len(n)), np.where(n == 0, 0, 1j)])
@@ -42,7 +44,7 @@ class Memory(NamedTuple):
 
 
 class StrainFit(NamedTuple):
-    """A fitted law, and the moduli that it predicts for the sweep."""
+    """A fitted law, and the moduli that this law predicts at the n strain amplitudes of the sweep."""
 
     law: LawFit
     storage: np.ndarray  # (n,) [Pa]
@@ -92,11 +94,11 @@ def outside_series(memory: Memory, omega: float) -> str | None:
 
 
 def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: str) -> StrainFit:
-    """Minimise the sum of the squared relative residuals of G* at all amplitudes. Return the best result of many
-    starting points.
+    """Minimise the sum of the squared relative residuals of G* at all amplitudes, from many starting points. Return the
+    fit with the smallest sum.
 
-    Without a Prony series, the loss tangent is an additional parameter of the fit, and the fitted modulus is valid only
-    at the frequency of the sweep.
+    If `memory` has no Prony series, the loss tangent is an additional parameter of the fit. The fitted modulus is then
+    valid only at the frequency of the sweep.
     """
     own = candidate if memory.series is not None else with_loss_tangent(candidate)
     memories = memory.of(sweep.angular_frequency)
@@ -122,7 +124,7 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
     compiled = time.perf_counter()
     found = jax.block_until_ready(program(points))
     times = (time.perf_counter() - compiled, compiled - begin)
-    # G' and G'' of one sweep belong to one test, and their residuals are already relative.
+    # G' and G'' are not two tests, but belong to one sweep, and their residuals are already relative.
     law = assessed(own, _as_curves(sweep), found, scale, times, of_tests=False)
     best = found.u[int(np.nanargmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
     G, third = (np.asarray(v) for v in model(best))
@@ -147,15 +149,15 @@ def with_loss_tangent(candidate: Candidate) -> Candidate:
 
 
 def _as_curves(sweep: StrainSweep) -> list[Curve]:
-    """Return storage and loss modulus as two curves over the amount of shear at the rim. They are needed for the
-    warnings about a fit."""
+    """Return storage and loss modulus as two curves over the amount of shear at the rim. These curves are needed for
+    the warnings about a fit."""
     F = np.tile(np.eye(3), (len(sweep.strain), 1, 1))
     F[:, 0, 1] = sweep.strain
     return [Curve(name, "simple_shear", F, (0, 1), G) for name, G in (("G'", sweep.storage), ("G''", sweep.loss))]
 
 
 def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
-    """Return warnings for the user about the fits. The best fit must be the first in `fits`."""
+    """Return warnings about the fits of a strain sweep. The best fit must be the first in `fits`."""
     best = fits[0]
     told = list(best.law.warnings)
     tangents = sweep.loss / sweep.storage
@@ -164,8 +166,8 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
     if "loss_tangent" in best.law.names and shape:
         told.append(
             "without --model, also the constant part of the stress is computed with the modulus at this frequency. "
-            f"{' and '.join(shape)} may be off by several per cent, which the standard errors do not contain: give "
-            "--model with the fit.json of a frequency sweep"
+            f"{' and '.join(shape)} may be wrong by several per cent, and the standard errors do not contain this "
+            "error: give --model with the fit.json of a frequency sweep"
         )
     if abs(change) > CHANGED:
         told.append(
@@ -176,7 +178,7 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
         told.append("the law misses the moduli by more than 5 % on average: it does not describe this sweep")
     if sweep.storage[-1] < 0.8 * sweep.storage[0]:
         told.append(
-            "the storage modulus decreases with strain. The same happens if tissue slips, yields or tears. In this "
-            "case, a hyperelastic law describes the curve but not its cause"
+            "the storage modulus decreases with strain. The same happens if the tissue slips, yields or tears. In "
+            "this case, a hyperelastic law describes the curve but not its cause"
         )
     return [*told, *tied_laws([f.law for f in fits], "sweep")]

@@ -18,7 +18,7 @@ LARGEST_DRIFT = 2.0
 
 
 class StrainSweep(NamedTuple):
-    """Moduli of the first harmonic, sorted by strain."""
+    """Moduli of the first harmonic at n strain amplitudes, sorted by strain."""
 
     strain: np.ndarray  # (n,) amplitude at the rim [1]
     storage: np.ndarray  # (n,) [Pa]
@@ -35,7 +35,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     Args:
         path: path of the file. The name of its strain column is strain, with the unit % or 1.
         table: name of the table, or a part of its name, if the file has several tables.
-        max_strain: maximum strain [1]; points with a larger strain are ignored.
+        max_strain: maximum strain [1]; points with a larger strain are ignored. None: all points are used.
 
     Raises:
         InputError: no table has a column of strains; the moduli are tensile moduli; there are several frequencies or
@@ -65,7 +65,9 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     if good.sum() > kept.sum():
         notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are ignored as requested")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:
-        raise InputError(f"{path}: {kept.sum()} points of strain are left: give {FEWEST_POINTS} points or more")
+        raise InputError(
+            f"{path}: {kept.sum()} points of strain are left: give points at {FEWEST_POINTS} or more strains"
+        )
     if np.ptp(omega[kept]) > 0.01 * omega[kept].mean():
         low, high = omega[kept].min() / 2 / np.pi, omega[kept].max() / 2 / np.pi
         raise InputError(

@@ -30,7 +30,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="terms of Ogden's law (default 1, 2 and 3)")
     command.add_argument(
-        "--unit", choices=("Pa", "kPa", "MPa"), help="unit of stress columns that name none (default: Pa)"
+        "--unit", choices=("Pa", "kPa", "MPa"), help="unit of stress columns whose names contain no unit (default: Pa)"
     )
     command.add_argument(
         "--out", type=Path, default=Path("curves"), metavar="DIR", help="folder of the results (default curves)"
@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
     candidates = hyperelastic.candidates(options.law, options.terms)
     found, notes = curves.read_curves(options.files, options.unit or "Pa")
     if options.unit and not any("names no unit" in note for note in notes):
-        notes.append(f"--unit {options.unit} changes nothing: the stress columns name their unit")
+        notes.append(f"--unit {options.unit} has no effect: the stress columns name their unit")
     if options.law == "all":
         left = [n for n in laws.LAWS if not hyperelastic.incompressible_form(n)]
         notes.append(f"not fitted, because they are not an isochoric energy plus U(J): {', '.join(left)}")

@@ -19,7 +19,7 @@ from liverjax.scenes.scene import numbers_at
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation import gradients
 
-#: If the mesh error exceeds this many times the noise, a note is given.
+#: A note is given if the mesh error, divided by the noise, exceeds this value.
 _TOLD = 0.3
 
 
@@ -118,7 +118,8 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
         remedy = "a finer mesh, or order = 2," if linear else "a finer mesh"
         finer = f"; {remedy} would give more information" if max(beside) > 1 else ""
         print(
-            f"note: the mesh's error is {max(beside):.2g} times the noise, and counts as noise{finer}", file=sys.stderr
+            f"note: the error of the mesh is {max(beside):.2g} times the noise, and counts as noise{finer}",
+            file=sys.stderr,
         )
     with bar:
         found = field.estimate(problem, options.name, length, how)

@@ -45,9 +45,9 @@ def _notes_on_shape(options: argparse.Namespace) -> list[str]:
             f"a half-angle of {HALF_ANGLE:g} degrees is assumed; --half-angle sets another. E is proportional to 1/tan"
         )
     if not cone and options.half_angle is not None:
-        told.append(f"--half-angle is for a cone: it changes nothing for a {options.shape}")
+        told.append(f"--half-angle is for a cone: it has no effect for a {options.shape}")
     if cone and options.radius:
-        told.append("--radius is for a sphere or a punch: it changes nothing for a cone")
+        told.append("--radius is for a sphere or a punch: it has no effect for a cone")
     if options.thickness > THICK:
         told.append(f"--thickness is in metres: {options.thickness:g} m act as a half-space")
     return told

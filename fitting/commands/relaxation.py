@@ -116,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))
     found = fits.choose_in_time(test, options.model, options.modes)
-    if options.file.suffix.lower() != ".toml":  # in a described rig, errors of the sizes have another effect
+    if options.file.suffix.lower() != ".toml":  # errors of sizes in a TOML file act in another way
         default = Simulation()
         rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
         found.details["geometry_error"] = total_error.of_geometry(rig, None)

@@ -27,7 +27,7 @@ def refuse_copies(files: list[Path]) -> None:
     for file in (file for file in files if file.is_file()):
         first = seen.setdefault(file.read_bytes(), file)
         if first is not file:
-            raise InputError(f"{file}: it is the same measurement as {first}: give each once")
+            raise InputError(f"{file}: it is the same measurement as {first}: give each measurement once")
 
 
 def add_cards_and_samples(command: argparse.ArgumentParser) -> None:
@@ -63,8 +63,8 @@ def write_cards(out: Path, model: "Maxwell") -> None:
 
 
 def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
-    """Read a sweep without the points at which the instrument dominates. With --max-frequency, only the limits of the
-    band and the raw columns (`without_inertia`) decide which points are ignored."""
+    """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, points are
+    ignored only because of the limits of the band and of the raw columns (`without_inertia`)."""
     from fitting.readers import rheometer
 
     try:
@@ -80,9 +80,9 @@ def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
 
 
 def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") -> "Sweep":
-    """Return the sweep without the points at which the instrument dominates. If the density of the sample is given, the
-    inertia of the sample is not mistaken for that of the instrument. The moduli still contain the inertia of the
-    sample."""
+    """Return the sweep without the points at which the instrument dominates. The moduli still contain the inertia of
+    the sample. If the density of the sample is given, its inertia is subtracted for the search of these points, so that
+    it is not mistaken for the inertia of the instrument."""
     import numpy as np
 
     from fitting.fits import sample_inertia
@@ -99,7 +99,7 @@ def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") ->
         if strain:
             density = compression.torsional_density(laws.typical(options.law), strain, density)
         bare = sample_inertia.taken_off(sweep, density, options.height)
-    except InputError:  # the later step that subtracts the inertia raises this error with the remedy
+    except InputError:  # a later step subtracts the inertia, and raises the error with its remedy
         return kramers_kronig.without_instrument(sweep)
     kept = kramers_kronig.without_instrument(bare)
     told = tuple(note for note in kept.notes if note not in bare.notes)

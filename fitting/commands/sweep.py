@@ -51,7 +51,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="TEST",
         help="further tests of the same material (relaxation, creep, sweep, shear waves): one Prony series for all",
     )
-    command.add_argument("--table", metavar="NAME", help="which of several tables: its number, name or a part of it")
+    command.add_argument("--table", metavar="NAME", help="which table of several: its number, or a part of its name")
     command.add_argument("--max-frequency", type=float, metavar="HZ", help="ignore the points above this frequency")
     command.add_argument("--min-frequency", type=float, metavar="HZ", help="ignore the points below this frequency")
     shared_options.add_modes(command)
@@ -73,7 +73,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         help="sweeps at several temperatures are given: shift them to the one nearest to C degrees Celsius "
         "(default the middle one) and fit the master curve",
     )
-    command.add_argument("--vertical", action="store_true", help="with --master: moduli have shift factors too")
+    command.add_argument("--vertical", action="store_true", help="with --master: fit shift factors of the moduli too")
     _add_sample(command)
     _add_outputs(command)
     master = ("shift_factors.csv", "master_curve.csv", "shift.png")
@@ -91,15 +91,15 @@ def _celsius(text: str) -> float | str:
             return text if text == MIDDLE else float(text)
     except ValueError:
         pass
-    raise argparse.ArgumentTypeError(f"{text!r} is no temperature in degrees Celsius: give the files before --master")
+    raise argparse.ArgumentTypeError(f"{text!r} is not a temperature in °C: give the files before --master")
 
 
 def _add_sample(command: argparse.ArgumentParser) -> None:
-    """Options for the sample between its plates, and for its simulation."""
+    """Add the options for the sample between its plates, and for its simulation."""
     command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
     command.add_argument(
-        "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m], to include in errors"
+        "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m], which is added to errors"
     )
     command.add_argument(
         "--friction-error",
@@ -126,7 +126,7 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
 
 
 def _add_outputs(command: argparse.ArgumentParser) -> None:
-    """Options for further output of a fit."""
+    """Add the options for further output of a fit."""
     command.add_argument(
         "--predict",
         type=Path,
@@ -150,7 +150,7 @@ def run(options: argparse.Namespace) -> int:
 
     _check(options)
     if options.master is not None:
-        options.method = options.method or "closed-form"  # nothing was measured at the shifted frequencies
+        options.method = options.method or "closed-form"  # no measurement exists at the shifted frequencies
     elif len(options.sweep) > 1:
         from fitting.commands import samples
 
@@ -162,7 +162,7 @@ def run(options: argparse.Namespace) -> int:
     options.method = options.method or "torsion"
     shift: Content = {}
     shifted = ""
-    tests = _tests_to_predict(options)  # read before the fit: an error in a file must not lose the fit
+    tests = _tests_to_predict(options)  # read now, so that an error in a file does not discard a finished fit
     if options.master is None:
         sweep = shared_options.usable_sweep(options, options.sweep[0])
     else:
@@ -285,20 +285,20 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _note_idle(options: argparse.Namespace) -> None:
-    """Print a note on options that are for the simulation and have no effect on the closed form."""
+    """Print a note on each option that has no effect, because it is for the simulation or for a single sweep."""
     several = len(options.sweep) > 1 or bool(options.others) or options.master is not None
     if options.method == "torsion" or (options.method is None and not several):
         return
     idle = {"--steps": options.steps != 50, "--scheme": options.scheme != "exponential"}
     idle["--law"] = options.law != "neo_hookean" and not options.precompression
     for name in (name for name, changed in idle.items() if changed):
-        print(f"note: {name} is for the simulation: it changes nothing in the closed form", file=sys.stderr)
+        print(f"note: {name} is for the simulation: it has no effect on the closed form", file=sys.stderr)
     if several and options.optimizer != "levenberg-marquardt":
-        print(f"note: --optimizer {options.optimizer} is for a single sweep: it changes nothing here", file=sys.stderr)
+        print(f"note: --optimizer {options.optimizer} is for a single sweep: it has no effect here", file=sys.stderr)
 
 
 def _check_friction(options: argparse.Namespace) -> None:
-    """Raise an error for --friction-error if the size of the sample is missing, or if the fit does not use it."""
+    """Raise an error for --friction-error if the size of the sample is missing, or if the fit cannot use the option."""
     error = options.friction_error
     if error is None:
         return
@@ -314,7 +314,7 @@ def _check_friction(options: argparse.Namespace) -> None:
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(f"--friction-error is fitted with the Prony modes of one sample: remove {name}")
+            raise InputError(f"--friction-error works only with the Prony modes of one sample: remove it, or {name}")
 
 
 def _check_precompression(options: argparse.Namespace) -> None:
@@ -326,11 +326,11 @@ def _check_precompression(options: argparse.Namespace) -> None:
     compression.check_strain(options.precompression)
     for name, asked in (("--with", bool(options.others)), (f"{len(options.sweep)} samples", len(options.sweep) > 1)):
         if asked:
-            raise InputError(f"--precompression works for one sample only: remove {name}, or --precompression")
+            raise InputError(f"--precompression works for a single sweep only: remove {name}, or --precompression")
     for name, asked in (("--profile", options.profile), ("--samples", options.samples is not None)):
         if asked:
             raise InputError(
-                f"{name} is computed for a sample that is not compressed: remove {name}, or --precompression"
+                f"{name} works only for a sample that is not compressed: remove {name}, or --precompression"
             )
     if options.model != "prony" and options.method != "closed-form":
         raise InputError(
@@ -358,13 +358,13 @@ def _check_master(options: argparse.Namespace) -> None:
 def _check_samples(options: argparse.Namespace) -> None:
     """Raise an error for options that need a single sweep."""
     for name, asked, instead in (
-        ("--method torsion", options.method == "torsion", "remove it, or give one file"),
-        ("--profile", options.profile, "remove it, or give one file"),
-        ("--samples", options.samples is not None, "remove it, or give one file"),
-        ("--report", options.report, "remove it, or give one file"),
-        ("--predict", bool(options.predict), "remove it, or give one file"),
-        ("--gap-error", options.gap_error is not None, "remove it, or give one file"),
-        ("--density", options.density is not None, "remove it, or give one file"),
+        ("--method torsion", options.method == "torsion", "remove the option, or give one file"),
+        ("--profile", options.profile, "remove the option, or give one file"),
+        ("--samples", options.samples is not None, "remove the option, or give one file"),
+        ("--report", options.report, "remove the option, or give one file"),
+        ("--predict", bool(options.predict), "remove the option, or give one file"),
+        ("--gap-error", options.gap_error is not None, "remove the option, or give one file"),
+        ("--density", options.density is not None, "remove the option, or give one file"),
     ):
         if asked:
             raise InputError(f"{name} is for one sample only, and {len(options.sweep)} files are given: {instead}")
@@ -404,7 +404,7 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
-    """Return the closed-form fit and, by default, the fit of the simulation; and the corrected sweep of both fits."""
+    """Return the closed-form fit, by default also the fit of the simulation, and the corrected sweep of both fits."""
     from fitting.fits import instrument, sample_inertia, viscoelastic
     from fitting.fits.honesty import edges, total_error
     from fitting.methods import generalised_maxwell
@@ -429,7 +429,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     closed, corrected = instrument.without_error_of_inertia(closed, sweep)
     for note in corrected.notes[len(sweep.notes) :]:
         print(f"note: {note}", file=sys.stderr)
-    if options.gap_error:  # before the warnings that use the errors
+    if options.gap_error:  # before the warnings are made, because they use the errors
         closed = instrument.with_gap_error(closed, options.gap_error / simulation.height)
     if corrected is not sweep:
         dense = generalised_maxwell.spectrum(corrected)
@@ -441,7 +441,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         fits[1].details.update(heavy)
     for fit in fits:
         fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
-    for fit in fits if options.precompression else ():  # its errors contain the errors from the size of the sample
+    for fit in fits if options.precompression else ():  # after `geometry_error` is set, because it is used
         fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
     return fits, corrected
 

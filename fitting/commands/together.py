@@ -61,10 +61,12 @@ def _without_sample_inertia(tests: "list[Measured]", density: float | None, heig
 
 
 def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "Measured":
-    """Read a file as a described test in a rig, as shear waves, as another sweep, or as a relaxation or creep test.
+    """Read a test from a file: a TOML description of a test rig, shear waves, a further sweep, or a relaxation or creep
+    test.
 
-    Another sweep is cut to the band that the user gives. As in the first sweep, points at which the instrument
-    dominates are ignored. If `whole` is true, the sweep is only predicted, so it is not cut.
+    The points of a further sweep outside the band that the user gives are ignored. As in the first sweep, points at
+    which the instrument dominates are ignored too. If `whole` is true, the test is only predicted, and the limits of
+    the band are not applied.
     """
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion

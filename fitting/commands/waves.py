@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5", "progress_of_regions.h5")
 #: MOST_MEMORY: maximum memory of one matrix factor [GB]. A body that needs more is divided into parts, or the grid is
-#: made coarser. MOST_OF_MAP: largest number of values of a map in a divided body (its matrices are dense).
+#: made coarser. MOST_OF_MAP: maximum number of values of a map in a divided body, because the matrices of such a map
+#: are dense.
 MOST_MEMORY, MOST_OF_MAP = 4.0, 5000
 #: Maximum correlation length of a map, divided by the size of the organ. Above it, the map would be uniform.
 LONGEST = 5.0
@@ -39,12 +40,12 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "data", type=Path, metavar="DATA", help="complex displacements: .npz, .npy, .h5, .mat, .csv, .nii, .nii.gz"
     )
-    command.add_argument("--frequencies", type=float, nargs="+", metavar="HZ", help="frequencies, if not in the file")
+    command.add_argument("--frequencies", type=float, nargs="+", metavar="HZ", help="frequencies, if the file has none")
     command.add_argument("--mask", type=Path, metavar="FILE", help="voxels of the organ, if the file has no mask")
     command.add_argument("--labels", type=Path, metavar="FILE", help="number of the region of each voxel")
     command.add_argument("--unit", help="unit of the displacements: m, mm or um (default m)")
     command.add_argument(
-        "--spacing", type=float, nargs=3, metavar="M", help="spacing of the voxels [m], if the file states none"
+        "--spacing", type=float, nargs=3, metavar="M", help="spacing of the voxels [m], if the file states no spacing"
     )
     command.add_argument(
         "--noise", type=float, metavar="M", help="standard deviation of one component (default: from data)"
@@ -65,7 +66,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find the moduli. The exit code is 1 if a fit did not converge."""
+    """Find the moduli of the organ and its regions, and a map. The exit code is 1 if a fit did not converge."""
     _check_waves(options)
     from fitting.reports.waves import report
     from fitting.waves import direct_inversion, elastography, stiffness_map, wave_field
@@ -117,7 +118,7 @@ def _kept_regions(options: argparse.Namespace, organ: "Organ") -> "Keep":
     )
     progress = [options.out / name for name in FILES[4:]]
     if not options.resume:
-        for file in progress:  # of an earlier run
+        for file in progress:  # these files are from an earlier run
             file.unlink(missing_ok=True)
     elif not any(file.is_file() for file in progress):
         print(f"note: {options.out} has no files to resume: a new search begins", file=sys.stderr)
@@ -126,7 +127,7 @@ def _kept_regions(options: argparse.Namespace, organ: "Organ") -> "Keep":
 
 @contextmanager
 def _forces_that_balance(data: Path) -> Iterator[None]:
-    """Raise an `InputError` if the equations have no solution."""
+    """Raise an `InputError` if the equations of the fit inside the `with` block have no solution."""
     try:
         yield
     except np.linalg.LinAlgError:

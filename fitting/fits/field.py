@@ -38,16 +38,17 @@ from liverjax.scenes.scene import numbers_at
 
 #: Standard deviations of ln(modulus) to try: from a nearly uniform body to a body whose stiffness may vary strongly.
 DEVIATIONS = (0.1, 0.2, 0.4, 0.8, 1.6)
-#: If the next standard deviation lowers chi^2 by less than this fraction, the search ends.
+#: If the next larger standard deviation lowers chi^2 by less than this fraction, no larger one is tried.
 _WORTH = 0.02
-#: The search ends if the norm of the gradient is below this distance to the minimum, in standard deviations of the map.
+#: The search ends if the norm of the gradient is below this value. The norm is an upper bound of the distance to the
+#: minimum, in standard deviations of the map.
 _NEAR = 0.05
-#: A map farther than this from its minimum has not converged (in standard deviations of the map).
+#: The search has not converged if the distance to the minimum is above this value, in standard deviations of the map.
 FAR = 0.1
 
 
 class Field(NamedTuple):
-    """The map and its uncertainty."""
+    """The map and its uncertainty. The map is a nodal field m (V,), and the modulus is multiplied by exp(m)."""
 
     name: str
     log_factor: np.ndarray  # m (V,)
@@ -55,17 +56,17 @@ class Field(NamedTuple):
     sd: np.ndarray  # standard deviation (V,) of m at the nodes, from data and prior
     prior_sd: np.ndarray  # standard deviation (V,) of m at the nodes, from the prior alone
     mesh_bias: np.ndarray | None  # error of m (V,) due to the meshes, to be subtracted from m; None: unknown
-    deviation: float  # chosen standard deviation of the prior
-    length: float  # correlation length [m]
+    deviation: float  # standard deviation of m in the prior, chosen from `DEVIATIONS`
+    length: float  # correlation length of the prior [m]
     chi2: float
-    components: int
-    reached: bool  # whether chi^2 came down to the number of components
+    components: int  # number of measured displacement components
+    reached: bool  # whether chi^2 is at most the number of components
     distance: float  # distance to the minimum: length of the next Gauss-Newton step, in standard deviations
-    history: list[dict]  # one entry for each deviation of the prior: chi2, iterations, evaluations, seconds
-    eigenvalues: np.ndarray  # of J^T J in whitened z: the data determine the directions with eigenvalues above 1
+    history: list[dict]  # one entry for each prior deviation: chi2, iterations, evaluations, seconds
+    eigenvalues: np.ndarray  # of J^T J; the data determine the directions of z with eigenvalues above 1
     codes: tuple[int, ...]
     seconds: float
-    given: np.ndarray  # (E,) True where a [[region]] of the scene sets the modulus; the map does not change it there
+    given: np.ndarray  # (E,) True where a [[region]] of the scene, not the map, sets the modulus
 
 
 def start_of(problem: Problem, name: str) -> jax.Array:
@@ -102,16 +103,16 @@ def given_by_regions(problem: Problem, name: str) -> tuple[np.ndarray, np.ndarra
 
 
 def values_at(problem: Problem, name: str, base: jax.Array, m: jax.Array) -> dict[str, jax.Array]:
-    """Return the values of the parameter in the elements for the nodal field m (V,). The name of the parameter is the
-    key."""
+    """Return the values of the parameter `name` in the elements (E,) for the nodal field m (V,), as a dictionary with
+    the key `name`."""
     corners = m[problem.scenes[0].mesh.tetrahedra]
     return {name: base * jnp.exp(jnp.mean(corners, axis=1))}
 
 
 @partial(jax.jit, static_argnames="name")
 def _linearised(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> Any:
-    """Return the residuals (n,) of the runs at m, the linear map J from changes of m to changes of the residuals, and
-    the status codes of the runs."""
+    """Return the n residuals (n,) of the runs for the field m, the linear map J from changes of m to changes of the
+    residuals, and the status codes of the runs."""
     return jax.linearize(lambda m: misfit(problem, values_at(problem, name, base, m)), m, has_aux=True)
 
 
@@ -126,8 +127,8 @@ def _pulled(J: Callable, r: jax.Array, m: jax.Array) -> jax.Array:
 
 
 class _LinearRuns(NamedTuple):
-    """The runs, linearised at a whitened field z. They give products with the derivative J of the residuals with
-    respect to z, and with its transpose."""
+    """The runs, linearised at a whitened field z. The methods compute products with the derivative J of the n residuals
+    with respect to z, and with the transpose of J."""
 
     p: smooth.Prior
     deviation: float
@@ -135,7 +136,7 @@ class _LinearRuns(NamedTuple):
     m: jax.Array
     r: np.ndarray  # residuals (n,)
     J: Callable  # linear map from changes of m to changes of r
-    slope: np.ndarray  # J^T r (V,), with J with respect to z
+    slope: np.ndarray  # J^T r (V,), where J is the derivative with respect to z
     codes: tuple[int, ...]
 
     @property
@@ -168,8 +169,8 @@ class _LinearRuns(NamedTuple):
 
 
 def _without_addresses(structure: object) -> str:
-    """Return a string that describes the structure of scenes. It has no memory addresses, so it is the same in every
-    process. The string contains the types of all objects, and the settings that are not numbers."""
+    """Return a string that describes the structure of scenes: the types of all objects, and the settings that are not
+    numbers. The string has no memory addresses, so it is the same in every process."""
     return re.sub(r" at 0x[0-9a-f]+", "", str(structure))
 
 
@@ -183,21 +184,21 @@ class _Search:
         self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
         self.history: list[dict[str, float]] = []
         self.k, self.z = 0, np.zeros(len(p.root_mass))
-        self.last: list[_LinearRuns] = []  # a trial point, and the point before this trial step
+        self.last: list[_LinearRuns] = []  # runs at a trial field z, and at the field z before this trial step
         self.evaluations = 0
         self.marks = {
             "name": name,
             "length": float(p.scale),  # the prior's scale is a power of the length
             "noise": mark_of(*(d.sd for d in problem.data)),
             "displacements": mark_of(*(a for d in problem.data for a in d._replace(sd=d.step))),
-            "search": "trust region",  # files of other search methods may end at other points
+            "search": "trust region",  # a search by another method may end at another map
             "scene": mark_of(base, *jax.tree.leaves(problem.scenes)),
             "law or settings": mark_of(_without_addresses(jax.tree.structure(problem.scenes))),
             "versions": mark_of(str(versions())),
         }
 
     def at(self, z: np.ndarray) -> _LinearRuns:
-        """Return the runs, linearised at z."""
+        """Return the runs, linearised at the whitened field z."""
         deviation = DEVIATIONS[self.k]
         for one in self.last:
             if one.deviation == deviation and np.array_equal(one.z, z):
@@ -207,19 +208,21 @@ class _Search:
         self.evaluations += 1
         here = _LinearRuns(self.p, deviation, z.copy(), m, np.asarray(r), J, z, tuple(int(c) for c in codes))
         here = here._replace(slope=here.pull(here.r))
-        base = [one for one in self.last if np.array_equal(one.z, self.z)]  # the next trial step may begin there again
+        # The next trial step may begin again at the z before this trial step.
+        base = [one for one in self.last if np.array_equal(one.z, self.z)]
         self.last = [here, *(base or self.last)[:1]]
         return here
 
     def iterated(self, z: np.ndarray) -> None:
-        """Save the new point and report the progress. The minimiser calls this function after each iteration."""
+        """Save the new field z and report the progress. The minimiser calls this function after each iteration."""
         self.z = z.copy()
         self.write()
         r = self.at(self.z).r
         self.progress(self.k, float(r @ r) / self.problem.components)
 
     def write(self) -> None:
-        """Write the current point. The file is replaced as a whole, so it is never half written."""
+        """Write the current z and the history to the file. The file is replaced as a whole, so it is never half
+        written."""
         if self.file is None:
             return
         with whole(self.file) as new, h5py.File(new, "w") as f:
@@ -250,13 +253,14 @@ _HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "sec
 class MapOptions(NamedTuple):
     """Options of the search for a map, and of the file that keeps its progress."""
 
-    max_iterations: int = 60  # maximum number of iterations for each deviation of the prior
+    max_iterations: int = 60  # maximum number of iterations for each standard deviation of the prior
     modes: int = 60  # maximum number of directions with a computed uncertainty
-    file: Path | None = None  # HDF5 file, written after every iteration; None: no file
-    resume: bool = False  # begin from that file if it exists
-    #: Called after each iteration with the index of the deviation and chi^2 per component.
+    file: Path | None = None  # HDF5 file with the progress, written after every iteration; None: no file
+    resume: bool = False  # continue the search in that file, if the file exists
+    #: Called after each iteration with the index of the standard deviation in `DEVIATIONS` and with chi^2 per
+    #: component.
     progress: Callable[[int, float], None] = lambda weight, chi2: None
-    mesh_error: bool = True  # estimate the error due to the meshes (`mesh_bias`)
+    mesh_error: bool = True  # whether to estimate the error due to the meshes (`mesh_bias`)
 
 
 def estimate(
@@ -270,14 +274,15 @@ def estimate(
 
     Args:
         problem: scenes with one mesh, and the measurements.
-        name: dotted name of a positive parameter of the law. The search begins at the value in the scenes.
+        name: dotted name of a positive parameter of the law, for example law.mu. The search begins at the value in the
+            scenes.
         length: correlation length of the prior [m].
         options: settings of the search, see `MapOptions`.
         changes: fields of `options` by their names, for example ``max_iterations=40``.
 
     Raises:
         InputError: the problem is invalid (see `start_of`), `file` belongs to another fit, or the simulation fails at
-            the first parameters.
+            the parameters with which the search begins.
     """
     begin = time.perf_counter()
     base, problem = start_of(problem, name), with_solvers(problem, {})
@@ -320,10 +325,10 @@ def estimate(
 
 
 def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
-    """Try larger and larger standard deviations of the prior until chi^2 is as low as the number of components. Each
-    search begins at the result of the previous search."""
+    """Minimise the cost for larger and larger standard deviations of the prior, until chi^2 is as low as the number of
+    components or no longer falls. Each search begins at the result of the previous search."""
     while True:
-        # If the program was stopped after this search had finished, the history already has its row.
+        # If the program was stopped after this search had finished, the history already has the entry of this search.
         finished = len(search.history) > search.k and search.history[search.k]["iterations"] < max_iterations
         if not finished:
             search.history = [*search.history[: search.k], _minimised(search, max_iterations)]
@@ -337,7 +342,8 @@ def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
 
 
 def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
-    """Find the minimum for the present standard deviation of the prior, and return an entry of the history."""
+    """Find the minimum of the cost for the present standard deviation of the prior, and return an entry of the
+    history."""
     begin, before = time.perf_counter(), search.evaluations
     found = scipy.optimize.minimize(
         lambda z: search.at(z).cost,
@@ -356,17 +362,19 @@ def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
 
 
 def _measured_directions(here: _LinearRuns, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest eigenvalues (k,) of J^T J, and their eigenvectors (n, k) in whitened z."""
+    """Return the k largest eigenvalues (k,) of J^T J, k = `modes` or fewer, and their eigenvectors (n, k) in whitened z
+    (n,)."""
     k = min(modes, n - 2, len(here.r))
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=lambda z: here.pull(here.push(z)), dtype=float)
-    # The prior determines the directions with an eigenvalue far below 1: these eigenvalues need not be accurate.
+    # The prior determines the directions with an eigenvalue far below 1, so a low accuracy of these eigenvalues is
+    # enough.
     values, vectors = scipy.sparse.linalg.eigsh(operator, k=k, ncv=min(n, 2 * k + 1), tol=1e-2, v0=np.ones(n))
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
 
 
 def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return (I + J^T J)^-1 g (V,), with a relative tolerance of 1 %. This is accurate enough for first-order
-    estimates."""
+    """Return (I + J^T J)^-1 g (V,), by conjugate gradients with a relative tolerance of 1 %. This is accurate enough
+    for first-order estimates. The eigenvalues and eigenvectors of J^T J give the preconditioner."""
     n, shrink = len(g), values / (1 + values)
 
     def solved(z: np.ndarray) -> np.ndarray:
@@ -398,8 +406,8 @@ def distance_sentence(found: Field) -> str | None:
     )
 
 
-#: If the standard deviation of the logarithm exceeds this value even at the best known node, the data do not determine
-# the level of the map.
+#: If the standard deviation of ln(modulus) exceeds this value at every node, the data do not determine the level of the
+#: map.
 OPEN = 0.5
 
 

@@ -1,10 +1,11 @@
 """A stiff or soft sphere in a uniform body. Centre, radius and stiffness of the sphere are estimated from measured
 displacements.
 
-Unlike a map, the sphere has few parameters. A smooth map spreads a sharp edge, so its peak is not the modulus of an
-inclusion. The map only gives the starting point. The edge of the sphere is smooth over a length proportional to the
-element size, so the residuals have derivatives with respect to the position of the sphere. An error of the radius can
-compensate an error of the modulus. The elements should therefore be quadratic, or much smaller than the sphere.
+Unlike a stiffness map, the sphere has few parameters. A smooth map spreads a sharp edge, so the peak of the map is not
+the modulus of an inclusion. The map only gives the starting point of the fit. The edge of the sphere is smooth over a
+length proportional to the element size, so the residuals have derivatives with respect to the position of the sphere.
+An error of the radius can compensate an error of the modulus. The elements should therefore be quadratic, or much
+smaller than the sphere.
 """
 
 from typing import Any
@@ -20,13 +21,14 @@ from liverjax.core.struct import Number
 from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Width of the edge divided by the mean distance between neighbouring integration points.
+#: Width of the smooth edge of the sphere, divided by the mean distance between neighbouring integration points.
 _EDGE = 0.25
 NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion")
 
 
 def edge_width(mesh: TetMesh) -> float:
-    """Return the width of the edge [m], a quarter of the mean distance between neighbouring integration points."""
+    """Return the width [m] of the smooth edge of the sphere, a quarter of the mean distance between neighbouring
+    integration points."""
     size = float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
     return _EDGE * size / mesh.order
 
@@ -42,9 +44,9 @@ def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> j
 
 
 def start_from(problem: Problem, field: Field) -> np.ndarray:
-    """Return the starting point u (6,) of the sphere from the map. The sphere consists of the elements whose
-    ln(modulus) differs from the background by more than half of the largest difference. Differences are divided by the
-    standard deviation of the map. With a weak prior, the map may have large values where the data contain little
+    """Return the starting point u (6,) of the sphere (see `estimate`) from the map. The sphere consists of the elements
+    whose ln(modulus) differs from the background by more than half of the largest difference. Differences are divided
+    by the standard deviation of the map. Otherwise the sphere could begin at large values where the data contain little
     information, for example at corners.
     """
     mesh = problem.scenes[0].mesh
@@ -65,8 +67,8 @@ def start_from(problem: Problem, field: Field) -> np.ndarray:
 
 
 def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> Estimate:
-    """Estimate the centre and radius [m] of the sphere, and the parameter `name` outside and inside, with standard
-    errors.
+    """Estimate the centre and radius [m] of the sphere, and the parameter `name` outside and inside the sphere, with
+    standard errors.
 
     Args:
         problem: scenes with one mesh, and the measurements.

@@ -2,11 +2,12 @@
 module also contains the fit of a compressed sample.
 
 The instrument subtracts the torque of its inertia I; the modulus is the torque per angle, divided by the constant K of
-the geometry. If the true inertia is I (1 + delta), G' is too small by delta I omega^2 / K. Without a prior, this term
-would compensate errors of the model. Here delta has a normal prior around 0 with the standard deviation
-`raw_torque.UNCERTAINTY`. delta is fitted only if the file has raw columns. It is used only if it stays the same, within
-its error, when the upper end of the band is left out. The friction b of the bearing adds b omega / K to G''. The error
-of b has a normal prior around 0 with the standard deviation that the user gives.
+the geometry. If the true inertia is I (1 + delta), G' is too small by delta I omega^2 / K at the angular frequency
+omega. Without a prior, this term would compensate errors of the model. Here delta has a normal prior around 0 with the
+standard deviation `raw_torque.UNCERTAINTY`. delta is fitted only if the file contains the raw torque or the raw phase.
+The fitted delta is used only if it stays the same, within its error, when the upper end of the band is left out. The
+friction b of the bearing adds b omega / K to G''. The error of b has a normal prior around 0 with the standard
+deviation that the user gives.
 """
 
 from typing import Any, NamedTuple
@@ -28,11 +29,11 @@ from liverjax import laws
 #: If the standard error of an instrument error, divided by its prior standard deviation, is at least this, the data do
 #: not determine the instrument error.
 UNTOLD = 0.9
-#: Maximum number of rounds, each a fit and a correction; and maximum number of halvings of a correction that would make
-#: a modulus 0 or negative.
+#: ROUNDS: maximum number of rounds; each round is a fit and a correction. HALVINGS: maximum number of halvings of a
+#: correction that would make a modulus 0 or negative.
 ROUNDS, HALVINGS = 20, 30
-#: A correction below this many prior standard deviations counts as 0. For exact data, the standard error is 0 and
-#: cannot be the limit.
+#: A correction below this many prior standard deviations counts as 0. This limit is needed for exact data, whose
+#: standard error is 0.
 SETTLED = 1e-6
 
 
@@ -40,7 +41,7 @@ class Nuisance(NamedTuple):
     """An error of the instrument, in standard deviations of its prior."""
 
     name: str
-    moved: np.ndarray  # (n,) change of G* [Pa] by one standard deviation
+    moved: np.ndarray  # (n,) change of G* [Pa] at the n frequencies if the error is one standard deviation
     unit: float  # standard deviation of the prior, in the unit of the report
 
     @property
@@ -49,13 +50,14 @@ class Nuisance(NamedTuple):
         return "friction_off_by_N_m_s" if self.name == "friction" else "inertia_off_by"
 
     def told(self, deviations: float) -> str:
-        """Return the size of this error with its unit, as a string for a warning."""
+        """Return the size of this error with its unit, as a string for a warning. `deviations`: the error in standard
+        deviations of its prior."""
         value = self.unit * deviations
         return _cent(value) if self.name == "inertia" else f"{value:.2g} N m s"
 
     def compared(self, deviations: float) -> str:
-        """Return text for a warning: by how much the true friction or inertia is larger or smaller than the value that
-        the instrument subtracted."""
+        """Return words for a warning. They state by how much the true friction or inertia is larger or smaller than the
+        value that the instrument subtracted."""
         return (
             f"{self.told(abs(deviations))} {'larger' if deviations > 0 else 'smaller'} than the value that was "
             "subtracted"
@@ -63,11 +65,12 @@ class Nuisance(NamedTuple):
 
 
 class InstrumentErrors(NamedTuple):
-    """Errors of the quantities that the instrument subtracted, in standard deviations of their priors."""
+    """The k errors of the quantities that the instrument subtracted (inertia, friction), in standard deviations of
+    their priors."""
 
     values: np.ndarray  # (k,)
     covariance: np.ndarray  # (k, k)
-    part: np.ndarray | None  # the values from the points without the last half decade; None if too few points are left
+    part: np.ndarray | None  # `values` without the last half decade of the sweep; None if too few points are left
     part_errors: np.ndarray | None
     found: bool  # False: the rounds of fit and correction did not converge
 
@@ -93,9 +96,9 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
 def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     """Fit the instrument's errors together with the Prony modes, and return the fit and the corrected sweep.
 
-    Fit and sweep are returned unchanged if the sweep has no data of the instrument, or if the model has no free Prony
-    modes. If one of the errors changes when the upper end of the band is left out, all errors are reported but none is
-    used.
+    The fit and the sweep are returned unchanged if the sweep has no data of the instrument, or if the model has no free
+    Prony modes. If one of the errors changes when the upper end of the band is left out, all errors are reported, but
+    the moduli are not corrected for them.
     """
     known = nuisances_of(sweep)
     if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
@@ -118,7 +121,7 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
         "moduli are corrected for it"
         if e < UNTOLD
         else f"the data do not determine the instrument's {n.name}: its standard error is {n.told(e)} with the data "
-        f"and {n.told(1.0)} without, and the moduli contain this error"
+        f"and {n.told(1.0)} without the data, and the moduli contain this error"
         for n, v, e in zip(known, values, np.sqrt(np.diag(covariance)), strict=True)
     ]
     corrected = corrected._replace(notes=(*sweep.notes, *notes))
@@ -127,8 +130,8 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
 
 
 def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
-    """Return the instrument errors that were fitted together with the modes, and the correction (k,) of the sweep, in
-    standard deviations of their priors."""
+    """Return the k instrument errors that were fitted together with the modes, and their values (k,), for which the
+    sweep was corrected. The values are in standard deviations of the priors."""
     told = fit.details.get("instrument")
     if told is None or told["moves_with_the_band"]:
         return [], np.zeros(0)
@@ -144,9 +147,9 @@ def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]
         each = " and ".join(n.name for n in known)
         return [
             f"the error of the instrument's {each} was not found together with the modes. The moduli are not "
-            "corrected for this error, and the errors of the parameters do not contain it: use --max-frequency to "
-            "exclude the frequencies at which the instrument carries most of the torque, or give another number of "
-            "--modes"
+            "corrected for this error, and the errors of the parameters do not contain this error: use "
+            "--max-frequency to exclude the frequencies at which the instrument carries most of the torque, or give "
+            "another number of --modes"
         ]
     for k in np.flatnonzero(~errors.steady):
         n = known[k]
@@ -166,7 +169,7 @@ def _cent(value: float) -> str:
 
 
 def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[str, object]:
-    """Return the entry `instrument` of fit.json."""
+    """Return the entry `instrument` of fit.json: values, standard errors and priors of the instrument errors."""
     out: dict[str, object] = {}
     errors = np.sqrt(np.diag(found.covariance))
     for k, n in enumerate(known):
@@ -181,8 +184,8 @@ def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[s
 
 
 def directions(sweep: Sweep, known: list[Nuisance]) -> np.ndarray:
-    """Return the changes (2n, k) of the residuals if each instrument error changes by one standard deviation of its
-    prior."""
+    """Return the changes (2n, k) of the residuals of G' and G'' at n frequencies if each of the k instrument errors
+    changes by one standard deviation of its prior."""
     scales = np.concatenate(sweep.deviations)
     return np.stack([np.concatenate([n.moved.real, n.moved.imag]) / scales for n in known], axis=1)
 
@@ -203,8 +206,8 @@ def _with_noise_as_measured(sweep: Sweep) -> Sweep:
 
 
 def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, Fit, bool]:
-    """Return the errors (k,) and their covariance in standard deviations of the priors, the fit to the corrected
-    moduli, and whether the rounds of fit and correction converged.
+    """Return the k instrument errors (k,), their covariance, the fit to the corrected moduli, and whether the rounds of
+    fit and correction converged. Errors and covariance are in standard deviations of the priors.
     """
     known = nuisances_of(sweep)
     values, covariance = np.zeros(len(known)), np.eye(len(known))
@@ -232,10 +235,10 @@ def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:
 
 
 def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return the step, halved until all moduli corrected with `values` + step are positive. Returns zeros if no part of
-    the step is possible.
+    """Return the `step` of the corrections, halved until all moduli corrected by `values` + step are positive. Returns
+    zeros if `HALVINGS` halvings are not enough.
 
-    The modes can fit a part of a large error, so the first step may be far too long.
+    The first step may be far too long, because the modes can fit a part of a large error.
     """
     for _ in range(HALVINGS):
         moved = _shifted(sweep, known, values + step)
@@ -246,7 +249,7 @@ def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarr
 
 
 def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: np.ndarray) -> Estimate:
-    """Return the estimate with its errors enlarged by the errors of the instrument."""
+    """Return the estimate of the modes with standard errors that also contain the errors of the instrument."""
     J = np.asarray(fit.solution.jacobian)
     _, slope = host.with_jacobian(
         lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell), np.asarray(fit.solution.u)
@@ -259,8 +262,8 @@ def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: 
 
 
 def with_gap_error(fit: Fit, relative: float) -> Fit:
-    """Return the fit with the error of the gap. This error is common to all moduli. It does not change ratios and
-    times."""
+    """Return the fit with the error of the gap in its standard errors. `relative`: relative standard error of all
+    moduli due to the gap. This error does not change ratios and relaxation times."""
     modes = fit.modes
     first = np.concatenate([fit.uncertainty.values[:1], np.zeros(2 * modes)])
     own = fit.parameters
@@ -277,8 +280,8 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
     Storage modulus, loss modulus and residuals of the fit still describe the compressed sample.
 
     Args:
-        fit: fit of the measured moduli. If the model has parameters that are moduli, they are divided by the factors
-            too.
+        fit: fit of the measured moduli. If parameters of the model are moduli, these parameters are also divided by the
+            factors.
         sweep: the measured moduli.
         factors: factors by which the compression changes the relaxing and the equilibrium moduli.
     """
@@ -310,8 +313,8 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
 
 
 def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
-    """Return the kind (the meaning of the variables u) for the sample at rest. Its relaxing part and its equilibrium
-    part are divided by their factors."""
+    """Return the kind (the meaning of the variables u) for the sample at rest. The relaxing moduli and the equilibrium
+    modulus are divided by their factors."""
     seen, shown, moduli = kind.maxwell, kind.values, kind.moduli
     if shown is None or moduli is None:
         return kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
@@ -329,7 +332,7 @@ def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
 
 def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, object]]:
     """Return the kind and the details with new Prony modes for the model of the sample at rest. The modes of the
-    measured moduli cannot be used, because each of them contains both relaxing and equilibrium part."""
+    measured moduli cannot be used, because each of these modes contains a relaxing and an equilibrium part."""
     own, omega = kind.moduli, sweep.angular_frequency
     assert own is not None
     solid = kind.names[0] == "equilibrium_modulus"
@@ -367,6 +370,7 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
 
 
 def _changed(fit: Fit, before: compression.Shares, after: compression.Shares) -> float:
-    """Return the ratio of G0 with the factors `after` to G0 with the factors `before`, for the same measured moduli."""
+    """Return G0 computed with the factors `after`, divided by G0 computed with the factors `before`, for the same
+    measured moduli."""
     stands = float(fit.model.equilibrium_modulus) / float(fit.model.shear_modulus)
     return (1 - stands) * before.relaxing / after.relaxing + stands * before.equilibrium / after.equilibrium

@@ -1,9 +1,9 @@
-"""One set of Prony parameters from several tests at once (sweep, creep, tension, indentation), each with separate
-noise.
+"""One set of Prony parameters from several tests at once (sweep, creep, tension, indentation). Each test has its
+individual noise.
 
-The Levenberg-Marquardt method minimises the residuals of all tests together, divided by their noise. A rig is a test
-machine with its sample; its simulation is differentiated in forward mode. The law is scaled to G0, as in the torsion
-fit.
+The Levenberg-Marquardt method minimises the residuals of all tests together, each divided by its noise. A rig is a test
+machine with its sample. The simulation of a rig is differentiated in forward mode. The shear modulus of the law is
+scaled to G0, as in the torsion fit.
 """
 
 import time
@@ -33,18 +33,19 @@ from liverjax.physics.viscosity import Prony
 
 
 class Test(NamedTuple):
-    """A measurement and the function `predict`, which returns the predicted values (n,) and the worst status code."""
+    """A measurement with n values, and the function `predict`, which returns the predicted values (n,) and the worst
+    status code of the simulation."""
 
     name: str
     predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
     measured: np.ndarray  # (n,)
-    sd: np.ndarray  # (n,) standard deviation of its noise
+    sd: np.ndarray  # (n,) standard deviation of the noise
     mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) change on an infinitely fine mesh; None: no mesh
 
 
 def sweep(data: Sweep) -> Test:
-    """Return the test for a frequency sweep that is predicted in closed form. Its noise comes from the file, or
-    otherwise from the misfit of the best Prony modes."""
+    """Return the test for a frequency sweep that is predicted in closed form. The noise comes from the file, or from
+    the misfit of the best Prony modes if the file gives no noise."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
@@ -54,8 +55,8 @@ def sweep(data: Sweep) -> Test:
 
 
 def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.Drive = torsion.Drive()) -> Test:
-    """Return the test for a frequency sweep that the torsion simulation predicts, with fixed or free height, at torque
-    amplitudes [N m]."""
+    """Return the test for a frequency sweep that the torsion simulation predicts, at the torque amplitudes `torque` [N
+    m]. `rig.free_height` states whether the height of the sample is free."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
@@ -66,23 +67,24 @@ def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.
 
 
 def _noise_of(data: Sweep) -> np.ndarray:
-    """Return the standard deviations (2n,) [Pa] of the moduli. If the file has no standard deviations, the scales of
-    the sweep are only weights, and the misfit of Prony modes gives the noise.
+    """Return the standard deviations (2n,) [Pa] of G' and G'' at the n frequencies of a sweep. If the file has no
+    standard deviations, the scales of the sweep are only weights, and the misfit of Prony modes gives the noise.
     """
     scales = np.concatenate(data.deviations)
     if data.noise_given:
         return scales
     _, tried = viscoelastic.choose_modes(data, generalised_maxwell.refuse_impossible(data))
-    # Fits with modes that this sweep does not determine count too: the other tests may determine these modes.
+    # Fits are also used if this sweep does not determine all their modes, because the other tests may determine them.
     return scales * max(QUIETEST, min(fit.uncertainty.noise for fit in tried))
 
 
 def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
-    """Return a test in a rig of `fitting.rigs.glued`, with readings (T,) [N] or [m]. `sd` is the standard deviation of
-    their noise, as one number or (T,).
+    """Return the test for readings (T,) [N] or [m] of a rig of `fitting.rigs.glued`, one reading for each of T time
+    steps. `sd` is the standard deviation of the noise, as one number or (T,).
 
     Raises:
-        InputError: the number of readings differs from the number of steps of the rig, or the noise is not positive.
+        InputError: the number of readings differs from the number of steps of the rig, a value is not finite, or `sd`
+            is not positive.
     """
     measured = np.asarray(measured, float)
     if measured.shape != (rig.scene.solve.steps,):
@@ -110,13 +112,14 @@ def fit(
     max_iterations: int = 30,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Estimate:
-    """Fit the Maxwell parameters to all tests, with standard errors. `uncertainty.parameter_names` gives their names.
+    """Fit the Maxwell parameters to all tests, and return them with standard errors. `uncertainty.parameter_names`
+    gives the names of these parameters.
 
     If tests are simulated in rigs, `mesh_bias` is the error of each parameter due to the meshes. Subtract `mesh_bias`
     to correct the parameter. A warning is given if this error is larger than the standard error.
 
     Args:
-        tests: one or more.
+        tests: one or more tests.
         start: starting point of the parameters; the number of modes does not change.
         law: one law for all tests. The fit scales its shear modulus to G0.
         part: which part of the stress relaxes, see `Prony`.
@@ -184,7 +187,7 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> np.ndarray:
-    """Return the errors (n,) of the readings due to the meshes, divided by the standard deviation of the noise."""
+    """Return the errors (n,) of all n readings due to the meshes, divided by the standard deviations of their noise."""
     return np.concatenate(
         [
             np.zeros(len(test.sd)) if test.mesh_error is None else np.asarray(test.mesh_error(*material)) / test.sd

@@ -1,8 +1,8 @@
 """Samples of the posterior of a fit, from the data and a stated prior.
 
-The likelihood is the same as in the fit: the errors are independent, with the given scales times a common factor s.
-This factor s is integrated out, with the prior 1 / s. If the data have standard deviations, the prior is 1 / s for s >
-1 and 0 otherwise. So the standard deviations may be enlarged, but never reduced.
+The likelihood is the same as in the fit: the errors are independent and normal, and their standard deviations are the
+given scales times a common factor s. This factor s is integrated out, with the prior 1 / s. If the data have standard
+deviations, the prior is 1 / s for s > 1 and 0 otherwise. So the standard deviations may be enlarged, but never reduced.
 
 If errors of the instrument are fitted together with the modes of a sweep, the posterior contains these errors too, with
 their priors. A sweep does not determine the gap. So the error of the gap is drawn independently, as one factor for all
@@ -49,28 +49,28 @@ PRIORS = {
 
 
 class Posterior(NamedTuple):
-    """Draws of the reported parameters."""
+    """Draws of K reported parameters: N draws from each of several chains."""
 
     names: tuple[str, ...]
     draws: np.ndarray  # (chains, N, K)
-    r_hat: np.ndarray  # (K,)
+    r_hat: np.ndarray  # (K,) R-hat of each parameter; it is near 1 if the chains agree
     chains: Chains  # the same draws in the coordinates of the fit, with details of the sampling
     prior: str  # description of the prior in words
     seconds: float
-    simulated: dict[str, float] | None = None  # number of simulated draws, and largest error of log density
-    times: tuple[float, float] | None = None  # ends [s] of the prior of relaxation times
+    simulated: dict[str, float] | None = None  # number of simulated draws, and largest error of their log density
+    times: tuple[float, float] | None = None  # shortest and longest time [s] in the prior of relaxation times
 
     def warnings(self) -> list[str]:
-        """Return warnings if the chains do not agree, if the prior truncates the posterior, or if the linear rig is not
-        accurate enough.
+        """Return warnings if the chains do not agree, if the prior truncates the posterior, or if the linear rig
+        (`of_simulation`) is not accurate enough.
         """
         worst = int(np.argmax(self.r_hat))
         out = self._cut_by_the_prior()
         if self.simulated and not self.simulated["largest_difference"] < DIFFERENT:
             out.append(
-                f"the posterior was computed with the linear rig instead of the simulation. In {SIMULATED} simulated "
-                f"draws, its log density is wrong by up to {self.simulated['largest_difference']:.2g}, so its "
-                "intervals are only approximate"
+                "the posterior was computed for small strain (linear rig) instead of with the simulation. In "
+                f"{SIMULATED} simulated draws, its log density is wrong by up to "
+                f"{self.simulated['largest_difference']:.2g}, so its intervals are only approximate"
             )
         if self.r_hat[worst] < AGREED:
             return out
@@ -93,39 +93,42 @@ class Posterior(NamedTuple):
             ):
                 if near.mean() > CUT:
                     out.append(
-                        f"the prior truncates the posterior of {name}: {100 * near.mean():.0f} % of the draws lie near "
-                        f"the bound of {end:.3g} s. The data do not limit this time, so its interval and those of the "
-                        "moduli depend on the prior. Measure a wider band"
+                        f"the prior truncates the posterior of {name}: {100 * near.mean():.0f} % of the draws lie "
+                        f"near the bound of {end:.3g} s. The data do not limit this time, so the intervals of this "
+                        "time and of the moduli depend on the prior. Measure a wider band"
                     )
         return out
 
 
-#: NEAR: a draw within this factor of a bound of the prior counts as near. CUT: a larger part of near draws is reported.
+#: NEAR: a draw lies near a bound of the prior if it is within this factor of the bound. CUT: the program warns if a
+#: larger fraction of the draws lies near a bound.
 NEAR, CUT = 1.25, 0.025
-#: AGREED: chains agree if R-hat is below this value. QUIETEST: lower bound of the relative error of data; without any
-#: error, the posterior would be a point.
+#: AGREED: chains agree if R-hat is below this value. QUIETEST: lower bound of the relative error of data; if the data
+#: had no error, the posterior would be a single point.
 AGREED, QUIETEST = 1.01, 1e-6
 
 
 class Target(NamedTuple):
-    """A posterior density of the coordinates u, and the parameters to report."""
+    """A posterior density of the P coordinates u, and the parameters to report. W is the number of vectors u that are
+    evaluated together, and m is the number of residuals."""
 
-    residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), residuals divided by their scales
+    residuals: Callable[[np.ndarray], np.ndarray]  # function of u (W, P): residuals (W, m) divided by their scales
     prior: "Modes | Springpots | WithInstrument"
     deviations_given: bool
     weight: float = 1.0  # number of independent residuals, divided by the number of residuals
 
     def log_likelihood(self, u: np.ndarray) -> np.ndarray:
-        """Return the log likelihood (W,) of u (W, P), up to a constant. The factor s of the errors is integrated
-        out."""
-        with np.errstate(all="ignore"):  # a point at which numbers overflow has likelihood 0
+        """Return the log likelihood (W,) of W vectors u (W, P), up to a constant. The common factor s of the errors is
+        integrated out."""
+        with np.errstate(all="ignore"):  # if numbers overflow, the likelihood is 0
             r = self.residuals(u)
             return self.weight * log_likelihood(np.sum(r * r, axis=-1), r.shape[-1], self.deviations_given)
 
 
 def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np.ndarray:
-    """Return the logarithm of the integral of s^-m exp(-square / (2 s^2)) ds / s over all s, up to a constant. If
-    deviations are given, the integral is over s >= 1. `square` is the sum of m = `count` squared residuals."""
+    """Return the logarithm of the integral of s^-m exp(-square / (2 s^2)) ds / s over all s, up to a constant. Here s
+    is the common factor of the errors, and `square` is the sum of m = `count` squared residuals. If `deviations_given`,
+    the integral is only over s >= 1."""
     half = 0.5 * np.maximum(square, QUIETEST**2 * count)
     out = -0.5 * count * np.log(half)
     return out + np.log(scipy.special.gammainc(0.5 * count, half)) if deviations_given else out
@@ -138,11 +141,11 @@ def target(
     size: np.ndarray,
     given: bool,
 ) -> Target:
-    """Return the posterior density of a model.
+    """Return the posterior density of a model, without errors of the instrument.
 
     Args:
         kind: the meaning of u: Prony modes or a fractional model.
-        residuals: function from u (W, P) to the residuals (W, m), divided by their scales.
+        residuals: function from W vectors u (W, P) to their m residuals (W, m), divided by their scales.
         resolved: shortest and longest relaxation time [s] that the data resolve.
         size: measured moduli (n,) [Pa].
         given: whether standard deviations of the data are given.
@@ -161,12 +164,12 @@ class Modes(NamedTuple):
     """Prior and parameters of Prony modes, in the coordinates of `generalised_maxwell.natural` or `natural_fluid`."""
 
     fluid: bool
-    modulus: tuple[float, float]  # ends of log G0
-    times: tuple[float, float]  # ends of the log times
+    modulus: tuple[float, float]  # lower and upper bound of log G0
+    times: tuple[float, float]  # lower and upper bound of the logs of the relaxation times
     words: str = PRIORS["prony"]
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
-        """Return the log prior (W,) of u (W, P), up to a constant."""
+        """Return the log prior (W,) of W vectors u (W, P), up to a constant."""
         with np.errstate(all="ignore"):
             model = self._model(u)
             rest = np.zeros((len(u), 0)) if self.fluid else 1 - model.ratios.sum(axis=-1, keepdims=True)
@@ -174,8 +177,8 @@ class Modes(NamedTuple):
             log_time = np.log(model.relaxation_times)
             inside = (log_time[:, -1] > self.times[0]) & (log_time[:, 0] < self.times[1])
             inside &= (u[:, 0] > self.modulus[0]) & (u[:, 0] < self.modulus[1])
-            # Log determinants of the derivatives: ratios by logits (softmax), and log times by the logs of their
-            # differences.
+            # Log determinants of two changes of variables: ratios to logits (softmax), and log times to the logs of
+            # their differences.
             gaps = u[:, u.shape[-1] - model.ratios.shape[-1] + 1 :]
             found = np.log(shares).sum(axis=-1) + gaps.sum(axis=-1)
         return np.where(inside & np.isfinite(found), found, -np.inf)
@@ -183,9 +186,8 @@ class Modes(NamedTuple):
     def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
         """Draw u (count, parameters) from the prior."""
         modes = parameters // 2
-        share = rng.standard_exponential(
-            (count, modes + (not self.fluid))
-        )  # divided by their sum: uniform on the simplex
+        # After division by their sum, these numbers are uniform on the simplex.
+        share = rng.standard_exponential((count, modes + (not self.fluid)))
         log_time = -np.sort(-rng.uniform(*self.times, (count, modes)), axis=1)
         top = rng.uniform(*self.modulus, (count, 1))
         gaps = np.log(-np.diff(log_time, axis=1))
@@ -195,33 +197,33 @@ class Modes(NamedTuple):
         return (generalised_maxwell.natural_fluid if self.fluid else generalised_maxwell.natural)(u)
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Return the names of the reported parameters, for this number of coordinates."""
+        """Return the names of the reported parameters, for `parameters` coordinates."""
         first, *others = parameter_names(parameters // 2)
         return (first, *others) if self.fluid else (first, "equilibrium_modulus", *others)
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Return moduli, ratios and times (n, K) for u (n, P)."""
+        """Return the K reported parameters (moduli, ratios and relaxation times) (n, K) of n draws u (n, P)."""
         model = self._model(u)
         moduli = [model.shear_modulus] if self.fluid else [model.shear_modulus, model.equilibrium_modulus]
         return np.concatenate([np.stack(moduli, axis=-1), model.ratios, model.relaxation_times], axis=-1)
 
 
 class Springpots(NamedTuple):
-    """Prior and parameters of a fractional model. u has the free entries of `springpots`: logs of moduli and logits of
-    exponents."""
+    """Prior and parameters of a fractional model. The coordinates u are the free variables of the model (see
+    `fitting.methods.springpots`): logs of moduli and logits of exponents."""
 
     model: Fractional
     moduli: tuple[float, float]  # bounds of the log moduli
-    values: Callable  # JAX function of one u
+    values: Callable  # function from u to the reported parameters
     words: str = PRIORS["fractional"]
 
     @property
     def _moduli(self) -> np.ndarray:
-        """For each free entry of u: whether it is a log modulus. The other entries are logits of exponents."""
+        """Whether each entry of u is the log of a modulus. The other entries are logits of exponents."""
         return np.array([k % 2 == 0 for k in self.model.free])
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
-        """Return the log prior (W,) of u (W, P), up to a constant."""
+        """Return the log prior (W,) of W vectors u (W, P), up to a constant."""
         moduli, exponents = u[:, self._moduli], u[:, ~self._moduli]
         inside = np.all((moduli > self.moduli[0]) & (moduli < self.moduli[1]), axis=-1)
         slopes = -np.logaddexp(0, exponents) - np.logaddexp(0, -exponents)
@@ -237,7 +239,7 @@ class Springpots(NamedTuple):
         return self.model.names
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Return the parameters (n, K) of the fractional model for u (n, P)."""
+        """Return the K parameters (n, K) of the fractional model for n draws u (n, P)."""
         return self.values(u)
 
 
@@ -259,7 +261,7 @@ class WithInstrument(NamedTuple):
         return u[..., : -len(self.errors)], u[..., -len(self.errors) :]
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
-        """Return the log prior (W,) of u (W, P), up to a constant."""
+        """Return the log prior (W,) of W vectors u (W, P), up to a constant."""
         modes, errors = self.apart(u)
         return self.modes.log_prior(modes) - 0.5 * np.sum(errors**2, axis=-1)
 
@@ -269,22 +271,23 @@ class WithInstrument(NamedTuple):
         return np.concatenate([modes, rng.standard_normal((count, len(self.errors)))], axis=1)
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Return the names of the reported parameters, for this number of coordinates."""
+        """Return the names of the reported parameters, for `parameters` coordinates."""
         return (*self.modes.names(parameters - len(self.errors)), *(n.reported for n in self.errors))
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Return moduli, ratios, times and errors of the instrument (n, K) for u (n, P)."""
+        """Return the K reported parameters (n, K) of n draws u (n, P): moduli, ratios, relaxation times and errors of
+        the instrument."""
         modes, errors = self.apart(u)
         return np.concatenate([self.modes.numbers(modes), errors * [n.unit for n in self.errors]], axis=1)
 
 
 def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
-    """Sample independent chains, with `count` draws of the posterior in each.
+    """Sample the posterior with independent chains, and return `count` draws from each chain.
 
     Args:
-        at: the density.
-        parameters: P, length of u.
-        count: draws of each chain.
+        at: the posterior density.
+        parameters: number of coordinates (length of u).
+        count: number of draws from each chain.
         seed: seed of the random generators; the same seed gives the same draws.
     """
     begin, prior = time.perf_counter(), at.prior
@@ -299,8 +302,8 @@ def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
 
 
 def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:
-    """Return the draws with the error of the gap, if the fit has this error. The error multiplies all moduli of a draw
-    by one factor. The factor is log-normal, so that no modulus is negative."""
+    """Return the draws with the error of the gap, if the fit contains this error. The error of the gap multiplies all
+    moduli of a draw by one random factor. The factor is log-normal, so that no modulus is negative."""
     relative, kind = fit.details.get("gap_error"), fit.kind
     if not relative:
         return found
@@ -332,7 +335,8 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
 
 
 def _beside_instrument(fit: Fit, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> tuple[Target, int]:
-    """Return the posterior density of the Prony modes and of the instrument errors in the fit, and the length of u."""
+    """Return the posterior density of the Prony modes and of the instrument errors that the fit contains, and the
+    number of coordinates u."""
     own, parameters = _sweep_target(fit.kind, sweep, residuals), len(fit.solution.u)
     known, corrected_by = instrument.used_errors(fit, sweep)
     if not known or not isinstance(own.prior, Modes):
@@ -351,7 +355,8 @@ def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np
     return target(kind, residuals, sweep.resolved, size, sweep.noise_given)
 
 
-#: SIMULATED: number of draws that are simulated. DIFFERENT: a warning is given if their log density differs by more.
+#: SIMULATED: number of draws that are simulated. DIFFERENT: the program warns if the log density of one of them differs
+#: by more from its approximation.
 SIMULATED, DIFFERENT = 12, 0.1
 
 
@@ -359,9 +364,9 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
     """Sample the posterior of a fit of Prony modes through the torsion simulation.
 
     The density is computed with the linear rig: the same test for small strain, which needs no time steps. For each
-    frequency, a complex factor corrects the linear rig so that both agree at the minimum. Then some draws are simulated
-    in full. `Posterior.simulated` has the largest difference between the simulated and the approximate log likelihood
-    of these draws. It shows how good the approximation is.
+    frequency, a complex factor corrects the linear rig so that it agrees with the simulation at the minimum. Then some
+    draws are simulated in full. `Posterior.simulated` contains the largest difference between the simulated and the
+    approximate log likelihood of these draws. This difference shows how good the approximation is.
     """
     data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
     rig, law, omega, _, measured, _ = data
@@ -395,10 +400,11 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
 
 
 def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
-    """Sample the posterior of a closed-form fit to a relaxation or creep test, of Prony modes or of a fractional model.
+    """Sample the posterior of Prony modes or of a fractional model, fitted in closed form to a relaxation or creep
+    test.
 
-    If the noise of neighbouring measured values is correlated, only the number of independent values counts in the
-    likelihood.
+    If the noise of neighbouring measured values is correlated, the log likelihood is multiplied by the fraction of
+    independent values.
     """
     test = test._replace(constant_noise=fit.details.get(time_tests.CONSTANT_NOISE, False))
     if fit.kind.values is None:

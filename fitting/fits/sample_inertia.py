@@ -1,9 +1,9 @@
 """Inertia of a cylinder in oscillating torsion, in closed form. This inertia changes the modulus that a rheometer
 measures.
 
-Shear waves run along the axis, with the wave number k = omega sqrt(rho/G*) for the density rho. The torque at the
-turning plate, divided by the angle of this plate, gives G* k h cot(k h) in place of G*, for the height h (Schrag 1977,
-Trans. Soc. Rheol. 21, 399).
+Shear waves run along the axis of the sample, with the wave number k = omega sqrt(rho/G*) for the angular frequency
+omega and the density rho. A rheometer divides the torque at the turning plate by the angle of this plate. So it
+measures G* k h cot(k h) instead of G*, for the sample height h (Schrag 1977, Trans. Soc. Rheol. 21, 399).
 """
 
 import numpy as np
@@ -12,16 +12,17 @@ from fitting.methods.host import Array, arrays_of
 from fitting.readers.frequency_sweep import Sweep
 from liverjax.core.errors import InputError
 
-#: The inertia is subtracted only up to this |k h|. At pi/2 the sample alone is in resonance, and its measured storage
-#: modulus is 0. At pi, its measured modulus is infinite.
+#: The inertia is subtracted only if |k h| is below this value, for the wave number k and the height h of the sample. At
+#: |k h| = pi/2, the sample alone is in resonance, and its measured storage modulus is 0. At pi, its measured modulus is
+#: infinite.
 MOST = 2.5
-#: If inertia changes the modulus by more than this fraction, a note gives the change.
+#: If the inertia changes the modulus by more than this fraction, a note gives the change.
 WORTH_A_NOTE = 0.001
 
 
 def shown(G: Array, omega: Array, density: float, height: float) -> Array:
-    """Return the modulus (n,) [Pa] that a rheometer measures on a sample of complex modulus G (n,) [Pa], in NumPy or
-    JAX.
+    """Return the complex modulus (n,) [Pa] that a rheometer measures at n frequencies on a sample with the true complex
+    modulus G, in NumPy or JAX.
 
     Args:
         G: complex modulus (n,) [Pa].
@@ -42,10 +43,11 @@ def rate_in_steps(omega: Array, steps: int) -> Array:
 
 
 def modulus_of(seen: np.ndarray, omega: np.ndarray, density: float, height: float) -> np.ndarray:
-    """Return the complex modulus (n,) [Pa] of a sample with the measured modulus `seen`. Newton's method inverts
-    `shown`.
+    """Return the true complex modulus (n,) [Pa] of a sample with the measured complex modulus `seen` (n,) [Pa].
+    Newton's method inverts `shown`.
 
-    The modulus is NaN where |k h| is above `MOST`.
+    The modulus is NaN at frequencies where |k h| (module docstring) is above `MOST` or Newton's method did not
+    converge.
     """
     G = seen + density * (omega * height) ** 2 / 3
     for _ in range(20):
@@ -59,11 +61,11 @@ def modulus_of(seen: np.ndarray, omega: np.ndarray, density: float, height: floa
 
 
 def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
-    """Return the sweep with the moduli of the sample, computed from measured moduli that contain the inertia. A note
-    gives the largest change.
+    """Return the sweep with the true moduli of the sample. The measured moduli contain the effect of the inertia, which
+    this function subtracts. A note gives the largest change.
 
     Raises:
-        InputError: without the inertia, no positive modulus is left at one frequency.
+        InputError: at one frequency, no modulus can be computed, or G' or G'' without the inertia is not positive.
     """
     seen = sweep.storage + 1j * sweep.loss
     G = modulus_of(seen, sweep.angular_frequency, density, height)
@@ -86,7 +88,7 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
 
 
 def put_back(sweep: Sweep, density: float, height: float) -> Sweep:
-    """Return the sweep as a rheometer measures it, with the inertia. This is the inverse of `taken_off`, without the
-    note."""
+    """Return the sweep as a rheometer measures it, with the effect of the inertia. This is the inverse of `taken_off`,
+    but it adds no note."""
     seen = shown(sweep.storage + 1j * sweep.loss, sweep.angular_frequency, density, height)
     return sweep._replace(storage=seen.real, loss=seen.imag)

@@ -24,9 +24,9 @@ class Samples(NamedTuple):
 
     sweeps: list[Sweep]
     fits: list[Fit]
-    populations: dict[str, Population | None]  # by the names of `values_of_sample`
+    populations: dict[str, Population | None]  # population of each parameter; names as in `values_of_sample`
     typical: Maxwell  # Prony modes of a typical sample, for a simulation
-    compared: list[dict]  # models and numbers of modes, best first
+    compared: list[dict]  # table of the compared models and numbers of modes, best first
 
     @property
     def kind(self) -> Kind:
@@ -34,8 +34,8 @@ class Samples(NamedTuple):
         return self.fits[0].kind
 
     def values(self, k: int) -> dict[str, tuple[float, float]]:
-        """Return the parameters of sample k with their errors. The names of the populations are the keys. A strength
-        that is missing in the spectrum of this sample is 0."""
+        """Return the value and the standard error of each parameter of sample k. The keys are the names in
+        `populations`. A strength that is missing in the spectrum of this sample is 0."""
         own = values_of_sample(self.fits[k])
         return {name: own.get(name, (0.0, np.inf)) for name in self.populations}
 
@@ -43,8 +43,8 @@ class Samples(NamedTuple):
 class _Candidate(NamedTuple):
     label: dict
     fits: list[Fit]
-    criterion: float  # summed over the samples
-    able: bool  # at least half of the samples determine all its parameters
+    criterion: float  # sum of the information criteria of the samples
+    able: bool  # whether at least half of the samples determine all its parameters
 
 
 def fit(
@@ -63,7 +63,7 @@ def fit(
         progress: called with the name of each fit.
 
     Raises:
-        InputError: a single sweep, or an unknown model.
+        InputError: there is only one sweep, or the model is unknown.
     """
     if len(sweeps) < 2:
         raise InputError(
@@ -103,8 +103,8 @@ def _candidate_for_all(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Ca
 def _modes_for_all(
     sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable
 ) -> list[_Candidate]:
-    """Return the fits of 1, 2, … Prony modes. The search ends when two numbers of modes, one after the other, do not
-    lower the summed criterion."""
+    """Return the fits of all samples with 1, 2, … Prony modes. The search ends when two numbers of modes, one after the
+    other, do not lower the summed criterion."""
     largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
     numbers = range(1, min(largest, min(map(uncertainty.supported_modes, sweeps))) + 1)
     if modes != "auto":
@@ -148,11 +148,11 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     return out
 
 
-#: _STRANGE: a sample is reported if the probability that any of the samples differs so much by chance is below this
-#: value. _FEWEST: minimum number of samples for this test.
+#: _STRANGE: a sample is reported as an outlier if it is less probable than this value that any of the samples differs
+#: so much by chance. _FEWEST: minimum number of samples for this test.
 _STRANGE, _FEWEST = 0.05, 4
-#: _APART: a sample is reported if its ratio to the mean of the others is above this value, or below the inverse.
-#: _UNSURE: values whose logarithm has a larger standard error are not compared.
+#: _APART: a sample is reported as an outlier only if its value, divided by the mean of the others, is above this ratio
+#: or below its inverse. _UNSURE: values whose logarithm has a larger standard error are not compared.
 _APART, _UNSURE = 1.3, 0.5
 #: If moduli of one material differ by this factor, their units may be wrong.
 _OTHER_UNIT = 100.0
@@ -160,10 +160,10 @@ _OTHER_UNIT = 100.0
 
 def outliers(found: Samples) -> list[str]:
     """Return a warning for each sample with a parameter far from the other samples (t-tests on logarithms, Bonferroni
-    correction). Half of the significance level belongs to the first parameter, a modulus, because a wrong gap or radius
-    multiplies all moduli by one factor. The other half belongs to the other parameters.
+    correction). Half of the significance level is used for the first parameter, a modulus, because a wrong gap or
+    radius multiplies all moduli by one factor. The other half is used for all other parameters together.
 
-    The strengths of a spectrum are not compared: one strength may grow while its neighbour on the grid falls.
+    The strengths of a spectrum are not compared, because one strength may grow while its neighbour on the grid falls.
     """
     names = [n for n in found.populations if not n.startswith("strengths[")]
     told: dict[int, list[tuple[float, str, float, float]]] = {}
@@ -179,7 +179,7 @@ def outliers(found: Samples) -> list[str]:
             for chance, name, ratio, mean in own
         )
         what = "its units and sizes"
-        if not any(name.endswith(("modulus", "springpot")) for _, name, _, _ in own):  # none of them is a modulus
+        if not any(name.endswith(("modulus", "springpot")) for _, name, _, _ in own):  # no parameter is a modulus
             what = "its temperature, the unit of its frequency, and the sample"
         source = Path(found.sweeps[sample].source).name
         out.append(f"{source}: {which}: check {what}. This sample widens the population's intervals")
@@ -191,16 +191,17 @@ def outliers(found: Samples) -> list[str]:
 
 
 def _known_logarithms(found: Samples, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the indices of the samples that determine the parameter `name`, the logarithms of its values, and their
-    errors."""
+    """Return the indices of the samples that determine the parameter `name`, the logarithms of the values of this
+    parameter, and the standard errors of these logarithms."""
     pairs = np.array([found.values(k)[name] for k in range(len(found.fits))])
     known = np.flatnonzero((pairs[:, 0] > 0) & (pairs[:, 1] < _UNSURE * pairs[:, 0]))
     return known, np.log(pairs[known, 0]), pairs[known, 1] / pairs[known, 0]
 
 
 def _strangers(found: Samples, name: str) -> list[tuple[int, float, float, float]]:
-    """Return the samples with a parameter far from the other samples. Each entry has the index of the sample, the
-    probability of such a distance by chance in any of the samples, the ratio to the mean of the others, and this mean.
+    """Return the samples whose parameter `name` is far from that of the other samples. Each entry contains the index of
+    the sample, the probability of such a distance by chance in any of the samples, the ratio of the parameter to the
+    mean of the others, and this mean.
     """
     known, logs, errors = _known_logarithms(found, name)
     out = []
@@ -215,8 +216,8 @@ def _strangers(found: Samples, name: str) -> list[tuple[int, float, float, float
 
 
 def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[str]:
-    """Return a warning if some samples have a modulus far above or below the others. This check also works for few
-    samples, where no statistical test is possible."""
+    """Return a warning if some samples have a modulus far above or below the modulus of the others. `logs`: logarithms
+    of the modulus `name`. This check also works for few samples, for which no statistical test is possible."""
     order = np.argsort(logs)
     gaps = np.diff(logs[order])
     if not len(gaps) or gaps.max() < np.log(_OTHER_UNIT):
@@ -235,8 +236,8 @@ def _place(name: str) -> int:
 
 
 def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
-    """Return Prony modes with the means of the population. Modes without a mean are not included. Other parameters
-    without a mean get the median."""
+    """Return the Prony modes of a typical sample, whose parameters are the means of the populations. Modes without a
+    mean are not included. For other parameters without a mean, the median of the samples is used."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}

@@ -23,19 +23,20 @@ from liverjax.simulation.automatic import with_solver
 
 
 class Problem(NamedTuple):
-    """Scenes of one body under different loads, and the displacements measured in each."""
+    """Scenes of one body under different loads, and the displacements that were measured in each scene."""
 
     scenes: tuple[Scene, ...]
     data: tuple[Displacements, ...]
 
     @property
     def components(self) -> int:
-        """Number of measured components."""
+        """Number of measured displacement components in all scenes."""
         return sum(d.components for d in self.data)
 
 
 def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
-    """Return the residuals (n,) of all scenes with the parameters `values`, and the worst status code of each scene."""
+    """Return the n residuals (n,) of all scenes for the parameters `values`, and the worst status code of each
+    scene."""
     parts, codes = [], []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         result = lj.simulate(lj.with_parameters(scene, values), store=store)
@@ -51,12 +52,12 @@ def with_solvers(problem: Problem, values: Mapping[str, object]) -> Problem:
 
 
 class Unknowns(NamedTuple):
-    """The unknowns u (n,) of the fit, and the functions that compute the parameters of the scenes from u."""
+    """The n unknowns u (n,) of the fit, and the functions that compute the parameters of the scenes from u."""
 
     start: np.ndarray  # starting point u (n,)
     values_of: Callable[[jax.Array], Content]  # u -> parameters of the scenes by dotted name
-    natural_of: Callable[[jax.Array], jax.Array]  # u -> the parameters to report (m,)
-    names: Sequence[str]  # names of these parameters
+    natural_of: Callable[[jax.Array], jax.Array]  # u -> m parameters to report (m,)
+    names: Sequence[str]  # names of the reported parameters
 
 
 def fit(
@@ -66,7 +67,8 @@ def fit(
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
     mesh_error: bool = True,
 ) -> tuple[Estimate, Solution]:
-    """Minimise the residuals over u.
+    """Minimise the sum of the squared residuals over the unknowns u. Return the reported parameters with standard
+    errors, and the solution for u.
 
     Args:
         problem: scenes and data.
@@ -99,7 +101,7 @@ def fit(
     seconds = time.perf_counter() - begin
     estimate = estimated(names, natural_of, found, problem.components)
     estimate = _of_alike_noise(problem, natural_of, found, estimate)
-    known = np.all(np.isfinite(estimate.standard_errors))  # otherwise a parameter ran to a limit
+    known = np.all(np.isfinite(estimate.standard_errors))  # an infinite error means that a parameter ran to a limit
     left_out = missing_or_none(problem, values_of(found.u)) if mesh_error and known else None
     if left_out is not None:
         size = float(np.sqrt(np.sum(left_out**2) / problem.components))
@@ -143,18 +145,19 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
 
 
-#: With at least this many components per parameter, the residuals show whether the noise differs between components.
+#: If there are at least this many measured components per parameter, the residuals show whether the noise differs
+#: between components.
 _MANY = 20
 
 
 def _many(J: np.ndarray, seen: np.ndarray) -> bool:
-    """Return whether there are enough residuals to show differences of the noise between components."""
+    """Return whether there are enough residuals to find out if the noise differs between components."""
     return bool(np.count_nonzero(seen) >= _MANY * J.shape[1])
 
 
 def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the position (n, 3) [m] of each measured component, and the index (n,) of its group. A group has the
-    components of one scene, step and direction."""
+    """Return the positions (n, 3) [m] of the n measured components, and the indices (n,) of their groups. A group
+    contains the components of one scene, step and direction."""
     places, groups = [], []
     for k, (scene, data) in enumerate(zip(problem.scenes, problem.data, strict=True)):
         points = np.asarray(scene.mesh.points)[np.asarray(data.nodes)]
@@ -166,7 +169,7 @@ def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, 
 
 
 def missing(problem: Problem, values: Content) -> np.ndarray:
-    """Return the errors (n,) of the residuals due to the meshes, for scenes with the parameters `values`."""
+    """Return the errors (n,) of the n residuals due to the meshes, for scenes with the parameters `values`."""
     rows = []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         scene = lj.with_parameters(scene, values)
@@ -182,8 +185,8 @@ def missing(problem: Problem, values: Content) -> np.ndarray:
 
 
 def missing_or_none(problem: Problem, values: Content) -> np.ndarray | None:
-    """Return the errors (n,) of the residuals due to the meshes (`missing`). Returns None, with a warning, if the mesh
-    error of a scene cannot be estimated."""
+    """Return the errors (n,) of the n residuals due to the meshes (`missing`). If the mesh error of a scene cannot be
+    estimated, the function warns and returns None."""
     try:
         return missing(problem, values)
     except InputError as e:
@@ -192,8 +195,8 @@ def missing_or_none(problem: Problem, values: Content) -> np.ndarray | None:
 
 
 def with_mesh_as_noise(problem: Problem) -> tuple[Problem, list[float]]:
-    """Return the problem with the mesh error added to the noise, and the size of this error in each scene, divided by
-    the stated noise [1].
+    """Return the problem with larger noise, which contains the mesh error, and the size of this error in each scene,
+    divided by the stated noise [1].
 
     The size is a root mean square over the measured components, for the parameters in the scenes. Without the added
     noise, a map would compensate the mesh error by a false stiffness. If the mesh error cannot be estimated, a warning
@@ -212,7 +215,8 @@ def with_mesh_as_noise(problem: Problem) -> tuple[Problem, list[float]]:
 
 
 def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estimate:
-    """Fit the parameters of the scenes with these dotted names. Positive parameters stay positive.
+    """Fit the parameters of the scenes with the dotted names `names`, for example law.mu. Positive parameters stay
+    positive.
 
     Raises:
         InputError: a scene has no parameter of this name, or the parameter is not a floating-point number.

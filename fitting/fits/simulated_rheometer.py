@@ -50,8 +50,8 @@ class Simulation(NamedTuple):
 
     @property
     def is_linear(self) -> bool:
-        """Whether the response without a mesh is known. This is so for small strain, except for a compressed sample
-        with inertia."""
+        """Whether the moduli without the error of a mesh are known. They are known for small strain, except for a
+        compressed sample with inertia."""
         return self.strain <= LINEAR_STRAIN and not (self.density is not None and self.precompression)
 
     @property
@@ -64,8 +64,8 @@ class Simulation(NamedTuple):
 
     @property
     def run(self) -> "Simulation":
-        """The simulation that is fitted to data of a sample. For a compressed sample, the error of the mesh is known
-        only without inertia. The inertia is then subtracted from the data instead."""
+        """The settings of the simulation that is fitted to the data. For a compressed sample, the error of the mesh is
+        known only for a simulation without inertia. So the inertia is subtracted from the data instead."""
         return self._replace(density=None) if self.precompression else self
 
 
@@ -76,7 +76,8 @@ LINEAR_STRAIN = 1e-2
 
 
 def law_and_prony(model: Maxwell, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
-    """Return the material of the sample from Prony modes: the law, scaled to the G0 of the modes, and the viscosity."""
+    """Return the material of the sample from Prony modes: the law, whose shear modulus is scaled to the G0 of the
+    modes, and the viscosity."""
     viscosity = Prony(
         ratios=model.ratios,
         relaxation_times=model.relaxation_times,
@@ -112,8 +113,8 @@ def simulated_residuals(
 def with_jacobian(
     u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
 ) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
-    """Return the residuals of `simulated_residuals`, their derivatives (rows, P) with respect to u, and the simulated
-    moduli.
+    """Return the residuals of `simulated_residuals`, their derivatives (m, P) with respect to the P variables u, with
+    one row for each of the m residuals, and the simulated moduli.
 
     The derivatives are those of the linear rig. If the strain is large, or if a compressed sample has inertia, the
     simulation is differentiated instead. With the derivatives of the linear rig, Gauss-Newton finds the same minimum in
@@ -140,7 +141,8 @@ def with_jacobian(
 def small_strain_moduli(
     rig: torsion.Rig, model: Maxwell, law: laws.Law, omega: jax.Array, simulation: Simulation
 ) -> jax.Array:
-    """Return the limit (n,) [Pa] of the simulated complex moduli for small strain, without the error of the mesh."""
+    """Return the complex moduli (n,) [Pa] at n frequencies that the simulation approaches for small strain, without the
+    error of the mesh."""
     scaled, prony = law_and_prony(model, law, simulation)
     if simulation.precompression:
         scale = model.shear_modulus / law.shear_modulus()
@@ -152,7 +154,7 @@ def small_strain_moduli(
 
 
 def rig_of(simulation: Simulation) -> torsion.Rig:
-    """Return the rig of a simulation. The mesh is coarse if the error of the mesh is known exactly."""
+    """Return the rig of a simulation. If the error of the mesh is known exactly, a coarse mesh is used."""
     cell, height = simulation.cell_size, simulation.height
     if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
         cell = torsion.linear_cell_for(simulation.radius, height)
@@ -187,7 +189,7 @@ def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
 
 
 #: Results of the closed-form fit that stay valid for the fit through the simulation. OF_THE_DATA: words that identify
-#: these warnings. KEPT: keys of these details.
+#: the warnings that stay valid. KEPT: keys of the details that stay valid.
 OF_THE_DATA = (
     "modes would follow",
     "about as well as",
@@ -224,7 +226,7 @@ def through_torsion(
     optimizer: str = OPTIMIZERS[0],
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Fit:
-    """Fit the moduli of the simulated rheometer. The search begins at the closed-form fit.
+    """Fit the moduli that the simulated rheometer measures to the data. The search begins at the closed-form fit.
 
     Args:
         sweep: data.
@@ -237,7 +239,8 @@ def through_torsion(
 
     begin = time.perf_counter()
     data = simulation_data(sweep, simulation)
-    pressing = time.perf_counter() - begin if simulation.precompression else 0.0  # nearly all of it is compilation
+    # Nearly all of the time for the compression is compilation.
+    pressing = time.perf_counter() - begin if simulation.precompression else 0.0
     rig, law, *_, scales = data
     check_viscosity(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
     u0, kind = jnp.asarray(start.solution.u), start.kind
@@ -261,7 +264,7 @@ def through_torsion(
             return found, simulated_residuals(found.u, data, simulation, kind)[1]
 
         (found, m), compiling, running = timed(minimised, u0, *data)
-    if isinstance(start.solution.u, np.ndarray):  # all later steps use NumPy, like the closed form
+    if isinstance(start.solution.u, np.ndarray):  # all later steps use NumPy, as the closed form does
         found = Solution(*(np.asarray(field) for field in found))
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
     worst = int(np.asarray(m.statistics.status).max())
@@ -299,9 +302,9 @@ def _with_shared_errors(fit: Fit, start: Fit) -> Fit:
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     """Return the estimate with the changes of the parameters due to the mesh and due to the time steps, to first order.
 
-    At small strain, both changes follow from two sets of moduli without a mesh: with the recursion, and in continuous
-    time. For a compressed sample, quadratic elements give these moduli, and an estimate of their remaining error is
-    added (`glued_compression`).
+    At small strain, both changes follow from two sets of moduli without the error of a mesh: one for the recursion, and
+    one for continuous time. For a compressed sample, these moduli are computed with quadratic elements, and an estimate
+    of their remaining error is added (`glued_compression`).
     """
     rig, law, omega, scales = data
     scaled, prony = law_and_prony(fit.kind.maxwell(fit.solution.u), law, simulation)
@@ -325,15 +328,16 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
 
 
 def _of_no_mesh(law: laws.Law, prony: Prony, omega: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
-    """Return the complex moduli (n,) [Pa] without a mesh, for the recursion and for continuous time."""
+    """Return the complex moduli (n,) [Pa] at n frequencies without a mesh, for the recursion and for continuous
+    time."""
     return torsion.linear_moduli(law, prony, omega, steps), torsion.linear_moduli(law, prony, omega, None)
 
 
 def _of_held(
     rig: torsion.Rig, material: tuple[laws.Law, Prony], omega: jax.Array, simulation: Simulation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return complex moduli (n,) [Pa] of a compressed sample, for the recursion and for continuous time. Both are
-    corrected by the estimated error of the meshes in `_without_mesh`.
+    """Return the complex moduli (n,) [Pa] of a compressed sample at n frequencies, for the recursion and for continuous
+    time. Both are corrected by the estimated error of the meshes in `_without_mesh`.
     """
     law, prony = material
     of, moduli = jax.jit(torsion.held)(rig, law), jax.jit(torsion.held_moduli, static_argnums=4)
@@ -349,7 +353,8 @@ def _simulation_details(
     simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli
 ) -> dict[str, object]:
     """Return settings and statistics of the simulation, for the report."""
-    # For a sample without compression whose whole stress relaxes, the bias of the run is the same at every frequency.
+    # For a sample without compression whose whole stress relaxes, the effect of the mesh is the same at every
+    # frequency.
     known = simulation.part == "all" and rig.held is None
     rest = rig if rig.held is None else replace(rig, held=None, height=torsion.rest_height(rig))
     return {
@@ -382,7 +387,8 @@ def largest_shift(closed: Fit, simulated: Fit) -> float:
 
 
 def _with_equilibrium(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameters followed by the equilibrium modulus, and their standard errors."""
+    """Return the parameters of the modes followed by the equilibrium modulus, and the standard errors of all of
+    these."""
     u = fit.uncertainty
     rest = u.values[0] * (1 - u.values[1 : 1 + (len(u.values) - 1) // 2].sum())
     return np.append(u.values, rest), np.append(u.standard_errors, uncertainty.equilibrium_error(u))
@@ -405,8 +411,10 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
 
 
 def _cause(closed: Fit, simulated: Fit, k: int) -> tuple[str, str]:
-    """Return the cause of the change of parameter k, with a verb ("… changes"), and the remedy."""
-    if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):  # closed: no inertia
+    """Return two parts of a warning about the change of parameter k: the cause with a verb ("… changes"), and the
+    remedy."""
+    # The closed form has no inertia in this case.
+    if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):
         return (
             "the sample's inertia and the discretisation change",
             "raise --steps to see which of the two is the cause",

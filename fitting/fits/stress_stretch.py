@@ -45,7 +45,7 @@ class LawFit(NamedTuple):
     shear_modulus: float
     cost: float  # half the sum of squared relative residuals
     curve_errors: dict[str, float]  # root mean square of the misfit, divided by that of the curve's stress
-    mean_relative_error: float  # root mean square over all points
+    mean_relative_error: float  # root mean square of the relative misfit over all points
     aicc: float
     bic: float
     converged: bool
@@ -54,7 +54,7 @@ class LawFit(NamedTuple):
     warnings: list[str]
     run_time: float
     compile_time: float
-    limits: dict[str, str]  # parameters that went to 0 or infinity
+    limits: dict[str, str]  # parameters that went to a limit, with the limit: 0 or infinity
 
 
 #: The stresses of a test may all be multiplied by a wrong factor that the residuals do not show. Such factors are
@@ -65,7 +65,7 @@ _HIDDEN, _MOVED = 2.0, 0.05
 #: the factor RUNAWAY, and its error is at least FREE times its value. The second condition is needed because typical
 #: sizes hold for large strains. At small strains, coefficients of higher terms may be far larger and still determined.
 RUNAWAY, FREE = 1e6, 30.0
-#: Lower bound of the relative noise in this check, because no test is more accurate.
+#: Lower bound of the relative noise for the limit FREE, because no test is more accurate.
 _LEAST_NOISE = 1e-3
 #: Uneven noise differs in size between points. If the standard error for uneven noise exceeds the error for equal noise
 #: by this factor, the correlation for uneven noise is used.
@@ -85,13 +85,16 @@ def initial_modulus(curves: list[Curve]) -> float:
             ratios.append(np.median(c.stress[keep] / model[keep]))
     positive = [r for r in ratios if r > 0]
     if not positive:
-        raise InputError("in every curve, the stresses point against the stretches: check signs and axes")
+        raise InputError(
+            "in every curve, the stresses have the wrong sign (they point against the strains): check signs and axes"
+        )
     return float(np.median(positive))
 
 
 def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawFit:
-    """Minimise the sum of squares of the relative misfit (P - P_measured) / (root mean square of the curve's stress).
-    The best minimum from many starting points is returned."""
+    """Minimise the sum of squares of the relative misfit: the difference of the nominal stress P of the law and the
+    measured one, divided by the root mean square of the curve's stress. The best minimum from many starting points is
+    returned."""
     scale = initial_modulus(curves)
     F, at = jnp.asarray(np.concatenate([c.F for c in curves])), np.cumsum([0] + [len(c.stress) for c in curves])
     i, j = (jnp.asarray(np.repeat([c.component[k] for c in curves], np.diff(at))) for k in (0, 1))
@@ -125,7 +128,7 @@ def assessed(
 ) -> LawFit:
     """Return the fit from the best starting point, with its quality and with warnings for the user.
 
-    `of_tests`: whether each curve is one test, with residuals that are differences of its stress divided by its scale.
+    `of_tests`: whether each curve is one test, and the residuals are stress differences divided by its scale.
     """
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))
@@ -138,7 +141,7 @@ def assessed(
     slope = np.asarray(jax.jit(jax.jacfwd(candidate.values))(u, scale))
     every, _ = errors_and_correlation(spread(J[:n], max(noise, _LEAST_NOISE), slope)[0])
     limits = _run_away(candidate, values, every, scale)
-    # A parameter at its limit gets no standard error. The errors of the others hold for the law at that limit.
+    # A parameter at its limit gets no standard error. The errors of the others hold for the law at this limit.
     known = np.array([name not in limits for name in candidate.names])
     own_slope = slope[np.ix_(known, known)]
     half, s = spread(J[:n, known], noise, own_slope)
@@ -186,7 +189,7 @@ def _of_other_minima(
     candidate: Candidate, values: np.ndarray, us: np.ndarray, scale: float, curves: list[Curve]
 ) -> list[str]:
     """Return a warning if some starting points led to the same cost with other parameter values (see
-    `of_other_minima`). `us` (S, p): unknowns at the end of these searches."""
+    `of_other_minima`). `us` (S, p): p unknowns at the end of these S searches."""
     every = np.asarray(jax.vmap(lambda u: candidate.values(u, scale))(jnp.asarray(us)))
     return of_other_minima(candidate.names, candidate.law, values, every, np.concatenate([c.F for c in curves]))
 
@@ -216,7 +219,7 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
 def _of_hidden_factors(
     factors: FactorNoise | None, names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
-    """Return a warning about factors that multiply the stress of each test. The residuals do not show these factors,
+    """Return a warning about factors that may multiply the stress of each test. The residuals do not show such factors,
     because the parameters compensate them."""
     if factors is None or factors.shown:
         return []
@@ -239,14 +242,15 @@ def _errors_of_law(
     half: np.ndarray,
     of_tests: bool,
 ) -> tuple[np.ndarray, np.ndarray, Alike | None, FactorNoise | None]:
-    """Return errors and correlation of the parameters, the noise that is correlated between neighbouring points, and
-    the factors that multiply the stress of each test. Each error is the largest one for several kinds of noise.
+    """Return the standard errors and the correlation of the P parameters, the noise that is correlated between
+    neighbouring points, and the factors that multiply the stress of each test. Each standard error is the largest one
+    that results from several kinds of noise.
 
     Args:
         curves: the fitted curves.
-        residuals: derivatives J (n, p), misfit (n,) and its standard deviation.
-        slope: derivatives (P, p) of the parameters with respect to the unknowns.
-        half: square root of the covariance, for equal and independent noise.
+        residuals: at n points: derivatives J (n, p) of the misfit, misfit (n,) and its standard deviation.
+        slope: derivatives (P, p) of the parameters with respect to the p unknowns.
+        half: square root of the covariance of the parameters, for equal and independent noise.
         of_tests: see `assessed`. If False, the fit considers neither factors that multiply a test nor noise that grows
             with the stress.
     """
@@ -298,8 +302,8 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
         told.append("only one starting point led to this minimum: there may be a better minimum")
     if held:
         told.append(
-            "without a constraint, the stress of the law would decrease within the range of the data: the fit stays at "
-            "the edge of stability"
+            "without a constraint, the stress of the law would decrease within the range of the data, so the fit "
+            "stays at the edge of stability"
         )
     solid = fit.law + laws.Volumetric(bulk=jnp.asarray(1e3 * abs(fit.shear_modulus)))
     firm = ellipticity(np.asarray(_tangents(solid, jnp.asarray(np.concatenate([c.F for c in curves]))))) > 0
@@ -315,8 +319,8 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
 
 def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scale: float) -> dict[str, str]:
     """Return the parameters that ended far from every starting point and that the data do not determine, with the limit
-    of each. `errors` (p,) are the standard errors if all parameters are free. The starting points lie within a few
-    times the typical size.
+    of each (0 or infinity). `errors` (p,): standard errors of all p parameters if none is at its limit. The starting
+    points lie within a few times the typical size.
     """
     starts = jnp.asarray(candidate.random(np.random.default_rng(0), STARTS))
     typical = np.median(np.abs(jax.vmap(lambda u: candidate.values(u, scale))(starts)), axis=0)
@@ -328,7 +332,8 @@ def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scal
     return ends
 
 
-#: A warning is given if the stress at rest exceeds this fraction of the root mean square of the curve.
+#: The program warns if the stress of the undeformed sample exceeds this fraction of the root mean square of the curve's
+#: stress.
 _PRELOAD = 0.05
 
 

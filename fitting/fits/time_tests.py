@@ -25,11 +25,11 @@ from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: STILL: the load changes if two successive rows differ by more than this fraction of its maximum. MOST_LOADS: maximum
-#: number of loads that are treated separately.
+#: STILL: a load is regarded as changing if two successive rows differ by more than this fraction of the maximum load.
+#: MOST_LOADS: maximum number of loads that are treated separately.
 STILL, MOST_LOADS = 0.01, 10
-#: Maximum number of measured values that are fitted. From a longer record, values at about equal steps of log time are
-#: used.
+#: Maximum number of measured values that are fitted. If a record has more values, values at about equal steps of log
+#: time are used.
 MOST = 300
 #: Key in `TimeFit.details` if the noise of neighbouring values is correlated: the number of independent values that
 #: carry the same information.
@@ -41,7 +41,7 @@ STARTS = 12
 
 
 class TimeFit(NamedTuple):
-    """The fit of a relaxation or creep test."""
+    """The fit of m measured values of a relaxation or creep test."""
 
     kind: Kind
     model: Maxwell
@@ -51,7 +51,7 @@ class TimeFit(NamedTuple):
     time: np.ndarray  # times (m,) [s] of the fitted values
     measured: np.ndarray  # (m,) stress [Pa], or strain [1] in creep
     fitted: np.ndarray
-    scales: np.ndarray  # (m,) divisors of relative errors
+    scales: np.ndarray  # (m,) scales that divide the residuals
     warnings: tuple[str, ...]
     run_time: float
     compile_time: float
@@ -65,15 +65,16 @@ class TimeFit(NamedTuple):
 
     @property
     def relative_errors(self) -> np.ndarray:
-        """|fit - data| (m,) divided by `relative_sizes`."""
+        """Relative errors (m,): |fit - data|, divided by `relative_sizes`."""
         return np.abs(self.fitted - self.measured) / relative_sizes(self.measured, self.fitted, self.scales)
 
 
 def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Return the divisors (m,) of relative errors: the fitted response, but at least the median of |fit - data|.
+    """Return the divisors (m,) of the relative errors of m values. A divisor is the root of the sum of two squares:
+    that of the fitted response, and that of the median of |fit - data|.
 
-    If the response changes sign, as in cycles, the divisors are the scales of the residuals. In other tests these
-    scales would hide noise, because their lower bound is 33 times the noise.
+    If the response changes sign, as in cycles, the divisors are the scales of the residuals. In other tests, these
+    scales would hide noise, because the lower bound of the scales is 33 times the noise.
     """
     largest = np.abs(measured).max(initial=0.0)
     if min(measured.max(initial=0.0), -measured.min(initial=0.0)) > 0.1 * largest:
@@ -83,7 +84,8 @@ def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray)
 
 @lru_cache(maxsize=8)
 def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
-    """Return a function from (u, time, driven, rows, answer, scales) to residuals (m,), for relaxation or creep."""
+    """Return a function from (u, time, driven, rows, answer, scales) to the residuals (m,) of m fitted values, for
+    relaxation or creep."""
     natural = generalised_maxwell.natural_fluid if name == FLUID.name else generalised_maxwell.natural
 
     def residuals(u, time, driven, rows, answer, scales):
@@ -93,8 +95,8 @@ def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
 
 
 def thinned(test: TimeTest) -> np.ndarray:
-    """Return the rows (m,) of the test to fit: all rows, or about `MOST` rows spread over the log of the time since a
-    load began to change."""
+    """Return the indices (m,) of the rows of the test that are fitted: all rows, or about `MOST` rows. These rows are
+    spread over the log of the time since the load last began to change."""
     rows = np.flatnonzero(test.used)
     if len(rows) <= MOST:
         return rows
@@ -113,7 +115,7 @@ def thinned(test: TimeTest) -> np.ndarray:
 
 def _begins_of_loads(test: TimeTest) -> np.ndarray:
     """Return the times [s] at which the driven quantity begins to change, from `TimeTest.begun` on. If there are more
-    than `MOST_LOADS` (for example in cycles), only the first time is returned.
+    than `MOST_LOADS` such times (for example in cycles), only the first one is returned.
     """
     driven = np.abs(test.driven)
     still = max(STILL * float(driven.max()), 8 * noise_of_series(test.driven))
@@ -187,7 +189,7 @@ def criterion(fit: TimeFit) -> float:
 
 
 def identifiable(fit: TimeFit, test: TimeTest) -> bool:
-    """Whether the fit converged and the test determines every mode."""
+    """Return whether the fit converged and the test determines every mode."""
     return fit.converged and not uncertainty.superfluous(test, fit.uncertainty)
 
 
@@ -204,13 +206,14 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
 
 
 def refitted(fit: TimeFit, test: TimeTest) -> TimeFit:
-    """Return Prony modes of the same kind and number as in the fit, fitted to a changed form of its test."""
+    """Return a fit of Prony modes, of the same kind and number as in `fit`, to `test`. `test` is a changed form of the
+    test to which `fit` belongs."""
     return _one_model(test, thinned(test), fit.modes, fit.kind)
 
 
 def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
-    """Return a function and its data. The function computes the residuals (m,) from the variables u of the fit and
-    these data.
+    """Return a function and its data. The function computes the residuals (m,) of m fitted values from the variables u
+    of the fit and these data.
 
     Args:
         test: data.
@@ -220,8 +223,8 @@ def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Arr
 
 
 def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
-    """Return times (n,), the driven quantity (n,), the indices (m,) of the fitted values among these times, these
-    values (m,), and their scales (m,)."""
+    """Return n times (n,), the driven quantity (n,) at these times, the indices (m,) of the m fitted values among these
+    times, the fitted values (m,) themselves, and their scales (m,)."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
     kept[rows] = True
@@ -272,8 +275,8 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
 
 
 def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
-    """Return stress divided by strain (m,) [Pa] at the fitted values, which is roughly G(t), and the times (m,) [s] of
-    these values."""
+    """Return the stress divided by the strain (m,) [Pa] at the m fitted values, which is roughly the relaxation modulus
+    G(t). Also return the times (m,) [s] of these values since the loading began."""
     rows = thinned(test)
     driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
     ratio = answer / np.maximum(driven, 1e-6 * driven.max())
@@ -281,23 +284,24 @@ def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
 
 
 def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrix and right-hand side of a linear least-squares problem with relative residuals. The unknowns are the
-    equilibrium modulus and the strengths of modes with the relaxation `times` [s]."""
+    """Return the matrix and the right-hand side of a linear least-squares problem for the modulus of `apparent`, with
+    relative residuals. The unknowns are the equilibrium modulus and the strengths of modes with the relaxation `times`
+    [s]."""
     modulus, at = apparent(test)
     A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
     return A / modulus[:, None], np.ones(len(at))
 
 
 def _starts(test: TimeTest, modes: int, kind: Kind) -> np.ndarray:
-    """Return starting points with times spread over the decades of the test. Non-negative least squares on the apparent
-    modulus gives the strengths."""
+    """Return starting points with relaxation times that are spread over the decades of the test. The strengths come
+    from non-negative least squares on the apparent modulus (`apparent`)."""
     each = generalised_maxwell.times_over(test.resolved, modes, STARTS)
     found = [generalised_maxwell.start_at_times(times, *apparent_equations(test, times)) for times in each]
     return np.stack([generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u for u in found])
 
 
 def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
-    """Add the table of all tried fits, and the warnings."""
+    """Return the chosen fit with the table of all tried fits, and with the warnings."""
     lowest = min(map(criterion, tried))
     table: list[Content] = [
         {
@@ -312,7 +316,11 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     elastic = _without_relaxation(test, chosen)
     advice = "try fewer modes" if chosen.modes > 1 else "look at the data"
     out = [_told_of_elastic(elastic)] if elastic else []
-    out += [] if chosen.converged or elastic else [f"the fit did not converge; its best point is given: {advice}"]
+    out += (
+        []
+        if chosen.converged or elastic
+        else [f"the fit did not converge, and the parameters with the smallest misfit are given: {advice}"]
+    )
     mean = float(chosen.relative_errors.mean())
     if mean > 0.05:
         out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try more modes, or look at the data")
@@ -324,7 +332,7 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     low, high = test.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):
         if not elastic and not low <= tau <= high:
-            out.append(f"relaxation_times[{k}] = {tau:.3g} s lies outside the {low:.3g}-{high:.3g} s of the test")
+            out.append(f"relaxation_times[{k}] = {tau:.3g} s lies outside the range {low:.3g}-{high:.3g} s of the test")
     out += structured_misfit(chosen)
     runs, chance = kramers_kronig.runs_probability(chosen.fitted - chosen.measured)
     details = {"tried": sorted(table, key=lambda row: row["above_the_lowest"]), "answers_fitted": len(chosen.measured)}

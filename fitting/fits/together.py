@@ -1,6 +1,6 @@
-"""One Prony series for several tests of one material in closed form, and the contribution of each test.
+"""One Prony series for several tests of one material, fitted in closed form, and the contribution of each test.
 
-Tests are sweeps, relaxation, creep, and phase velocities of shear waves.
+The tests are frequency sweeps, relaxation tests, creep tests, and phase velocities of shear waves.
 
 The noise of every test is different. Its size is estimated during the fit, from the residuals of the test.
 """
@@ -25,13 +25,13 @@ from fitting.waves.dispersion import Dispersion
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: ROUNDS: number of rounds, each a fit and new weights. QUIETEST: minimum relative noise of a test. STARTS: number of
-#: starting points.
+#: ROUNDS: number of rounds; each round is a fit, and then new weights of the tests. QUIETEST: minimum relative noise of
+#: a test. STARTS: number of starting points.
 ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
 #: The tests contradict each other if the noise of a test in the common fit, divided by its noise in a fit to this test
 #: alone, exceeds this ratio.
 APART = 1.5
-#: A warning is given if the misfit exceeds this value.
+#: A warning is given if the relative misfit of a test exceeds this value.
 MISSED = 0.05
 #: MORE: maximum number of additional modes in a fit to one test. CLEARLY: minimum decrease of the information criterion
 #: for an additional mode (Kass and Raftery 1995).
@@ -52,12 +52,12 @@ class Share(NamedTuple):
     name: str  # sweep, dispersion, relaxation or creep
     source: str
     points: int  # number of measured values
-    noise: float  # noise in the common fit, divided by the scales; given standard deviations are not reduced
-    alone: float  # the same noise from a fit to this test alone
-    misfit: float  # relative misfit of the common fit
+    noise: float  # noise in the common fit, divided by the scales; at least 1 if standard deviations are given
+    alone: float  # noise in a fit to this test alone, divided by the scales
+    misfit: float  # relative misfit of this test in the common fit
     misfit_alone: float  # relative misfit of the fit to this test alone
     mean_relative_error: float
-    errors_without: np.ndarray  # standard errors (P,) without this test, for the common fit
+    errors_without: np.ndarray  # standard errors (P,) of the P common parameters if this test is left out
 
 
 class Together(NamedTuple):
@@ -97,8 +97,8 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """Return the divisors for relative errors of the measured values. Mostly these are the values themselves. In
-    relaxation and creep the divisors have a lower bound. If errors of the phase angle cause the scatter of the loss
+    """Return the divisors for relative errors of the measured values. Mostly the divisors are the measured values. In
+    relaxation and creep, the divisors have a lower bound. If errors of the phase angle cause the scatter of the loss
     modulus, the divisor is |G*|."""
     _, measured, scales = reported_numbers(test)
     if isinstance(test, Sweep) and test.sd_estimated:
@@ -114,13 +114,13 @@ def _sizes_beside(test: Measured, fitted: np.ndarray) -> np.ndarray:
 
 def least_noise(test: Measured) -> float:
     """Return the lower bound of the noise of a test, divided by its scales. The bound is 1 if standard deviations are
-    given, because these are not reduced."""
+    given, because given standard deviations are not reduced."""
     return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
 
 
 def tests_evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals (…, m) of all tests, in the order of the tests, and their derivatives (…, m, P) at u (…, P),
-    in NumPy."""
+    """Return the m residuals (…, m) of all tests, in the order of the tests, and their derivatives (…, m, P) with
+    respect to the P variables u (…, P), in NumPy."""
 
     def one(name: str, at: tuple, measured: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if name in ("relaxation", "creep"):
@@ -199,14 +199,14 @@ def _able(fit: Together, band: ResolvedBand) -> bool:
 
 
 def criterion_of_all(fit: Together) -> float:
-    """Return the Bayesian information criterion. The noise of each test is estimated from the fit."""
+    """Return the Bayesian information criterion of a common fit. The noise of each test is estimated from the fit."""
     total = sum(s.points for s in fit.shares)
     free = len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
     return float(sum(s.points * 2 * np.log(s.noise) for s in fit.shares) + free * np.log(total))
 
 
 def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> Together:
-    """Fit a given number of modes to all tests. Fits and new weights alternate."""
+    """Fit a given number of modes to all tests. After each fit, the tests get new weights from their residuals."""
     parts = [reported_numbers(t) for t in tests]
     begin, evaluate = time.perf_counter(), partial(tests_evaluated, list(map(name_of, tests)), kind)
     starts, noise = starts_of_all(tests, band, modes, kind), np.full(len(tests), 0.03)
@@ -229,7 +229,7 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
 def misfits(
     tests: list[Measured], data: list, residuals: np.ndarray, noise: np.ndarray, free: float
 ) -> tuple[list[Share], list[np.ndarray]]:
-    """Return the misfit of each test, and the values that the fit predicts for each test.
+    """Return the misfit of each test (`Share`), and the values that the fit predicts for each test.
 
     Args:
         tests: K tests.
@@ -269,8 +269,8 @@ def _size_of_noise(residuals: np.ndarray, freedom: float) -> float:
 
 
 def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: float) -> np.ndarray:
-    """Return the relative noise of each test: the root of (sum of its squared residuals, divided by its degrees of
-    freedom)."""
+    """Return the noise of each test, relative to its scales: the root of the sum of its squared residuals divided by
+    its degrees of freedom. `used`: noise that was used in the fit. `free`: number of parameters."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals, np.cumsum(counts)[:-1])
     out = []
@@ -280,8 +280,8 @@ def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.n
 
 
 def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
-    """Return starting points (S, P) with times spread over the decades of the tests. Non-negative least squares on the
-    moduli of the tests gives the strengths."""
+    """Return S starting points (S, P) of the P variables, with relaxation times that are spread over the decades of the
+    tests. The strengths come from non-negative least squares on the moduli of the tests."""
     out = []
     for times in generalised_maxwell.times_over(band.resolved, modes, STARTS):
         A, b = (np.concatenate(rows) for rows in zip(*(_apparent(t, times) for t in tests), strict=True))
@@ -291,8 +291,9 @@ def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: K
 
 
 def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrix and right-hand side of a linear least-squares problem with relative residuals. The unknowns are the
-    equilibrium modulus and the strengths of the modes."""
+    """Return the matrix and the right-hand side of a linear least-squares problem for the moduli of a test, with
+    relative residuals. The unknowns are the equilibrium modulus and the strengths of modes with the relaxation `times`
+    [s]."""
     if isinstance(test, TimeTest):
         return time_tests.apparent_equations(test, times)
     b = np.concatenate(_moduli_of(test))
@@ -312,7 +313,7 @@ def _moduli_of(test: Sweep | Dispersion) -> tuple[np.ndarray, ...]:
 
 
 def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) -> Together:
-    """Add the shares of the tests, the table of all tried fits, and the warnings."""
+    """Return the chosen fit with the contributions of the tests, the table of all tried fits, and the warnings."""
     begin = time.perf_counter()
     chosen = chosen._replace(shares=_shares(chosen))
     lowest = min(map(criterion_of_all, tried))
@@ -325,7 +326,11 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
         }
         for f in tried
     ]
-    out = [] if chosen.converged else ["the fit did not converge; its best point is given: try fewer modes"]
+    out = (
+        []
+        if chosen.converged
+        else ["the fit did not converge, and the parameters with the smallest misfit are given: try fewer modes"]
+    )
     out += disagreements(chosen.shares)
     out += missed(chosen.shares)
     out += structured(chosen)
@@ -336,7 +341,9 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     low, high = band.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):
         if not low <= tau <= high:
-            out.append(f"relaxation_times[{k}] = {tau:.3g} s lies outside the {low:.3g}-{high:.3g} s of all tests")
+            out.append(
+                f"relaxation_times[{k}] = {tau:.3g} s lies outside the range {low:.3g}-{high:.3g} s of all tests"
+            )
     return chosen._replace(
         tried=sorted(table, key=lambda row: row["above_the_lowest"]),
         warnings=tuple(out),
@@ -345,7 +352,8 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     )
 
 
-#: A rise of the load matters if it lasts longer than this fraction of a relaxation time.
+#: The program warns about a rise of the load that no row shows if it lasts longer than this fraction of a relaxation
+#: time.
 _SHORT = 0.2
 
 
@@ -368,7 +376,7 @@ def _of_rises(chosen: Together) -> list[str]:
 def disagreements(shares: list[Share]) -> list[str]:
     """Return a warning for each test whose misfit is much larger in the common fit than in a fit to this test alone."""
     return [
-        f"the tests do not agree: the misfit of {s.source or s.name} is {100 * s.misfit:.2g} % in the common fit, but "
+        f"the tests do not agree. The misfit of {s.source or s.name} is {100 * s.misfit:.2g} % in the common fit, but "
         f"only {100 * s.misfit_alone:.2g} % in a fit to this test alone: check whether this test was made at another "
         "temperature or strain, or on another sample"
         for s in shares
@@ -406,8 +414,8 @@ def structured(fit: Together) -> list[str]:
 
 
 def _shares(fit: Together) -> list[Share]:
-    """Return the contribution of each test: the errors without this test, and the misfit of a fit to this test
-    alone."""
+    """Return the contribution of each test: the standard errors if this test is left out, and the misfit of a fit to
+    this test alone."""
     u = np.asarray(fit.solution.u)
     vector = host.with_jacobian(partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)[1]
     rows = np.asarray(fit.solution.jacobian)
@@ -435,8 +443,8 @@ def _residuals_alone(fit: Together, k: int) -> np.ndarray:
         return best
     lowest = _criterion_alone(best, count, free)
     for modes in range(fit.modes, fit.modes + MORE + 1):
-        # If the moduli of this test are far from the moduli of the others, the starting points of all tests are not
-        # good.
+        # If the moduli of this test are far from the moduli of the others, the starting points for all tests are not
+        # good for this test.
         starts = starts_of_all([fit.tests[k]], own, modes, fit.kind)
         r, free = np.asarray(from_starts(evaluate, starts, data).residuals), starts.shape[1]
         criterion = _criterion_alone(r, count, free)
@@ -453,8 +461,8 @@ def _criterion_alone(r: np.ndarray, count: int, free: int) -> float:
 def shares_by_rows(
     fit: Together, jacobian: np.ndarray, slope: np.ndarray, values: np.ndarray, alone: Callable[[int], np.ndarray]
 ) -> list[Share]:
-    """Return the contributions of the tests: the errors from the residuals of the other tests only, and the misfit of a
-    fit to each test alone.
+    """Return the contribution of each test: the standard errors from the residuals of the other tests only, and the
+    misfit of a fit to this test alone.
 
     Args:
         fit: the common fit.

@@ -31,8 +31,8 @@ class Kind(NamedTuple):
     maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
     names: tuple[str, ...] = ()  # names of the model's parameters; empty: the modes are the parameters
     units: tuple[str, ...] = ()
-    values: Callable[[Array], Array] | None = None  # u -> parameters of the model (P,)
-    prior: Callable[[Array], Array] | None = None  # u -> residuals of the prior, after those of the data
+    values: Callable[[Array], Array] | None = None  # u -> P parameters of the model (P,)
+    prior: Callable[[Array], Array] | None = None  # u -> residuals of the prior, which follow those of the data
     effective: float | None = None  # number of parameters that the data determine; None: the length of u
     moduli: Callable[[Array, Array], tuple[Array, Array]] | None = None  # (u, omega) -> G', G'' (n,) [Pa]
 
@@ -61,14 +61,14 @@ class Fit(NamedTuple):
         return len(self.model.ratios)
 
     def relative_errors(self, sweep: Sweep) -> np.ndarray:
-        """Return |fit / data - 1| (2n,) of G' then G''."""
+        """Return the relative errors |fit / data - 1| (2n,) of G' then G'' at n frequencies."""
         data = np.concatenate([sweep.storage, sweep.loss])
         return np.abs(np.concatenate([self.storage, self.loss]) / data - 1)
 
 
 def timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
-    """Return the result, the time [s] of compilation and the time [s] of the run. For the same shapes, a function is
-    compiled once."""
+    """Return the result of a JAX function, the time [s] of compilation and the time [s] of the run. For arguments of
+    the same shapes, the function is compiled only once."""
     begin = time.perf_counter()
     arguments = jax.tree.map(jnp.asarray, arguments)
     leaves, tree = jax.tree.flatten(arguments)
@@ -86,7 +86,7 @@ def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
 
 @lru_cache(maxsize=16)
 def best_of(minimise: Callable, residuals: Callable) -> Callable[..., Solution]:
-    """Return a function that finds the lowest minimum from several starting points (S, P)."""
+    """Return a function that finds the lowest minimum from S starting points (S, P) of P variables."""
 
     def best(starts, *data):
         found = jax.vmap(lambda u: minimise(residuals, u, *data))(starts)
@@ -97,13 +97,16 @@ def best_of(minimise: Callable, residuals: Callable) -> Callable[..., Solution]:
 
 
 def check_modes(sweep: Sweep, modes: int) -> None:
-    """Raise `InputError`, with the largest number of modes, if the sweep has too few points for the parameters."""
+    """Raise `InputError` if `modes` is not a whole number above 0, or if the sweep has too few points for the
+    parameters of this number of modes."""
     check_sweep(sweep)
     largest = generalised_maxwell.largest_number_of_modes(sweep)
     if isinstance(modes, bool) or not isinstance(modes, (int, np.integer)):
         raise InputError(f"modes = {modes!r} must be a whole number: give e.g. 2, or call choose_modes")
     if largest < 1:
-        raise InputError(f"{sweep.source or 'sweep'}: one frequency determines no mode, so measure at more frequencies")
+        raise InputError(
+            f"{sweep.source or 'sweep'}: one frequency does not determine a mode. Measure at more frequencies"
+        )
     if modes < 1:
         raise InputError(f"--modes {modes} must be at least 1, or auto")
     if modes > largest:
@@ -130,8 +133,8 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
 
 
 def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer: str = OPTIMIZERS[0]) -> Fit:
-    """Return the best fit of Prony modes from the starting points `starts` (S, P). `kind` states whether the modes form
-    a solid or a fluid."""
+    """Return the best fit of Prony modes from the S starting points `starts` (S, P) of P variables. `kind` states
+    whether the modes form a solid or a fluid."""
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()
@@ -143,13 +146,13 @@ def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer:
 
 
 def residuals_of(kind: Kind) -> Callable[..., Array]:
-    """Return the function for the residuals of Prony modes of a solid or a fluid, in NumPy or JAX."""
+    """Return the function that computes the residuals of Prony modes of a solid or a fluid, in NumPy or JAX."""
     return generalised_maxwell.fluid_residuals if kind.name == FLUID.name else generalised_maxwell.residuals
 
 
 def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling: float, details: Content) -> Fit:
     """Return the closed-form fit for the minimum `found` over the variables u of `kind`. The first residuals of `found`
-    are those of the data."""
+    must be those of the data."""
     scales, measured = np.concatenate(sweep.deviations), np.concatenate([sweep.storage, sweep.loss])
     storage, loss = np.split(np.asarray(found.residuals)[: len(measured)] * scales + measured, 2)
     simulated = BestPoint("closed-form", found, storage, loss)
@@ -157,7 +160,7 @@ def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling:
 
 
 class BestPoint(NamedTuple):
-    """A minimum, and the moduli [Pa] at this minimum."""
+    """The result of a search: a minimum (`Solution`), and the moduli [Pa] at this minimum."""
 
     method: str
     solution: Solution
@@ -184,7 +187,10 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
     converged = bool(found.converged)
     advice = at.advice or (("try fewer modes",) if own is None else ("try another model",))
     if not converged:
-        reason = f"the fit did not converge in {int(found.iterations)} iterations; its best point is given"
+        reason = (
+            f"the fit did not converge in {int(found.iterations)} iterations, and the parameters with the smallest "
+            "misfit are given"
+        )
         sentences = (f"{reason}: {advice[0]}", *sentences)
     modes = len(spread.values) // 2
     model = Maxwell(spread.values[0], spread.values[1 : modes + 1], spread.values[modes + 1 :])
@@ -209,8 +215,8 @@ def _of_noise_shown(
 
 
 def _of_repeats(J: np.ndarray, r: np.ndarray, slope: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
-    """Return the square root of the covariance for noise that is correlated between repeated values of G', or of G'',
-    at one frequency. Returns None if there is no such noise."""
+    """Return the square root of the covariance of the parameters for noise that is correlated between repeated values
+    of G', or of G'', at one frequency. Returns None if the residuals show no such noise."""
     of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G' and G'' have separate factors
     _, group, counts = np.unique(of_row, return_inverse=True, return_counts=True)
     if np.median(counts) < 2:
@@ -220,7 +226,7 @@ def _of_repeats(J: np.ndarray, r: np.ndarray, slope: np.ndarray, omega: np.ndarr
     return shared.root if shared is not None and shared.shown else None
 
 
-#: N modes without an equilibrium modulus; the ratios add up to one.
+#: Prony modes of a fluid, which has no equilibrium modulus: the ratios add up to one.
 FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
 
 
@@ -251,7 +257,7 @@ def number_of_parameters(fit: Fit) -> float:
 
 
 def mean_square(fit: Fit) -> float:
-    """Return the mean square of the residuals of the data, with a lower bound at roundoff. Below this bound, exact fits
+    """Return the mean square of the residuals of the data, but at least `ZERO`. Exact fits have smaller values, which
     differ only by roundoff."""
     m = 2 * len(fit.storage)
     return max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, ZERO)
@@ -264,7 +270,7 @@ def information_criterion(fit: Fit) -> float:
     return float(m * np.log(mean_square(fit)) + number_of_parameters(fit) * np.log(m))
 
 
-#: A fit with relative residuals below this value is exact; no data have so many digits.
+#: A fit whose relative residuals are all below this value is exact, because no data have so many digits.
 EXACT = 1e-7
 
 
@@ -278,8 +284,8 @@ def choose_modes(
     Return the chosen fit and all tried fits. `progress` is called with the name of each fit.
 
     A single failure may be a local minimum, so the search ends when two numbers of modes fail one after the other. If
-    the computation for a number of modes breaks down, this is a failure too. A warning names this number, and the other
-    fits are kept.
+    the computation for a number of modes breaks down, this counts as a failure too. A warning names this number, and
+    the other fits are kept.
     """
     cap = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
     tried: list[Fit] = []
@@ -343,9 +349,9 @@ def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int
 
 
 def closer_but_not_chosen(modes: int, errors: list[float], converged: bool) -> str:
-    """Return a warning about a number of modes with a lower criterion. `errors`: mean relative errors with this number
-    and of the chosen fit."""
-    reason = "the data leave some of their parameters free" if converged else "their fit did not converge"
+    """Return a warning about a number of modes with a lower criterion. `errors`: mean relative errors of the fit with
+    this number of modes and of the chosen fit."""
+    reason = "the data do not determine some of their parameters" if converged else "their fit did not converge"
     a, b = (100 * e for e in errors)
     return (
         f"{modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but {reason}: "

@@ -17,23 +17,25 @@ from liverjax.core.struct import Content
 #: The program warns if the distance of a sweep from the common curve exceeds both FAR_OFF and SCATTERS times the
 #: scatter of the points. It also warns if the standard error of a shift factor exceeds LOOSE [decades].
 FAR_OFF, SCATTERS, LOOSE = 0.05, 2.0, 0.3
-#: The spline alone may cause relative distances from the curve up to this value.
+#: Relative distances from the curve below this value may come from the spline alone. Then no factors of the moduli are
+#: reported.
 SMOOTH = 1e-3
 #: Factors that multiply the moduli (vertical shifts) are reported if the probability of the same improvement by chance
 #: is below this.
 CHANCE = 1e-3
-#: These factors are reported only if they reduce the distance of the sweeps from one curve below this fraction of the
-#: distance without them.
+#: Factors that multiply the moduli are reported only if they reduce the distance of the sweeps from one curve to less
+#: than this fraction of the distance without such factors.
 BETTER = 0.8
 
 
 class MasterCurve(NamedTuple):
-    """All sweeps, shifted to the reference temperature."""
+    """The master curve: all sweeps, shifted to the reference temperature, with the shift factors and the fitted
+    laws."""
 
     sweep: Sweep
     parts: list[Sweep]  # the shifted sweeps, in the order of the temperatures
     shifts: Shifts
-    laws: list[TemperatureLaw]  # best first
+    laws: list[TemperatureLaw]  # fitted laws, best fit first
 
 
 def master_curve(data: AtTemperatures, reference: float | None, vertical: bool = False) -> MasterCurve:
@@ -41,21 +43,22 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
 
     Args:
         data: sweeps at two or more temperatures.
-        reference: reference temperature [K]; None: the middle temperature. The nearest measured temperature is used.
-        vertical: whether factors that multiply the moduli are found too. This is not possible if the file gives the
-            shift factors.
+        reference: reference temperature [K]; the nearest measured temperature is used. None: the middle temperature, or
+            the temperature whose given shift factor is nearest to 1.
+        vertical: whether factors that multiply the moduli are fitted too. Such factors cannot be fitted if the file
+            gives the shift factors.
     """
     T = data.temperatures
     place = len(T) // 2 if reference is None else int(np.argmin(np.abs(T - reference)))
     if reference is not None and not T.min() - 10 <= reference <= T.max() + 10:
         raise InputError(
             f"--master {celsius(reference):.4g}: the sweeps are from {celsius(T[0]):.4g} to {celsius(T[-1]):.4g} °C; "
-            "give a temperature between these"
+            "give a temperature in this range"
         )
     untold: list[str] = []
     if data.shift_factors is not None:
         log_a = np.log10(data.shift_factors)
-        if reference is None:  # the reference temperature of the given factors
+        if reference is None:  # the temperature to which the given factors refer
             place = int(np.argmin(np.abs(log_a)))
         found = shifts.known_shifts(data.sweeps, T, place, log_a - log_a[place])
     else:
@@ -89,8 +92,8 @@ def _scatter_of_points(sweeps: list[Sweep]) -> float:
 
 
 def _sentences(found: Shifts, noise: float) -> list[str]:
-    """Return notes about the shifts, and warnings if superposition is not valid. `noise`: relative scatter of the
-    points."""
+    """Return a note about the shifts, and warnings if the shifted sweeps do not lie on one curve or if a shift is
+    uncertain. `noise`: relative scatter of the points."""
     T = celsius(found.temperatures)
     out = [
         f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; their "
@@ -106,16 +109,21 @@ def _sentences(found: Shifts, noise: float) -> list[str]:
         )
     loose = [k for k in range(len(T)) if found.log_a_errors[k] > LOOSE]
     if loose:
-        listed = ", ".join(f"{T[k]:.4g} °C (a factor of {10 ** found.log_a_errors[k]:.2g})" for k in loose[:4])
-        out.append(f"the data hardly determine the shift at {listed}: the curves are too flat to be matched")
+        listed = ", ".join(
+            f"{T[k]:.4g} °C (uncertain by a factor of {10 ** found.log_a_errors[k]:.2g})" for k in loose[:4]
+        )
+        out.append(
+            f"the data hardly determine the shift at {listed}: the curves are too flat to be shifted onto each other"
+        )
     return out
 
 
 def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
-    """Return a note if the sweeps match much better when their moduli are also multiplied by factors (F-test)."""
+    """Return a note if the sweeps lie much nearer to one curve when their moduli are multiplied by factors too
+    (F-test)."""
     try:
         other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
-        # Both fits use the same distance between knots. It is small enough for each of them.
+        # For the F-test, both fits use the same distance between knots, the smaller one of the two fits.
         knots = min(found.knots, other.knots)
         alone, both = (
             shifts.found(sweeps, found.temperatures, found.reference, vertical, (knots,)) for vertical in (False, True)
@@ -144,7 +152,7 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
 
 
 def shift_numbers(found: MasterCurve) -> Content:
-    """Return the entry `shift` of fit.json, with the factors, their standard errors and the laws."""
+    """Return the entry `shift` of fit.json: the shift factors, their standard errors and the fitted laws."""
     s = found.shifts
     return {
         "reference_temperature_C": float(celsius(s.temperatures[s.reference])),

@@ -38,7 +38,7 @@ def shift_table(found: MasterCurve) -> str:
         lines.append(f"{T:9.2f} °C {s.log_a[k]:9.4f}{error}{vertical}{mark}".rstrip())
     for law in found.laws:
         numbers = ", ".join(f"{n} {v:.5g} ± {e:.2g}" for n, (v, e) in law.numbers.items())
-        lines.append(f"{law.name}: {numbers}; misses the factors by {law.apart:.2g} decades")
+        lines.append(f"{law.name}: {numbers}; root mean square distance from the shift factors {law.apart:.2g} decades")
     return "\n".join(lines)
 
 

@@ -3,9 +3,9 @@
 The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
 a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency. The curve and all factors are fitted
 together by least squares. So no model of the material is needed, and every factor has a standard error. The distance
-between the knots of the spline is chosen from the data. A curve that follows the noise would be steeper than the true
-curve. Then the errors of the factors, which depend on the slope of the curve, would be too small. Source: Ferry (1980),
-Viscoelastic properties of polymers, chapter 11.
+between the knots of the spline is chosen from the data, because a curve that follows the noise would be steeper than
+the true curve. Then the errors of the factors, which depend on the slope of the curve, would be too small. Source:
+Ferry (1980), Viscoelastic properties of polymers, chapter 11.
 """
 
 from collections.abc import Sequence
@@ -23,15 +23,16 @@ from liverjax.core.errors import InputError
 KNOTS, SMOOTH = (0.4, 0.6, 0.9, 1.35, 2.0, 3.0), 1e-3
 #: LONGEST: maximum step of a factor in one iteration [decades]. The iteration ends if all steps are below CONVERGED.
 LONGEST, CONVERGED = 0.3, 1e-6
-#: These are used for the first estimate of a shift. OVERLAP: fraction of a sweep that must overlap with the
+#: Two settings of the first estimate of a shift. OVERLAP: minimum fraction of a sweep that overlaps with the
 #: neighbouring sweep. REACH: shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
-#: Two sweeps match if their mean square distance, divided by the variance of their noise, is at most this value.
+#: Two sweeps match within the noise if their mean square distance, divided by the variance of their noise, is at most
+#: this value.
 WITHIN = 2.0
 
 
 class Shifts(NamedTuple):
-    """Shift factors of each sweep, in the order of the temperatures, and distances of the sweeps from the common
+    """Shift factors of K sweeps, in the order of their temperatures, and distances of the sweeps from the common
     curve."""
 
     temperatures: np.ndarray  # (K,) [K], ascending
@@ -58,8 +59,8 @@ def found(
     vertical: bool = False,
     tried: Sequence[float] = KNOTS,
 ) -> Shifts:
-    """Find shift factors by least squares. The distance between the knots is chosen by Akaike's corrected information
-    criterion.
+    """Find the shift factors and the common curve by least squares. Akaike's corrected information criterion chooses
+    the distance between the knots of the curve.
 
     Args:
         sweeps: K sweeps.
@@ -69,7 +70,8 @@ def found(
         tried: distances between two knots of the curve [decades] to try.
 
     Raises:
-        InputError: two neighbouring sweeps do not match at any shift, or do not overlap after the best shifts.
+        InputError: two sweeps at neighbouring temperatures do not match at any shift, or do not overlap after the best
+            shifts.
     """
     columns = _in_decades(sweeps)
     first = _first_shifts(columns, temperatures, reference), np.zeros(len(sweeps))
@@ -94,8 +96,8 @@ def sum_of_squares(sweeps: Sequence[Sweep], shifts: Shifts) -> float:
 
 
 def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
-    """Return the result with the lowest corrected information criterion. If the data determine none of the curves,
-    return the result with the largest distance between knots. `factors`: number of fitted factors.
+    """Return the result with the lowest corrected information criterion. If there are too few data for each of the
+    curves, return the result with the largest distance between knots. `factors`: number of fitted factors.
     """
     data = 2 * sum(len(s.storage) for s in sweeps)
 
@@ -157,8 +159,8 @@ def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: i
 
 
 def _gap(columns: list, log_a: np.ndarray) -> list[int] | None:
-    """Find a gap in frequency between the shifted sweeps, because the data do not determine a shift across a gap.
-    Return the indices of the sweeps on both sides of the gap, or None if there is no gap."""
+    """Return the indices of the two sweeps next to a gap in frequency between the shifted sweeps, or None if there is
+    no gap. The data do not determine a shift across such a gap."""
     ends = [(c[0][0] + a, c[0][-1] + a) for c, a in zip(columns, log_a, strict=True)]
     order = sorted(range(len(ends)), key=lambda k: ends[k][0])
     last = order[0]
@@ -179,7 +181,7 @@ def _refuse_gap(columns: list, shifts: Shifts) -> None:
 
 
 def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray, knots: float) -> np.ndarray:
-    """Return the relative root mean square distance (K,) of the shifted sweeps from their common curve."""
+    """Return the relative root mean square distance (K,) of each of K shifted sweeps from their common curve."""
     columns = _in_decades(sweeps)
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     place = np.repeat(np.arange(len(columns)), [len(c[0]) for c in columns])
@@ -192,15 +194,15 @@ def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.n
 
 
 def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, knots: float) -> int:
-    """Return the number of spline coefficients of the curve of G' for shifted sweeps. The curve of G'' has as many
-    coefficients."""
+    """Return the number of spline coefficients of the curve of G' for shifted sweeps. The curve of G'' has the same
+    number of coefficients."""
     x = np.concatenate([np.log10(s.angular_frequency) + a for s, a in zip(sweeps, log_a, strict=True)])
     return _basis(x, knots)[0].shape[1]
 
 
 def _basis(x: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values (n, C) and derivatives (n, C) of C cubic B-splines at x (n,). The distance between neighbouring
-    knots is at most `apart`."""
+    """Return the values (n, C) and derivatives (n, C) of C cubic B-splines at n points x (n,). The distance between
+    neighbouring knots is at most `apart`."""
     low, high = x.min() - 1e-6, x.max() + 1e-6
     count = max(2, int(np.ceil((high - low) / apart)) + 1)
     inner = np.linspace(low, high, count)
@@ -221,8 +223,8 @@ def _smoothness(size: int) -> np.ndarray:
 
 
 def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrix and right-hand side of a Gauss-Newton step for the unknowns log a (K), log b (K) and coefficients
-    of both curves."""
+    """Return the matrix and the right-hand side of a Gauss-Newton step. The unknowns are log a and log b of the K
+    sweeps, and the coefficients of the curves of G' and G''."""
     K, counts = len(columns), [len(c[0]) for c in columns]
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     own = np.repeat(np.eye(K), counts, axis=0)
@@ -237,7 +239,8 @@ def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: 
         right.append(y - B @ c)
     smooth = np.kron(np.eye(2), _smoothness(size))
     A = np.vstack([*rows, np.hstack([np.zeros((len(smooth), 2 * K)), smooth])])
-    return A, np.concatenate([*right, np.zeros(len(smooth))])  # for the coefficients the cost is already at its minimum
+    # The coefficients already minimise the cost, so the rows of the penalty have the right-hand side 0.
+    return A, np.concatenate([*right, np.zeros(len(smooth))])
 
 
 def _covariance(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
@@ -248,8 +251,8 @@ def _covariance(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
 
 
 def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:
-    """Return starting values of the shifts (K,) [decades]. Each sweep is matched to the neighbouring sweep, beginning
-    at the reference."""
+    """Return starting values of the shifts of the K sweeps (K,) [decades]. Each sweep is matched to the sweep at the
+    neighbouring temperature, beginning at the reference temperature."""
     log_a = np.zeros(len(columns))
     for way in (range(reference + 1, len(columns)), range(reference - 1, -1, -1)):
         before = reference
@@ -266,8 +269,8 @@ def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np
 
 
 def _over(fixed: tuple, moving: tuple) -> float | None:
-    """Return the shift [decades] of the sweep `moving` at which it is nearest to the neighbouring sweep `fixed`. Return
-    None if the sweeps match at no shift.
+    """Return the shift [decades] of the sweep `moving` at which this sweep is nearest to the neighbouring sweep
+    `fixed`. Return None if the sweeps match at no shift.
 
     If the sweeps match within the noise at several shifts, the shift with the longest overlap is used, because a few
     points may match by chance at a wrong shift.
@@ -283,7 +286,7 @@ def _over(fixed: tuple, moving: tuple) -> float | None:
         score = max(float(np.mean(np.square(apart))), noise), -int(inside.sum())
         if score < best:
             best, where = score, float(s)
-    return where if best[0] < 0.25 else None  # sweeps with a distance of half a decade do not match
+    return where if best[0] < 0.25 else None  # sweeps do not match at a root mean square distance of half a decade
 
 
 def _variance(columns: tuple) -> float:

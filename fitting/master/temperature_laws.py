@@ -13,22 +13,24 @@ import scipy.optimize
 
 from fitting.master.shifts import Shifts
 
-#: GAS: molar gas constant [J / (mol K)]. LEAST: lower bound for the standard error of a shift factor [decades].
+#: GAS: molar gas constant [J / (mol K)]. LEAST: standard error that is added to given shift factors [decades]; a tenth
+#: of it is added to fitted ones.
 GAS, LEAST = 8.314462618, 0.01
 
 
 class TemperatureLaw(NamedTuple):
-    """A fitted law with its parameters, and the distance of the shift factors from the law."""
+    """A law for the temperature dependence with its fitted parameters, and the distance of the shift factors from this
+    law."""
 
     name: str
     numbers: dict[str, tuple[float, float]]  # name with unit of each parameter -> value and standard error
-    apart: float  # root mean square distance [decades]
+    apart: float  # root mean square distance of the shift factors from the law [decades]
     at: Callable[[np.ndarray], np.ndarray]  # function: temperatures [K] -> log10 a_T
 
 
 def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
-    """Fit the laws for which there are enough temperatures, and return the laws, best fit first. With fewer than three
-    temperatures no law can be fitted."""
+    """Fit the laws for which there are enough temperatures, and return the fitted laws, best fit first. The Arrhenius
+    law needs three temperatures, the WLF law four."""
     T = shifts.temperatures
     T0 = T[shifts.reference]
     if len(T) < 3:
@@ -41,8 +43,9 @@ def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
 
 
 def _whitening(shifts: Shifts) -> np.ndarray:
-    """Return the whitening matrix W, with W^T W = C^-1. C is the covariance of all log shift factors except the
-    reference, plus the variance from `LEAST`."""
+    """Return the whitening matrix W (K - 1, K) for the log shift factors of K sweeps: W times the errors of these
+    factors has independent entries with variance 1. The covariance is that of all factors except the reference, plus
+    the variance from `LEAST`."""
     free = np.arange(len(shifts.log_a)) != shifts.reference
     least = LEAST if shifts.given else 0.1 * LEAST
     C = shifts.covariance[np.ix_(free, free)] + least**2 * np.eye(free.sum())
@@ -50,8 +53,8 @@ def _whitening(shifts: Shifts) -> np.ndarray:
 
 
 def _noise(off: np.ndarray, numbers: int, given: bool) -> float:
-    """Return the factor by which the covariance is multiplied, computed from the whitened residuals `off`. The factor
-    is at least 1, unless the shift factors were given."""
+    """Return the factor that multiplies the covariance of the parameters of a law, computed from the whitened residuals
+    `off`. `numbers`: number of these parameters. The factor is at least 1, unless the shift factors were given."""
     found = float(off @ off) / max(1, len(off) - numbers)
     return found if given else max(1.0, found)
 
@@ -70,8 +73,8 @@ def _arrhenius(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw:
 
 
 def _wlf(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw | None:
-    """Fit the WLF law. Return None if the curvature of the factors has the opposite sign, because then the law has no
-    finite parameters."""
+    """Fit the WLF law. Return None if the curvature of log a_T over temperature has the opposite sign, because then the
+    law has no finite parameters."""
     W = _whitening(shifts)
 
     # C2 must stay above T0 minus the lowest temperature, because the law has a pole at T0 - C2.

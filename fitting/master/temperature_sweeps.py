@@ -18,21 +18,22 @@ SAME = 1.0
 
 
 class AtTemperatures(NamedTuple):
-    """Sweeps in the order of their temperatures."""
+    """Sweeps at K temperatures, in ascending order of the temperatures."""
 
     sweeps: list[Sweep]
     temperatures: np.ndarray  # (K,) [K], ascending
-    shift_factors: np.ndarray | None  # (K,) a_T; None: the files give no shift factors
+    shift_factors: np.ndarray | None  # (K,) shift factors a_T; None: the files give none
 
 
 def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
     """Read all sweeps of the files, and join the sweeps at the same temperature.
 
     The temperature must be in a column (`temperature_C`, or `Temperature` with its unit) or in the name of the table. A
-    column `shift_factor` may contain factors that are already known.
+    column `shift_factor` may contain shift factors that are already known.
 
     Raises:
-        InputError: a table has no temperature, or there are fewer than two temperatures.
+        InputError: a table states no temperature, there are fewer than two temperatures, or a temperature or shift
+            factor is not positive.
     """
     parts: list[tuple[float, float, Sweep]] = []
     for path in paths:
@@ -93,7 +94,8 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     factors = raw.get("shift_factor", np.full(len(T), np.nan))
     if np.any(factors <= 0):
         raise InputError(f"{path}: shift_factor = {factors.min():g} is not above 0: give positive factors of frequency")
-    if group.max() > 0:  # frequencies repeat because every temperature has the same ones
+    # Every temperature has the same frequencies. So a note that frequencies repeat would be wrong.
+    if group.max() > 0:
         sweep = sweep._replace(notes=tuple(note for note in sweep.notes if REPEATED not in note and note != SORTED))
     out = []
     for k in range(group.max() + 1):

@@ -21,7 +21,7 @@ PER_DECADE, MARGINS, MOST = 20, (0.0, 0.25, 0.5, 1.0, 2.0), 60
 
 
 class Conversion(NamedTuple):
-    """The linear map from the moduli of a model at `omega` to the Prony modes that represent this model."""
+    """The linear map from the moduli of a model at n frequencies to N Prony modes that represent this model."""
 
     omega: np.ndarray  # (n,) [rad/s], over the band
     times: np.ndarray  # (N,) [s], descending
@@ -40,8 +40,8 @@ def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.n
 def convert(
     moduli: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], low: float, high: float, solid: bool
 ) -> Conversion:
-    """Find the smallest number of modes with an error below `ALLOWED`. If there is none, use the best fit with at most
-    `MOST` modes.
+    """Find the smallest number of modes with an error below `ALLOWED`. If the error is larger with every number up to
+    `MOST`, use the modes with the smallest error.
 
     Args:
         moduli: function from angular frequencies (n,) [rad/s] to G' and G'' (n,) [Pa].

@@ -58,8 +58,8 @@ def fit_contact(
     Args:
         depth: (n,) [m].
         force: (n,) [N].
-        unit_force: function that returns the force per unit modulus (n,) [N/Pa] for depths after contact (n,) [m].
-            These depths are negative before contact.
+        unit_force: function that returns the force per unit modulus (n,) [N/Pa] for depths (n,) [m] from the contact
+            point on. These depths are negative before contact.
         base: model of the force without contact: "zero", "constant" (unknown offset of the sensor) or "line" (the
             sensor also drifts).
     """
@@ -106,12 +106,13 @@ def fit_contact(
 
 
 def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> tuple[np.ndarray, float, Alike | None]:
-    """Return the standard errors of all unknowns, the correlation of the first two unknowns, and the noise that is
-    correlated between neighbouring points. Each error is the largest over several kinds of noise."""
+    """Return the standard errors of all unknowns, the correlation of the first two unknowns, and the correlated noise
+    of neighbouring points (None: not correlated). Each error is the largest of the errors for several kinds of noise.
+    J: derivatives of the force with respect to the unknowns."""
     equal = noise * np.linalg.pinv(J)
     roots = [equal, uneven_root(J, residuals, np.eye(J.shape[1]))]
     alike = None
-    if noise > _NOISELESS * np.abs(J[:, 0]).max():  # relative to the fitted force
+    if noise > _NOISELESS * np.abs(J[:, 0]).max():  # the residuals are more than roundoff
         alike = along_rows([len(J)], residuals, J, noise, np.linalg.pinv(J))
     if alike is not None:
         roots.append(alike.root)
@@ -120,8 +121,8 @@ def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> 
     return np.max(errors, axis=0), float(correlations[largest][0, 1]), alike
 
 
-#: _FREE: fraction of the approach that lies before contact, even if the base line has a tilt. _FEWEST: minimum number
-#: of points there.
+#: _FREE: this first fraction of the approach is before contact, even if the base line has a tilt. _FEWEST: minimum
+#: number of points in this part.
 _FREE, _FEWEST = 0.7, 8
 #: A tilt is used only if |tilt| / standard error exceeds _SEEN in a fit of the approach alone and _CLEAR in the fit of
 #: the whole curve.

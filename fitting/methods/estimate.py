@@ -15,7 +15,8 @@ LOST = 1e140
 
 
 class Estimate(NamedTuple):
-    """Parameters in the order of `names`, with standard errors and correlation."""
+    """P parameters in the order of `names`, with standard errors and correlation. k is the number of independent
+    errors, and s the number of systematic errors among them."""
 
     names: tuple[str, ...]
     values: np.ndarray  # (P,)
@@ -60,8 +61,9 @@ def estimated(
     Args:
         names: names of the parameters to report.
         natural_of: function that computes these parameters (P,) from the unknowns u.
-        found: result of the search over u. If it has NumPy arrays, `natural_of` must work in `host.with_jacobian`.
-        components: number of residuals that come from measured values. The other residuals are 0 and have no effect.
+        found: result of the search over u. If `found` contains NumPy arrays, `natural_of` must work in
+            `host.with_jacobian`.
+        components: number of residuals that come from measured values. Without a prior, all other residuals are 0.
         deviations_given: whether the standard deviations of the data are given, see `noise_factor`.
         effective: effective number of parameters that the data determine, if u has a prior. The residuals of the prior
             then follow the `components` residuals of the data.
@@ -142,7 +144,7 @@ def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
     """Return the estimate with one more systematic error, common to all points. `direction` (P,): change of the
-    parameters if this error is one standard deviation. It is independent of the other errors."""
+    parameters if this error is one standard deviation. The added error is independent of the other errors."""
     root = np.column_stack([estimate.root, direction])
     errors, correlation = errors_and_correlation(root)
     lost = ~np.isfinite(estimate.standard_errors)
@@ -164,7 +166,8 @@ def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
     return estimate
 
 
-#: The first-order estimate `mesh_bias` is used up to this relative change of a parameter due to the mesh.
+#: The first-order estimate `mesh_bias` is trusted if the relative change of a parameter due to the mesh is at most this
+#: value.
 LARGEST_BIAS = 0.3
 #: If the standard error exceeds this many times the value, the data do not determine the parameter.
 UNKNOWN = 100.0
@@ -174,8 +177,8 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
     """Return the change (P,) of the parameters due to the errors of the meshes, to first order. `missing` (n,): errors
     of the meshes in the simulated data, divided by the noise.
 
-    The change of the unknowns u is J^+ `missing`, with the Jacobian J of the residuals. It is accurate if the mesh
-    errors are below 25 % and the parameters are not nearly dependent. Subtract the result once to correct the
+    The change of the unknowns u is J^+ `missing`, with the Jacobian J of the residuals. This estimate is accurate if
+    the mesh errors are below 25 % and the parameters are not nearly dependent. Subtract the result once to correct the
     parameters.
     """
     J, (_, to_natural) = np.asarray(found.jacobian), with_slope(natural_of, found.u)

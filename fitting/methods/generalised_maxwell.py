@@ -17,7 +17,7 @@ from liverjax.core.errors import InputError
 
 
 class Maxwell(NamedTuple):
-    """Parameters of a generalised Maxwell solid. Relaxation times are in descending order."""
+    """Parameters of a generalised Maxwell solid with N modes. Relaxation times are in descending order."""
 
     shear_modulus: Array  # G0, instantaneous [Pa]
     ratios: Array  # g_i (N,)
@@ -68,7 +68,7 @@ def _softmax_shares(logits: Array) -> Array:
     """Return the softmax (N + 1,) of the logits (N,) and one more logit, which is 0."""
     xp = arrays_of(logits)
     logits = xp.concatenate([logits, xp.zeros((*logits.shape[:-1], 1), logits.dtype)], axis=-1)
-    share = xp.exp(logits - xp.max(logits.real, axis=-1, keepdims=True))  # the largest is exp(0)
+    share = xp.exp(logits - xp.max(logits.real, axis=-1, keepdims=True))  # the largest exponential is exp(0)
     return share / xp.sum(share, axis=-1, keepdims=True)
 
 
@@ -130,8 +130,8 @@ def largest_number_of_modes(sweep: Sweep) -> int:
 
 
 def mode_columns(omega: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return the moduli (2n, 1 + K), G' then G''. The first column is for an equilibrium modulus of 1 Pa, each other
-    column for one mode with a strength of 1 Pa."""
+    """Return the moduli (2n, 1 + K) at n frequencies for K relaxation times, first G', then G''. The first column is
+    for an equilibrium modulus of 1 Pa. Each other column is for one mode with a strength of 1 Pa."""
     x = omega[:, None] * times
     bottom = np.column_stack([np.zeros(len(omega)), x / (1 + x**2)])
     return np.vstack([np.column_stack([np.ones(len(omega)), x**2 / (1 + x**2)]), bottom])
@@ -147,8 +147,8 @@ class Spectrum(NamedTuple):
 
 
 def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
-    """Fit the strengths by non-negative least squares on a dense grid of relaxation times. The grid is two decades
-    wider than the band on each side."""
+    """Fit a spectrum to a sweep: strengths of modes on a dense grid of relaxation times, by non-negative least squares.
+    The grid is two decades wider than the band on each side."""
     omega = sweep.angular_frequency
     low, high = np.log10(1 / omega[-1]) - 2, np.log10(1 / omega[0]) + 2
     times = np.logspace(low, high, int((high - low) * per_decade) + 1)
@@ -162,7 +162,7 @@ def non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the x >= 0 for which A x is nearest to b, and the distance |A x - b|.
 
     If relaxation times are close, columns are nearly equal, and the active-set method may cycle. Then SciPy's bounded
-    least squares is used, which always returns its best point.
+    least squares is used, which always returns a result.
     """
     norm = np.linalg.norm(A, axis=0)  # with columns of equal length, the active-set method needs few iterations
     norm = np.where(norm > 0, norm, 1.0)
@@ -199,9 +199,9 @@ def refuse_impossible(sweep: Sweep) -> Spectrum:
 
 
 def starts(sweep: Sweep, modes: int, dense: Spectrum, count: int = 24, seed: int = 0) -> np.ndarray:
-    """Return starting points u (count, 2N + 1) of a search. The relaxation times of the first point are evenly spread
-    on the log axis. The second point has one time in each of N parts of the dense spectrum with equal strength. The
-    other points have random log-uniform times.
+    """Return starting points u (count, 2N + 1) of a search for N modes. The relaxation times of the first point are
+    evenly spread on the log axis. The second point has one time in each of N parts of the dense spectrum with equal
+    strength. The other points have random log-uniform times.
 
     For given times, the problem is linear in the strengths, so non-negative least squares gives the strengths.
     """
@@ -214,7 +214,8 @@ def starts(sweep: Sweep, modes: int, dense: Spectrum, count: int = 24, seed: int
 
 
 def _grouped(dense: Spectrum, modes: int, low: float, high: float) -> np.ndarray:
-    """Return one log time for each of N parts of the spectrum with equal strength."""
+    """Divide the spectrum into N = `modes` parts of equal strength. Return the logarithm of one relaxation time for
+    each part, or equally spaced logarithms if all strengths are 0."""
     if dense.strengths.sum() <= 0:
         return np.linspace(low, high, modes)
     share = np.cumsum(dense.strengths) / dense.strengths.sum()
@@ -240,8 +241,8 @@ def start_at_times(times: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarra
 
 
 def times_over(resolved: tuple[float, float], modes: int, count: int) -> list[np.ndarray]:
-    """Return relaxation times (N,) [s], descending, for `count` starting points. They are evenly spread on the log axis
-    for the first point and random for the others."""
+    """Return relaxation times (N,) [s], descending, for `count` starting points. The times of the first point are
+    evenly spread on the log axis. The times of the other points are random."""
     low, high = np.log(resolved)
     rng = np.random.default_rng(0)
     grids = [np.linspace(low, high, modes + 2)[1:-1]]

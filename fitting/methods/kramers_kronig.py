@@ -24,8 +24,8 @@ from fitting.readers.frequency_sweep import FEWEST, Sweep, merged, scatter, some
 #: A violation of the bounds counts if it exceeds both SIGNIFICANT standard deviations of the scatter and NEGLIGIBLE
 #: times the modulus.
 SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
-#: A warning is given if the relative distance of the best spectrum from the data exceeds FAR and FAR_RATIO times the
-#: scatter.
+#: A warning is given if the relative distance of the best spectrum from the data exceeds both FAR and FAR_RATIO times
+#: the scatter.
 FAR, FAR_RATIO = 0.01, 5.0
 #: If random noise gives such signs of the residuals with a probability below this value, the misfit is called
 #: structured.
@@ -47,7 +47,8 @@ class Consistency(NamedTuple):
 
 
 def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
-    """Check the bounds and the spectrum. `dense` is the result of `generalised_maxwell.spectrum`."""
+    """Check whether a sweep violates the bounds, and how far the best spectrum `dense` is from the data. `dense` is the
+    result of `generalised_maxwell.spectrum`."""
     omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
     noises = scatter(omega, storage), scatter(omega, loss)
     each, breaches = _noise_of_loss(sweep, noises[1]), []
@@ -115,7 +116,8 @@ def _noise_of_loss(sweep: Sweep, same: float) -> np.ndarray:
 def _breach(omega, storage, loss, noise) -> str:
     """Return a string with the bound that two neighbouring points violate, or an empty string."""
     step = math.log(omega[1] / omega[0])
-    # Upper bound of the rise of G': between the points, G'' is largest if it changes as fast as its own bound allows.
+    # Upper bound of the rise of G' between the two points, for the largest G'' that is possible between them:
+    # |d ln G''/d ln omega| is at most 1.
     most = step * min(max(loss) * math.exp(step / 2), math.inf)
     rise, sd = storage[1] - storage[0], noise[0] * math.hypot(*storage)
     margin = max(SIGNIFICANT * sd, NEGLIGIBLE * max(storage))
@@ -158,22 +160,25 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
 
 
 def _rounded_up(hertz: float) -> float:
-    """Return the value rounded up to four digits. A frequency limit of this value then does not exclude the point."""
+    """Return the frequency [Hz], rounded upwards to four significant digits. As a frequency limit, this value does not
+    exclude the point at `hertz`."""
     unit = 10.0 ** (math.floor(math.log10(hertz)) - 3)
     return math.ceil(hertz / unit) * unit
 
 
-#: _ONE_SIDED: if random signs agree so often with a probability below this value, nearly all residuals have one sign.
+#: _ONE_SIDED: nearly all residuals have one sign if random signs would agree as often with a probability below this
+#: value.
 #: _OUTLIERS: residuals of the rarer sign are outliers if their mean size exceeds this many times the mean size of the
 #: others.
 _ONE_SIDED, _OUTLIERS = 1e-4, 3.0
 
 
 def runs_probability(residuals: np.ndarray) -> tuple[int, float]:
-    """Return the number of runs (groups of consecutive residuals with equal sign) and the probability of at most this
-    number in random order (Wald and Wolfowitz 1940). If nearly all residuals (n,) have one sign, their order gives no
-    information. Then the second result is the probability that at least so many of n random signs are equal (two-sided
-    sign test). If the residuals of the rarer sign are outliers, the result of the runs test is kept.
+    """Return the number of runs (groups of consecutive residuals with equal sign), and the probability of at most this
+    number of runs if the signs were in random order (Wald and Wolfowitz 1940). If nearly all residuals (n,) have one
+    sign, their order gives no information. Then the second result is the probability that at least so many of n random
+    signs are equal (two-sided sign test). If the residuals of the rarer sign are outliers, the result of the runs test
+    is kept.
     """
     residuals = np.asarray(residuals)[np.asarray(residuals) != 0]
     up = residuals > 0
@@ -205,10 +210,9 @@ NOT_CONTAINED = "the standard errors do not contain it"
 
 
 def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple[dict, list[str]]:
-    """Test the signs of the residuals of G' and of G'', ordered by frequency, with a runs test. Returns its results,
-    and one warning if the misfit is structured. The noise of repeated measurements at one frequency may be correlated,
-    so they count once.
-    """
+    """Test the signs of the residuals of G' and of G'', ordered by frequency, with a runs test. Returns the results of
+    the tests, and one warning if the misfit is structured. The noise of repeated measurements at one frequency may be
+    correlated, so they count as one measurement."""
     numbers, told = {}, []
     omega, storage, loss = merged(omega, storage, loss)
     for name, residuals in (("storage_modulus", storage), ("loss_modulus", loss)):

@@ -16,7 +16,7 @@ from liverjax.solvers.blas import one_blas_thread
 
 
 class Solution(NamedTuple):
-    """A minimum of cost = |r|^2 / 2, or the best point found."""
+    """A minimum of cost = |r|^2 / 2, or the unknowns u with the smallest cost found."""
 
     u: Array
     residuals: Array
@@ -28,7 +28,8 @@ class Solution(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of Levenberg-Marquardt between two evaluations: the best point, and the trial point to evaluate next."""
+    """State of Levenberg-Marquardt between two evaluations: the unknowns u with the smallest cost so far (residuals r,
+    Jacobian J), and the trial point to evaluate next."""
 
     u: Array
     r: Array
@@ -45,7 +46,7 @@ class State(NamedTuple):
 #: A fit has converged if the undamped step would decrease the cost by less than GAIN (relative). A mean squared
 #: residual below ZERO counts as zero. MAX_DAMPING is the upper bound of the damping.
 GAIN, ZERO, MAX_DAMPING = 1e-10, 1e-26, 1e12
-#: The best of many fits may use the maximum number of iterations times this factor.
+#: The search that reached the lowest cost may use the maximum number of iterations times this factor.
 LONGER = 8
 
 
@@ -63,7 +64,7 @@ def _damped_steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Arr
 
 
 def begin(u: Array, n_residuals: int, damping: float = 1e-3) -> State:
-    """Return the first state, with the trial point u (…, P)."""
+    """Return the first state of Levenberg-Marquardt. Its trial point is the starting point u (…, P) with P unknowns."""
     xp, dtype, fits = host.arrays_of(u), u.dtype, u.shape[:-1]
     no = xp.full(fits, False)
     return State(
@@ -85,8 +86,8 @@ def _cost(r: Array) -> Array:
 
 
 def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
-    """Go to the trial point if it is better. Otherwise raise the damping (Nielsen 1999). Then propose the next trial
-    point."""
+    """Move to the trial point (residuals r, Jacobian J) if its cost is lower. Otherwise raise the damping (Nielsen
+    1999). Then propose the next trial point."""
     xp = host.arrays_of(s.u)
     first = s.iterations < 0
     cost, cost_new = _cost(s.r), _cost(r)
@@ -162,17 +163,18 @@ Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 
 
 def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iterations: int = 200) -> Solution:
-    """Return the best minimum that Levenberg-Marquardt finds from the starting points (S, P), in NumPy. Nothing is
-    compiled.
+    """Return the best minimum that Levenberg-Marquardt finds from S starting points (S, P) with P unknowns, in NumPy.
+    Nothing is compiled.
 
-    If the search for the best point has not converged, only this search is continued. For example, convergence is slow
-    if a model has too few modes for a wide curve.
+    If the search that reached the lowest cost has not converged, only this search is continued. For example,
+    convergence is slow if a model has too few modes for a wide curve.
 
     Args:
         evaluate: function of (u, *data), for example `host.with_jacobian` applied to a residual function.
         starts: starting points (S, P).
         data: further arguments of `evaluate`.
-        max_iterations: maximum number of iterations of each fit; `LONGER` times as many for the best fit.
+        max_iterations: maximum number of iterations of each search; `LONGER` times as many for the search with the
+            lowest cost.
     """
     # The matrices are small. With several threads, their decomposition took 50 times as long while other programs ran.
     with one_blas_thread():
@@ -184,8 +186,8 @@ def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iteratio
 
 
 def _best_minimum(evaluate: Evaluate, starts: np.ndarray, data: tuple, max_iterations: int) -> Solution:
-    """Return the point with the lowest cost that is reached from the starting points (S, P). All searches run at the
-    same time."""
+    """Return the solution with the lowest cost that is reached from S starting points (S, P) with P unknowns. All
+    searches run at the same time."""
     going: np.ndarray = np.arange(len(starts))
     s: Any = None
     with np.errstate(all="ignore"):  # a trial point that overflows is rejected
@@ -243,5 +245,5 @@ def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol
     r, J = with_jacobian(residuals)(found.x, *data)
     s = accept(begin(found.x, r.shape[0]), r, J)
     _, _, left = _damped_steps(J, r, s.damping)
-    near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the second condition: far below any noise
+    near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # 2nd condition: r is far below any noise
     return solution(s._replace(iterations=jnp.asarray(found.nit), converged=s.converged | near))

@@ -88,7 +88,7 @@ def _hull(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]
 
 
 class _Spreads(NamedTuple):
-    """Possible spreads s (K,) with their weights, and for each spread the mean and the variance of this mean."""
+    """K possible spreads s (K,) with their weights, and for each spread the mean and the variance of this mean."""
 
     s: np.ndarray
     weight: np.ndarray

@@ -64,7 +64,7 @@ def variances(p: Prior, modes: np.ndarray, kept: np.ndarray, chunk: int = 512) -
     for first in range(0, n, chunk):
         unit = np.zeros((n, min(chunk, n - first)))
         unit[np.arange(first, first + unit.shape[1]), np.arange(unit.shape[1])] = 1
-        # This is row v of T = scale A^-1 M^(1/2), because A is symmetric.
+        # Column v of `to_whitened` is row v of T = scale A^-1 M^(1/2), because A is symmetric.
         before[first : first + unit.shape[1]] = np.sum(to_whitened(p, unit) ** 2, axis=0)
     after = before - field_at_nodes(p, modes) ** 2 @ (1 - kept)
     return before, np.maximum(after, 0.0)

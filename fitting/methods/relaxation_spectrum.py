@@ -1,5 +1,5 @@
 """Fit a relaxation spectrum on a fixed grid of relaxation times, with non-negative strengths (moduli of the modes).
-Where the data do not determine the strengths, they are smooth.
+Where the data do not determine the strengths, the fitted strengths change smoothly with the relaxation time.
 
 For fixed relaxation times, the moduli are linear in the strengths, so the fit has only one minimum. Each strength is
 divided by the measured |G*| at omega = 1 / tau. A weighted penalty on the second differences of the strengths makes
@@ -26,7 +26,8 @@ CARRIED = 0.5
 
 
 class GridSpectrum(NamedTuple):
-    """Strengths at fixed relaxation times, with the weight of the penalty and the criteria of the choice."""
+    """Strengths at K fixed relaxation times, with the weight of the penalty (R rows) and the criteria by which grid and
+    weight are chosen."""
 
     times: np.ndarray  # (K,) [s], descending; only times with a strength above zero
     strengths: np.ndarray  # (K,) [Pa]
@@ -70,7 +71,7 @@ def at(sweep: Sweep, per_decade: int, smoothing: float, band: tuple[float, float
 
 
 class GridOfTimes(NamedTuple):
-    """Grid of a spectrum: the times, the units of the strengths, and the weight for smoothness."""
+    """Grid of a spectrum: K times, the units of the strengths, and the weight of the penalty."""
 
     times: np.ndarray  # (K,) [s], descending
     unit: np.ndarray  # (1 + K,) [Pa]; the first unit is for the equilibrium modulus
@@ -85,7 +86,8 @@ def grid_of_times(low: float, high: float, per_decade: int) -> np.ndarray:
 
 
 def second_differences(count: int, smoothing: float) -> np.ndarray:
-    """Return the matrix (K - 2, 1 + K) of the penalty on the second differences of the strengths."""
+    """Return the matrix (K - 2, 1 + K) of the penalty on the second differences of K = `count` strengths. The first
+    column, for the equilibrium modulus, is 0."""
     rows = np.column_stack([np.zeros(count - 2), np.diff(np.eye(count), 2, axis=0)])
     return np.sqrt(smoothing) * rows
 

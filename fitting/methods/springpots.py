@@ -35,8 +35,8 @@ class Fractional(NamedTuple):
     free: tuple[int, ...]  # indices in u
     names: tuple[str, ...]
     units: tuple[str, ...]
-    values: Callable[[Array, float], Array]  # (all six entries of u, reference [rad/s]) -> (P,)
-    formula: Callable[..., np.ndarray]  # (i omega, values) -> G* [Pa], written as in the literature
+    values: Callable[[Array, float], Array]  # (all six entries of u, reference frequency [rad/s]) -> parameters (P,)
+    formula: Callable[..., np.ndarray]  # (i omega, parameters) -> G* [Pa], as in the literature
 
     @property
     def solid(self) -> bool:
@@ -45,7 +45,7 @@ class Fractional(NamedTuple):
 
     @property
     def switches(self) -> np.ndarray:
-        """Four switches (4,), 1 or 0: whether the model has E, gamma, W and beta."""
+        """Four numbers (4,), each 1 or 0: whether the model has E, gamma, W and beta."""
         return np.array([float(k in self.free) for k in (0, 1, 4, 5)])
 
 
@@ -59,8 +59,8 @@ def _orders(u: Array) -> tuple[Array, Array, Array]:
 def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> tuple[Array, Array]:
     """Return real and imaginary part (n,) [Pa] of G* at the complex frequency s, from all six entries of u.
 
-    x (n,) is |s| / reference, and `angle` is the argument of s. The default angle means s = i omega, which gives G' and
-    G''.
+    x (n,) is |s| / reference, and `angle` is the argument of s. `switches`: see `Fractional.switches`. The default
+    angle means s = i omega, which gives G' and G''.
     """
     xp = arrays_of(u, x)
     alpha, beta, gamma = (exponent[..., None] for exponent in _orders(u))
@@ -101,7 +101,8 @@ def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwe
     xp = arrays_of(u, times)
     step = xp.log(times[0] / times[1])
     H = step * moduli(u, switches, 1 / (times * reference), np.pi)[1] / np.pi
-    ends = xp.stack([1e3 / times[0], 1e-2 / times[-1]])  # there, slower times act as springs, faster as dashpots
+    # At these two values of s, modes slower than `times` act as springs, and faster modes as dashpots.
+    ends = xp.stack([1e3 / times[0], 1e-2 / times[-1]])
     fast = times[-1] / 3
 
     x = xp.outer(ends, times)
@@ -205,7 +206,7 @@ def full(model: Fractional, u: Array) -> Array:
 
 
 def best_minimum(model: Fractional, sweep: Sweep, starts: np.ndarray, scales: np.ndarray | None = None) -> Solution:
-    """Return the best minimum over the free entries of u that is found from the starting points (S, P).
+    """Return the best minimum over the P free entries of u that is found from S starting points (S, P).
 
     Args:
         model: the fractional model.

@@ -10,9 +10,9 @@ give the retardation modes, with rates r_k >= 0 and weights (q_k . b)^2 (Gross 1
 theories of viscoelasticity). For a fluid, one rate is 0, because a fluid flows without limit.
 
 Fits compute the same responses in NumPy, with analytical derivatives (`residuals_with_jacobian`), so that nothing is
-compiled. The recursion (the update of the history variables of viscosity from step to step) is differentiated in every
-step. The derivatives of the retardation modes are the first-order changes of eigenvalues and eigenvectors of S. If all
-relaxation times are different, all eigenvalues of S are different.
+compiled. The recursion (the update of the history variables of viscosity from step to step) also computes its
+derivatives in every step. The derivatives of the retardation modes are the first-order changes of eigenvalues and
+eigenvectors of S. If all relaxation times are different, all eigenvalues of S are different.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def _phi(x: Array) -> tuple[Array, Array]:
     """Return phi_1 = (1 - e^-x) / x and phi_2 = (x - 1 + e^-x) / x^2, with their limits at x = 0."""
     xp = arrays_of(x)
     small = x < 1e-3
-    near, safe = xp.where(small, x, 0.0), xp.where(small, 1.0, xp.where(x > 1e100, 1e100, x))  # powers stay finite
+    near, safe = xp.where(small, x, 0.0), xp.where(small, 1.0, xp.where(x > 1e100, 1e100, x))  # for finite powers
     one = xp.where(small, 1 - near / 2 + near**2 / 6 - near**3 / 24, -xp.expm1(-safe) / safe)
     two = xp.where(small, 0.5 - near / 6 + near**2 / 24 - near**3 / 120, (safe + xp.expm1(-safe)) / safe**2)
     return one, two
@@ -129,7 +129,8 @@ class Slopes(NamedTuple):
 
 
 def _driven_stress(at: Slopes, time: np.ndarray, strain: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stress (m, …) [Pa] for a given strain, and its derivatives (m, …, P) with respect to u."""
+    """Return the stress (m, …) [Pa] at the m times `time[rows]` for a given strain, and its derivatives (m, …, P) with
+    respect to u."""
     model = at.model
     G0, g, tau = model.shear_modulus[..., None], model.ratios, model.relaxation_times
     rise = np.diff(strain)
@@ -142,7 +143,8 @@ def _driven_stress(at: Slopes, time: np.ndarray, strain: np.ndarray, rows: np.nd
 
 
 def _driven_strain(at: Slopes, time: np.ndarray, stress: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the strain (m, …) for a given stress [Pa], and its derivatives (m, …, P) with respect to u."""
+    """Return the strain (m, …) at the m times `time[rows]` for a given stress [Pa], and its derivatives (m, …, P) with
+    respect to u."""
     G0 = at.model.shear_modulus[..., None]
     rates, weights, of_rates, of_weights = _retardation(at)
     dt = np.diff(time)
@@ -196,18 +198,18 @@ def _retardation(at: Slopes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     n = np.arange(g.shape[-1])
     S = b[..., :, None] * b[..., None, :]
     S[..., n, n] -= 1 / tau
-    known = np.all(np.isfinite(S), axis=(-2, -1), keepdims=True)  # an overflow is only a bad trial point
+    known = np.all(np.isfinite(S), axis=(-2, -1), keepdims=True)  # overflow occurs only at a bad trial point
     eigenvalues, Q = np.linalg.eigh(np.where(known, S, 0.0))
     Q = np.where(known, Q, np.nan)
     c = np.einsum("...ik,...i->...k", Q, b)
     # Derivatives with respect to every u_p of b, of its components along the eigenvectors, and of the diagonal -1/tau.
     of_b = b[..., None] * (of_g / (2 * g[..., None]) - of_tau / (2 * tau[..., None]))
     along, of_diagonal = np.swapaxes(Q, -1, -2) @ of_b, np.swapaxes(of_tau / tau[..., None] ** 2, -1, -2)
-    # q_l . (dS/du_p) q_k, (…, p, l, k).
+    # M: q_l . (dS/du_p) q_k, with the axes (…, p, l, k).
     a = np.swapaxes(along, -1, -2)
     M = np.swapaxes(Q, -1, -2)[..., None, :, :] @ (of_diagonal[..., None] * Q[..., None, :, :])
     M += a[..., :, None] * c[..., None, None, :] + c[..., None, :, None] * a[..., None, :]
-    apart = eigenvalues[..., None, :] - eigenvalues[..., :, None]  # (…, l, k)
+    apart = eigenvalues[..., None, :] - eigenvalues[..., :, None]  # differences of the eigenvalues (…, l, k)
     apart[..., n, n] = np.inf
     of_c = a + (c[..., None, None, :] @ (M / apart[..., None, :, :]))[..., 0, :]
     of_rates = -np.swapaxes(M[..., n, n], -1, -2)

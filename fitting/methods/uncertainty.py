@@ -110,8 +110,8 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
     widen the interval. The squares of both half widths are added. This is right to first order in these errors.
 
     Returns:
-        [low, high] for each name. An end is None if the likelihood does not reach the limit within about four standard
-            errors.
+        [low, high] for each name. An end is None if the likelihood does not fall to the limit of the interval within
+            about four standard errors.
     """
     data = (jnp.asarray(sweep.angular_frequency), sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     best = 2 * float(found.cost)
@@ -136,8 +136,8 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
             intervals[name] = [None, None]
             continue
         grid = center + error * np.linspace(-4, 4, points) * uncertainty.quantile / 2
-        # The penalty keeps the parameter only near its value. The point found is still the constrained optimum for the
-        # value of the parameter found.
+        # The penalty keeps the parameter only near its grid value. The result is the constrained optimum for the value
+        # that the parameter has in this result.
         reached, chi2 = (
             np.asarray(v) for v in along(j, jnp.maximum(grid, 1e-3 * center), 1e3 * uncertainty.noise / error)
         )
@@ -185,7 +185,7 @@ def _decades(data: Band) -> float:
 
 def supported_modes(data: Band) -> int:
     """Return the number of modes that the band supports: about one for each decade, plus one."""
-    return max(1, int(_decades(data) + 1 + 1e-9))  # roundoff must not remove a mode
+    return max(1, int(_decades(data) + 1 + 1e-9))  # so that roundoff does not remove a mode
 
 
 def superfluous(data: Band, u: Estimate) -> list[str]:
@@ -267,8 +267,8 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
         out.append(
             f"the points scatter by {100 * sweep.point_scatter:.2g} %, but the deviations in the file are "
             f"{100 * sweep.relative_deviation:.2g} %. If these are the spread between samples, the errors of ratios "
-            "and times are too large, and the fit of this curve is not reliable. Then give one file per sample, to "
-            "fit each"
+            "and times are too large, and the fit of this curve is not reliable. In that case, give one file "
+            "per sample"
         )
     elif sweep.noise_given and u.noise > 1.5:
         out.append(

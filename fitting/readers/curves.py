@@ -18,7 +18,7 @@ _INDICES = [f"{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 
 
 class Curve(NamedTuple):
-    """One test of one sample."""
+    """A measured stress-stretch curve with n points: one component of the stress in one test of one sample."""
 
     label: str
     test: str  # uniaxial, equibiaxial, pure_shear, simple_shear or general
@@ -30,8 +30,8 @@ class Curve(NamedTuple):
 
     @property
     def driven(self) -> np.ndarray:
-        """Component (n,) of F on which the measured stress does work. If this component is constant, the shear F12 if
-        it varies, otherwise the stretch F11."""
+        """Component (n,) of F on which the measured stress does work, if this component varies. Otherwise the shear F12
+        if F12 varies, and else the stretch F11."""
         own, shear = self.F[:, *self.component], self.F[:, 0, 1]
         return own if np.ptp(own) > 0 else shear if np.ptp(shear) > 0 else self.F[:, 0, 0]
 
@@ -97,7 +97,7 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     first = next((k for k, names in enumerate(cells) if _names_curves(names)), 0)
     end = next((k for k in range(first, len(cells)) if cells[k][:1] == ["[step]"]), len(cells))  # the next sheet begins
     if end < first + 2:
-        raise InputError(f"{file} holds no rows: give a CSV file of curves")
+        raise InputError(f"{file} contains no rows: give a CSV file of curves")
     names, between = _documented(cells[first]), _delimiter_of_curves(lines[first])
     rows = [_row_under(names, own, file) for own in cells[first + 1 : end]]
     if between != ",":  # then numbers may have a decimal comma
@@ -105,7 +105,7 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
         rows = [{k: _with_point(v, between, sign) for k, v in row.items()} for row in rows]
     rows = [dict.fromkeys(names, "") | row | {"row": str(k)} for k, row in enumerate(rows, 1) if any(row.values())]
     if not rows:
-        raise InputError(f"{file} holds no rows: give a CSV file of curves")
+        raise InputError(f"{file} contains no rows: give a CSV file of curves")
     if not _names_curves(names):
         raise InputError(
             f"{file} has columns {', '.join(names)[:100]}: give F11 … F33, P11 … P33, "
@@ -115,8 +115,8 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
 
 
 def _measured_rows(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
-    """Return the rows with a measured nominal stress, and the number of other rows. If none has
-    one, return all rows and 0."""
+    """Return the rows with a measured nominal stress, and the number of other rows. If no row has a nominal stress,
+    return all rows and 0."""
     name = next((key for key in rows[0] if key.startswith("nominal_stress")), None)
     kept = rows if name is None else [row for row in rows if row[name].lower() not in EMPTY]
     return (kept, len(rows) - len(kept)) if kept else (rows, 0)
@@ -156,7 +156,7 @@ def _names_curves(headings: list[str]) -> bool:
 
 
 def _with_point(cell: str, between: str, sign: str | None) -> str:
-    """Return a number in Python's notation. Any other string is returned unchanged."""
+    """Return a cell with a number in Python's notation. Any other cell is returned unchanged."""
     value = to_number(cell, between, sign) if cell else None
     return cell if value is None else repr(value)
 
@@ -172,7 +172,7 @@ def _column(file: Path, rows: list[dict], name: str, default: float | None = Non
             values.append(float(text))
         except ValueError:
             where = f"{file}, data row {row['row']}"
-            raise InputError(f"{where}: {name} = {text[:40]!r} is not a number: give one") from None
+            raise InputError(f"{where}: {name} = {text[:40]!r} is not a number: give a number") from None
         if not np.isfinite(values[-1]):
             raise InputError(f"{file}, data row {row['row']}: {name} = {text} is not finite: remove the row")
     return np.array(values)
@@ -199,7 +199,7 @@ def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], b
         raise InputError(
             f"{file} has no column {', '.join(missing)}: give F11, F22 and F33, and the shears that are not 0"
         )
-    # A shear without a column is 0.
+    # A shear component without a column counts as 0.
     given = {ij: None if f"F{ij}" in rows[0] else 0.0 for ij in _INDICES}
     F = np.stack([_column(file, rows, f"F{ij}", zero) for ij, zero in given.items()], axis=1).reshape(-1, 3, 3)
     measured, stated = {}, {}
@@ -219,7 +219,7 @@ def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], b
     if np.abs(F[:, [0, 1, 2, 2], [2, 2, 0, 1]]).max() > 1e-9:
         raise InputError(f"{file}: F13, F23, F31, F32 must be 0: rotate the axes so that face 3 stays flat")
     if (1, 1) in measured and (0, 0) in measured and np.allclose(measured[0, 0], measured[1, 1], rtol=1e-6):
-        del measured[1, 1]  # one measurement, written twice
+        del measured[1, 1]  # P11 and P22 are the same measurement, written twice
     kind = _kind(F)
     several = len(measured) > 1
     return [
@@ -242,8 +242,8 @@ def _kind(F: np.ndarray) -> str:
     return "general"
 
 
-#: If the smallest stretch of a test is this large, the column probably contains strains in %, because a test begins
-#: near rest.
+#: If all stretches of a test are at or above this value, the column probably contains strains in %, because a test
+#: begins near rest (stretch 1).
 STRAINED = 1.9
 #: A shear above this value is probably in %.
 SHEARED = 3.0
@@ -271,10 +271,12 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         if shear and np.abs(driven).max() > SHEARED:
             raise InputError(
                 f"{file}: a shear of {driven[np.argmax(np.abs(driven))]:g} is too large: a shear is the displacement "
-                "over the height; write a shear of 2 % as 0.02"
+                "divided by the height; write a shear of 2 % as 0.02"
             )
         if np.any(stretch <= 0):
-            raise InputError(f"{file}: a stretch of {stretch.min():g} is not possible: give length over rest length")
+            raise InputError(
+                f"{file}: a stretch of {stretch.min():g} is not possible: give the length divided by the length at rest"
+            )
         if not shear and stretch.min() >= STRAINED:
             raise InputError(
                 f"{file}: stretches of {stretch.min():g} to {stretch.max():g} do not begin near 1: a stretch is the "
@@ -286,7 +288,7 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         if not shear and stretch.min() < SHORTENED and stretch.max() > STRAINED and of_one_sign:
             raise InputError(
                 f"{file}: stretches of {stretch.min():g} and {stretch.max():g} do not have opposite stresses, although "
-                "one is below 1. A stretch is the length over the length at rest: write a strain of 2 % as 1.02"
+                "one is below 1. A stretch is the length divided by the length at rest: write 1.02 for a strain of 2 %"
             )
         F = np.asarray(homogeneous.deformation_gradient(test, driven, stretch))
         label = f"{file.stem}, {test.replace('_', ' ')}" + (f" at {fixed}" if shear and fixed not in ("", "1") else "")
@@ -360,15 +362,15 @@ def _returns(driven: np.ndarray, F: np.ndarray) -> int:
             turns += [low] if rises is False else []
             rises, high = True, k
     parts = [np.arange(a + (a > 0), b + 1) for a, b in zip(turns, [*turns[1:], len(driven) - 1], strict=True)]
-    # A jump back to the start is not a separate part. The extreme values of each part are ignored, so that one wrong
-    # value does not make a range.
+    # A jump back to the start is not a separate part. The extreme values of each part are ignored, so that a single
+    # wrong value does not count as a range of deformations.
     parts = [rows[np.argsort(driven[rows], kind="stable")][1:-1] for rows in parts if len(rows) >= 3]
     return sum(_same_again(driven, F, before, after) for before, after in itertools.pairwise(parts))
 
 
 def _same_again(driven: np.ndarray, F: np.ndarray, before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the rows `after` repeat the deformations of the rows `before` over a range. Both are sorted by
-    `driven`."""
+    """Return whether the rows `after` repeat the deformations of the rows `before` over a range of `driven`. `before`
+    and `after` are row numbers, sorted by `driven`; F is (n, 9)."""
     low, high = max(driven[before[0]], driven[after[0]]), min(driven[before[-1]], driven[after[-1]])
     if not high - low > 2 * _TURN * np.ptp(driven):
         return False

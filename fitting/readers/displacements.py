@@ -16,10 +16,10 @@ from liverjax.scenes.scene import Scene
 
 #: A point farther from the mesh than this does not belong to the body (unit: size of the nearest element).
 _FAR = 2.0
-#: Points near a coarse surface may lie outside of the mesh by more than _OUTSIDE element sizes, but not more than the
-#: fraction _MOST_OUTSIDE of all points.
+#: At most the fraction _MOST_OUTSIDE of all points may lie outside of the mesh by more than _OUTSIDE element sizes.
+#: Such points occur near a surface with a coarse mesh.
 _OUTSIDE, _MOST_OUTSIDE = 0.25, 0.2
-#: A value above this many sizes of the body cannot be a displacement.
+#: A displacement above this value times the size of the body is an error in the file.
 _LONGEST = 2.0
 _COLUMNS = ("node", "x", "y", "z", "ux", "uy", "uz", "time", "sd")
 
@@ -29,7 +29,7 @@ class Displacements(NamedTuple):
 
     step: np.ndarray  # (n,) index of the step, from 0
     nodes: np.ndarray  # (n, 4) nodes of the element at the point; (n, 10) if quadratic
-    weights: np.ndarray  # values of the shape functions of these nodes at the point
+    weights: np.ndarray  # (n, 4) or (n, 10) values of the shape functions of these nodes at the point
     measured: np.ndarray  # (n, 3) [m]; 0 where not measured
     sd: np.ndarray  # (n, 3) [m] standard deviation of the noise; infinite where not measured
 
@@ -49,11 +49,11 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     Args:
         path: CSV file.
         scene: the scene whose simulation is compared with the displacements.
-        noise: standard deviation [m] if the file has no ``sd``.
+        noise: standard deviation of the noise [m], used if the file has no column ``sd``.
         unit: unit of all lengths in the file, one of `liverjax.mesh.tetrahedra.UNITS`.
 
     Raises:
-        InputError: an unreadable file, a wrong column or value, a node or point outside the mesh, no noise.
+        InputError: the file, a column, a value, a node or a point is wrong, or no noise is given.
     """
     path = Path(path)
     if unit not in UNITS:
@@ -63,7 +63,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     n = len(table["ux"])
     measured = scale * np.stack([table[c] for c in ("ux", "uy", "uz")], axis=1)
     if np.any(np.isinf(measured)):
-        raise InputError(f"{path}: row {int(np.argwhere(np.isinf(measured))[0, 0]) + 1} is infinite: leave it empty")
+        raise InputError(f"{path}: row {int(np.argwhere(np.isinf(measured))[0, 0]) + 1} is infinite: empty the cell")
     seen = np.isfinite(measured)
     if not seen.any():
         raise InputError(f"{path}: no displacement is measured: fill ux, uy, uz")
@@ -81,7 +81,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
         sd = np.full(n, noise)
     else:
         raise InputError(
-            f"{path}: no column sd: add one, or give the noise's standard deviation in metres with --noise"
+            f"{path}: no column sd: add this column, or give the noise's standard deviation in metres with --noise"
         )
     if not (np.all(np.isfinite(sd)) and np.all(sd > 0)):
         raise InputError(f"{path}: sd must be positive and finite: give the noise's standard deviation")
@@ -101,7 +101,8 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     )
 
 
-#: If _SOME points or more all lie within _TOGETHER times the size of the body, their positions are in another unit.
+#: If _SOME points or more all lie within _TOGETHER times the size of the body, their positions are assumed to be in
+#: another unit.
 _SOME, _TOGETHER = 8, 0.01
 
 
@@ -109,8 +110,8 @@ def _refuse_other_places(path: Path, places: np.ndarray, size: float, unit: str)
     across = float(np.ptp(places, axis=0).max()) if np.all(np.isfinite(places)) else size
     if len(np.unique(places, axis=0)) >= _SOME and across < _TOGETHER * size:
         raise InputError(
-            f"{path}: all points lie within {across:.2g} m of each other, in a body of {size:.3g} m: --unit {unit} is "
-            "for x, y, z and ux, uy, uz; write all of them in one unit"
+            f"{path}: all points lie within {across:.2g} m of each other, in a body of {size:.3g} m: --unit {unit} "
+            "applies to x, y, z and ux, uy, uz, so write all these columns in one unit"
         )
 
 
@@ -159,7 +160,7 @@ def _rows_of_numbers(path: Path, names: list[str], rows: list[list[str]], betwee
     sign, values = decimal_sign(cell for row in rows[:1000] for cell in row), np.full((len(rows), len(names)), np.nan)
     for k, row in enumerate(rows):
         if len(row) > len(names):
-            raise InputError(f"{path}: row {k + 1} has {len(row)} cells under {len(names)} headings: correct it")
+            raise InputError(f"{path}: row {k + 1} has {len(row)} cells under {len(names)} headings: correct the row")
         for j, cell in enumerate(row):
             value = to_number(cell, between, sign)
             if value is None:
@@ -203,8 +204,8 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.
     """Find the element that contains each point, or the nearest element.
 
     Returns the nodes (n, 4) of this element, the barycentric coordinates (n, 4) of the point, and the distance (n,)
-    from point to element in element sizes. For quadratic elements, the first two are the nodes (n, 10) and the values
-    (n, 10) of their shape functions. The function runs on the CPU, outside compiled programs.
+    from point to element in element sizes. For quadratic elements, the first two results are the nodes (n, 10) and the
+    values (n, 10) of their shape functions. The function runs on the CPU, outside compiled programs.
     """
     X, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     candidates = min(candidates, len(tets))
@@ -249,5 +250,5 @@ def predicted(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Ar
 
 def weighted_differences(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
     """Return predicted minus measured displacements, divided by the standard deviation of the noise, as a flat array (3
-    n,). A component that was not measured is 0."""
+    n,). A component that was not measured gives 0."""
     return ((predicted(data, scene, positions) - data.measured) / data.sd).ravel()

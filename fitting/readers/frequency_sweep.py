@@ -10,10 +10,10 @@ from fitting.readers import raw_torque
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Minimum number of frequencies that must remain if points are left out. A fit of one mode needs this number.
+#: Minimum number of frequencies that must remain if points are ignored. A fit of one mode needs at least this number.
 FEWEST = 3
 #: Given standard deviations are the spread between samples, not noise, if they exceed LARGE times the moduli and also
-#: SHARED times the scatter of the points. If they were noise, the points would scatter as much.
+#: SHARED times the scatter of the points. If these deviations were noise, the points would scatter just as much.
 SHARED, LARGE = 3.0, 0.1
 
 
@@ -33,9 +33,9 @@ class Sweep(NamedTuple):
     )
     friction: np.ndarray | None = None  # (n,) [Pa] change of G'' by one standard deviation of the bearing's friction
     friction_error: float = 0.0  # standard deviation of the bearing's friction [N m s]
-    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] ignored points, at which the instrument dominates
-    sd_estimated: bool = False  # the deviations are only weights, from the scatter of the points
-    sd_before: bool = False  # the deviations are only weights, from the moduli before a correction
+    grey: np.ndarray | None = None  # (k, 3) frequency [rad/s], G', G'' [Pa] of k ignored points (mostly inertia)
+    sd_estimated: bool = False  # True: the sd come from the scatter of the points and are only weights
+    sd_before: bool = False  # True: the sd are those before a correction of the moduli, and are only weights
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +76,8 @@ class Sweep(NamedTuple):
 
 
 def check_sweep(sweep: Sweep) -> None:
-    """Check the values of a sweep that was made in Python. The file readers have separate checks, with line and column.
+    """Check the values of a sweep that was made in Python. The file readers have separate checks, whose messages name
+    line and column.
 
     Raises:
         InputError: a value is invalid; the message names the field, the value and the remedy.
@@ -152,10 +153,10 @@ _FAR, _DEVIATIONS = 0.4, 5.0
 def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return a smooth curve through positive values y (n,) over positive x (n,), for example moduli over frequencies.
 
-    The curve is a spline of the logarithms, smoothed by cross-validation. It is the scale of relative errors. If the
-    measured values were the scale, a point that is low by chance would have more weight than a point that is high. The
-    fit would then be too low by twice the square of the relative noise. A value far above the curve is returned as it
-    is, so that this wrong point does not dominate the fit.
+    The curve is a spline of the logarithms, smoothed by cross-validation. The curve is the scale of relative errors. If
+    the measured values were the scale, a point that is low by chance would have more weight than a point that is high.
+    The fit would then be too low by twice the square of the relative noise. A value far above the curve is returned as
+    it is, so that this wrong point does not dominate the fit.
     """
     return _curve_of_bytes(np.asarray(x, float).tobytes(), np.asarray(y, float).tobytes())
 
@@ -174,13 +175,13 @@ def _curve_of_bytes(*columns: bytes) -> np.ndarray:
     curve = make_smoothing_spline(at[kept], values[kept], counts[kept])(np.log(x))
     off = np.log(y) - curve
     scale = np.where(off > max(_FAR, _DEVIATIONS * 1.4826 * float(np.median(np.abs(off)))), y, np.exp(curve))
-    scale.setflags(write=False)  # the cache gives the same array to the next caller
+    scale.setflags(write=False)  # read-only, because the cache returns the same array again
     return scale
 
 
 def _cells_along(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean x, the mean y and the number of the points (n,) in each cell along x, in ascending order.
-    Neighbouring points on the two sides of a cell border are merged."""
+    """Divide n points (x, y) into narrow cells along x. Return the mean x, the mean y and the number of points of each
+    cell, in ascending order. Neighbouring points on the two sides of a cell border are merged."""
     near = max(_NEAR, float(np.ptp(x)) / _MOST)
     cell = np.round(x / near)
     for _ in range(2):
@@ -231,7 +232,7 @@ def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     if off < _FEW_REPEATS:
         return sd * curve / modulus if off < 0.5 * distance_from_smooth(x, np.log(sd)) else sd
     smooth = curve * np.exp(np.polyval(np.polyfit(x - x.mean(), part, _DEGREE), x - x.mean()))
-    return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # keeps the mean square of the ratio
+    return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # then the mean square of sd / result is 1
 
 
 def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -253,7 +254,7 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
         if limit is None:
             continue
         if not (np.isfinite(limit) and limit > 0):
-            raise InputError(f"--{name}-frequency {limit:g} is no frequency in Hz: give a positive number")
+            raise InputError(f"--{name}-frequency {limit:g} is not a frequency in Hz: give a positive number")
         kept &= side * hertz <= side * limit * (1 + side * 1e-9)
     if kept.all():
         return sweep
@@ -285,8 +286,8 @@ def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> S
 
 
 def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
-    """Return the sweep with only the points whose modulus exceeds the uncertainty of the instrument's inertia. The
-    other points become `grey`.
+    """Return the sweep with only the points whose modulus exceeds the uncertainty of the contribution of the
+    instrument's inertia. The other points become `grey`.
 
     The inertia is found from raw torque and raw angle, with the torque of the sample or its `radius` and `height` [m].
     If these columns do not show the inertia, it is found from the raw phase.

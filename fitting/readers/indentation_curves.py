@@ -30,7 +30,7 @@ _NOT = {"rate", "velocity", "speed", "sd", "std", "error", "modulus"}
 _LARGEST = 1e30
 _FEWEST = 6
 #: A loading ends when the indenter moves back by more than _BACK times the depth range. A hold at the end of the
-#: loading is cut if it contains more than _HELD times all points.
+#: loading is ignored if it contains more than the fraction _HELD of all points.
 _BACK, _HELD = 0.1, 0.15
 #: An offset of the force is subtracted only if the noise is too small to hide a rise by this fraction of the largest
 #: force.
@@ -40,7 +40,7 @@ _FLAT = 0.01
 class IndentationCurve(NamedTuple):
     """The measured loading of an indentation test."""
 
-    depth: np.ndarray  # (n,) [m] of the indenter, from any origin; it grows as the indenter moves in
+    depth: np.ndarray  # (n,) [m] depth of the indenter, from an arbitrary zero; grows as the indenter moves in
     force: np.ndarray  # (n,) [N]
     source: str
     notes: tuple[str, ...] = ()
@@ -88,7 +88,7 @@ def read_indentation(path: str | Path) -> IndentationCurve:
 
 
 def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str]]:
-    """Return the number of points of the first loading, without a hold at its end; and notes."""
+    """Return the number of points of the first loading (a hold at its end does not count), and notes."""
     number, notes = len(depth), []
     back = np.maximum.accumulate(depth) - depth > _BACK * np.ptp(depth)
     end = int(np.argmax(back)) if back.any() else number
@@ -130,7 +130,7 @@ def _points_of_hold(values: np.ndarray) -> int:
     if held <= max(5, _HELD * len(values)):
         return 0
     half = min(held, reached) // 2
-    if half < 2:  # the largest value is at the beginning
+    if half < 2:  # the largest value is reached at the beginning
         return held
     before, within = (np.diff(part.reshape(2, half).mean(axis=1))[0] for part in _both_sides(values, reached, half))
     noise = noise_of_series(values) * np.sqrt(2 / half)  # noise of a difference of two means
@@ -149,11 +149,11 @@ def _margin(values: np.ndarray) -> float:
 
 
 class _PlacedColumn(NamedTuple):
-    """A column of the table."""
+    """The column of depth or force in the table."""
 
-    column: int  # from 0
+    column: int  # index of the column, from 0
     name: str
-    factor: float  # to SI
+    factor: float  # converts the values to SI units
 
 
 def _depth_and_force(lines: list[str], head: int) -> dict[str, _PlacedColumn]:
@@ -187,8 +187,8 @@ def _in_columns(cells: list[str], below: list[str]) -> dict[str, _PlacedColumn]:
 
 
 def _places(cells: list[str], below: list[str], quantity: str) -> list[_PlacedColumn]:
-    """Return the columns of a quantity, best first. Their headings begin with a word of the quantity and have a
-    unit."""
+    """Return the columns of a quantity, best first. The headings of these columns begin with a word of the quantity and
+    have a unit."""
     found, units = [], INDENTATION_UNITS[quantity]
     for j, cell in enumerate(cells):
         words = [w for w in re.split(r"[\s_()\[\]#\"/,]+", cell) if w]
@@ -219,7 +219,7 @@ def _in_si_units(
     numbered = [(k, line) for k, line in enumerate(lines[head + 1 :], head + 2) if line.strip(f"{delimiter} \t")]
     rows = [(k, split_cells(line, delimiter)) for k, line in numbered if not line.lstrip().startswith("#")]
     if rows and means_nothing(rows[0][1][p.column] for p in found.values() if p.column < len(rows[0][1])):
-        rows = rows[1:]  # the line of units
+        rows = rows[1:]  # this row contains the units, not numbers
     sign, kept, empty = decimal_sign(cell for _, cells in rows for cell in cells), [], 0
     for number, cells in rows:
         shown = [cells[p.column] if p.column < len(cells) else "" for p in found.values()]

@@ -100,7 +100,9 @@ def _plain_unit(unit: str) -> str:
 
 
 def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry: float | None) -> SampleShare | None:
-    """Return the inertia that the instrument subtracted. Returns None if the columns do not determine the inertia.
+    """Return the inertia of the instrument and its contribution to the modulus, which the software has subtracted.
+    Returns None if the columns do not determine the inertia, or if its contribution at the highest frequency is below
+    the modulus.
 
     Args:
         omega: (n,) [rad/s].
@@ -120,7 +122,7 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
         return None
     if "phase" in own:
         inertias = (K * g.real - stiffness * np.cos(own["phase"])) / w**2
-    else:  # of two roots, this one holds for frequencies above the resonance
+    else:  # the equation for the inertia has two roots; this root holds above the resonance
         inertias = (K * g.real + np.sqrt(np.maximum(stiffness**2 - (K * g.imag) ** 2, 0))) / w**2
     inertia = _agreed(w, inertias)
     if not inertia * omega[-1] ** 2 > K * np.abs(G[-1]):
@@ -138,8 +140,8 @@ def with_raw_columns(raw: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> SampleShare | None:
-    """Return the inertia from the raw phase alone, without torque and sample size: I omega^2 / K = G' - G'' /
-    tan(phase).
+    """Return the contribution of the instrument's inertia to the modulus, from the raw phase alone, without torque and
+    sample size: I omega^2 / K = G' - G'' / tan(phase).
 
     Returns None if there is no phase, or if the phases at the highest frequencies give different inertias. Also returns
     None if the contribution of the inertia is below the modulus even at the highest frequency.

@@ -98,7 +98,7 @@ def _below_zero(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -
     ]
 
 
-#: Ratio of G' to G'' [1], or of G'' to G', above that of all tissues and most other materials.
+#: In all tissues and most other materials, the ratios G' / G'' and G'' / G' are below this value [1].
 FAR_APART = 100.0
 
 
@@ -135,7 +135,9 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     values = {q: v[good] for q, (_, v) in first.items()}
     omega = values["frequency"]
     if len(np.unique(omega)) < 2:
-        raise InputError(f"{path}: the file has {len(np.unique(omega))} frequency; give at least two different ones")
+        raise InputError(
+            f"{path}: the file has {len(np.unique(omega))} frequency; give at least two different frequencies"
+        )
     values = storage_and_loss(values, notes)
     beside = [(c, written[good]) for c, written in table.beside]
     notes += _contradictions(path, beside, values | {"frequency": omega}, bool(stretched))

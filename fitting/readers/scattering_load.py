@@ -9,8 +9,8 @@ QUIET = 1e-3
 
 
 def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np.ndarray, list[str]]:
-    """Return the imposed strain or stress without scatter, and notes. Their mean replaces the values of a constant
-    load, and a fitted straight line replaces the values of a linear ramp.
+    """Return the imposed strain or stress without scatter, and notes. A constant load is replaced by its mean, and a
+    linear ramp by a fitted straight line. `word`: "strain" or "stress", for the notes.
 
     The model treats the change between two readings as a real step. So it would treat the scatter of a sensor as
     motion.
@@ -22,7 +22,7 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
     near = np.abs(driven - level) <= 5 * noise
     first, told = int(np.argmax(near)), f"the {word} scatters by {100 * noise / size:.2g} % of its largest value"
     share = np.mean(near[first:])
-    if share < 0.5:  # a cyclic load: its third differences look like noise
+    if share < 0.5:  # the load is cyclic: its third differences look like noise
         return driven, []
     # Because of the scatter, a single row of the ramp may be near the level before the ramp ends.
     first = next((int(k) for k in np.flatnonzero(near) if np.mean(near[k:]) >= 0.99), len(near))

@@ -1,5 +1,5 @@
-"""Read relaxation and creep tests from files. A file has the time and a modulus, a compliance, strain and stress, or
-another pair of columns."""
+"""Read relaxation and creep tests from files. A file has a column of time and one of these: a modulus, a compliance, or
+two columns, for example strain and stress."""
 
 import os
 from typing import NamedTuple
@@ -14,8 +14,8 @@ from liverjax.core.errors import InputError
 #: A load below this fraction of the largest load counts as rest: its effect on the response is just as small.
 AT_REST = 0.01
 
-#: Lower bound of the scales of the residuals: noise / RELATIVE; in a cyclic test, at least CYCLIC times the largest
-#: response.
+#: The scales of the residuals have a lower bound: the noise divided by RELATIVE, and in a cyclic test also CYCLIC times
+#: the largest response.
 RELATIVE, CYCLIC = 0.03, 0.1
 
 #: How the load changed where no row shows it. BETWEEN_ROWS: unknown; a linear change between rows is assumed.
@@ -35,14 +35,13 @@ class TimeTest(NamedTuple):
     notes: tuple[str, ...] = ()
     constant_noise: bool = False  # whether the noise of all responses has the same size
     rise: str = BETWEEN_ROWS  # how the load changed where no row shows it
-    described: bool = False  # whether a TOML description names the file
+    described: bool = False  # whether a TOML file describes the test
     offset_error: float = 0.0  # standard error of the subtracted offset of the sensor, in the unit of the response
 
     @property
     def scales(self) -> np.ndarray:
         """Scales of the residuals: the size of each response, with a lower bound for responses below the noise.
-        If the noise is constant, all scales are the median of these sizes.
-        """
+        If the noise is constant, all scales are the median of these sizes."""
         sizes = self._sizes_of_answers()
         return np.full(len(sizes), np.median(sizes)) if self.constant_noise else sizes
 
@@ -68,7 +67,7 @@ class TimeTest(NamedTuple):
         """Time [s] of the last row at rest. Instruments often record for a while before the load."""
         driven = np.abs(self.driven)
         first = int(np.argmax(driven > AT_REST * driven.max()))
-        while first > 0 and driven[first] - driven[first - 1] > 1e-6 * driven.max():  # back to where the rise begins
+        while first > 0 and driven[first] - driven[first - 1] > 1e-6 * driven.max():  # back to the start of the rise
             first -= 1
         return float(self.time[first])
 
@@ -83,7 +82,8 @@ class TimeTest(NamedTuple):
 
     @property
     def answers_at_once(self) -> bool:
-        """Whether a response at the instant of a step is fitted. It determines G0, but no relaxation time."""
+        """Whether a response at the instant of a step is fitted. Such a response determines G0, but no relaxation
+        time."""
         first, second = self.time[self.used][:2] - self.begun
         return bool(first < AT_ONCE * second)
 
@@ -119,7 +119,7 @@ def read_time_test(
         InputError: the file cannot be used; the message names the column or line, the value and the remedy.
     """
     if not (np.isfinite(start) and start >= 0):
-        raise InputError(f"--min-time {start:g} cannot be seconds after the load: give 0 or more")
+        raise InputError(f"--min-time {start:g} must be 0 or more: give the time after the load in seconds")
     columns, notes = read_columns(path)
     time = columns["time"]
     form = next((f for f in FORMS if set(f) <= set(columns)), None)
@@ -194,12 +194,13 @@ def from_rest(
 
     Args:
         time, driven, answer: (n,), see `of_columns`.
-        ramp: duration [s] of a jump of the load between two rows, until the later row; 0 for a step. If the first row
-            is under load, 0 means that this load acted from 0 s on. None: the load is linear between rows.
+        ramp: duration [s] of a jump of the load between two rows. The jump ends at the later row; 0 means a step. If
+            the first row is under load, 0 means that this load acted from 0 s on. None means that the load changes
+            linearly between rows.
         names: name of the file, and name of `ramp`, for messages.
 
     Raises:
-        InputError: `ramp` contradicts the rows: they show how the load rose, or the rise took less time.
+        InputError: `ramp` contradicts the rows: they already show how the load rose, or the rise took less time.
     """
     size, rows = np.abs(driven), _rows_of_jumps(driven)
     loaded = size[0] > AT_REST * np.max(size)
@@ -210,7 +211,7 @@ def from_rest(
             shown = f"the load rose between {time[rows[0] - 1]:.4g} and {time[rows[0]]:.4g} s"
         elif loaded:
             shown = "the rows begin under load, and only 0 (a step at 0 s) is possible there"
-        raise InputError(f"{names[0]}: {names[1]} {ramp:g} cannot be right, since {shown}: remove it")
+        raise InputError(f"{names[0]}: {names[1]} {ramp:g} cannot be right, since {shown}: remove this setting")
     if ramp is not None:
         time, driven, answer = _rows_before_jumps(rows, ramp, time, driven, answer)
     if not time[0] > 0:
@@ -254,8 +255,8 @@ def _rows_of_jumps(driven: np.ndarray) -> np.ndarray:
 
 
 def _rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple:
-    """Return the columns with an added row in each jump, `ramp` [s] before its later row. The added row has the values
-    of the earlier row."""
+    """Return the columns with an added row in each jump, `ramp` [s] before the later row of the jump. The added row has
+    the values of the earlier row."""
     interval = time[rows] - time[rows - 1]
     after = np.append(np.diff(time), np.inf)[rows]
     before = time[rows] - np.clip(ramp, 0.1 * AT_ONCE * np.minimum(interval, after), interval)
@@ -317,7 +318,7 @@ def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: 
     ]
 
 
-#: A quantity counts as constant if its relative standard deviation in the second half is below this [1].
+#: A quantity counts as constant if its relative standard deviation in the second half of the test is below this [1].
 HELD = 0.01
 #: A quantity changes at a constant rate if its standard deviation from a straight line is below this fraction of its
 #: standard deviation.
@@ -341,15 +342,15 @@ def _as_a_step(path, time, modulus, ramp):
     return times, np.minimum(times / ramp, 1.0) if ramp else np.ones(len(times)), answer
 
 
-#: A modulus or compliance may change in the wrong direction by _WRONG_WAY times its largest value, or by _IN_NOISE
-#: standard deviations of its noise.
+#: A modulus may rise, and a compliance may fall, by _WRONG_WAY times its largest value, or by _IN_NOISE standard
+#: deviations of its noise.
 _WRONG_WAY, _IN_NOISE = 0.25, 6.0
 
 
 def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, given: tuple) -> list[str]:
     """Check that a modulus does not rise, and a compliance does not fall, under a constant load. Return notes.
 
-    A running median removes single wrong rows. `given`: ramp [s] and start [s].
+    A running median removes single wrong rows. `given`: duration of the ramp [s], first fitted time [s].
 
     Raises:
         InputError: the check fails; the message has the time and possible causes.
@@ -422,7 +423,7 @@ _RINGS = 0.02
 
 
 def _as_shear(path, form, columns, sample):
-    """Return shear strain, shear stress [Pa], and notes."""
+    """Return shear strain, shear stress [Pa] and notes, from the two columns that `form` names."""
     if form == ("strain", "stress"):
         return columns["strain"], columns["stress"], []
     if sample.radius is None or sample.height is None:
@@ -460,8 +461,8 @@ def _without_offset(test: TimeTest) -> tuple[np.ndarray, float, list[str]]:
 
 
 def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
-    """Return a note if the response at the start of the load is not 0. One or two rows cannot distinguish an offset
-    from noise."""
+    """Return a note if the response at the start of the load is not 0. With only one or two rows before the load, an
+    offset cannot be distinguished from noise."""
     k = int(np.argmax(test.time >= test.begun))
     here, load = float(test.answer[k]), abs(float(test.driven[k])) / float(np.max(np.abs(test.driven)))
     noise = noise_of_series(test.answer[np.isfinite(test.answer) & (test.time > test.begun)])

@@ -18,7 +18,7 @@ TANGENT_UNITS = dict.fromkeys(("", "-", "1", "none"), 1.0)
 VISCOSITY_UNITS = {
     f"{unit}{sign}s": factor for unit, factor in (("Pa", 1.0), ("mPa", 1e-3), ("kPa", 1e3)) for sign in " .·*_-"
 }
-#: Units of the stress in curves.
+#: Units of the stress in stress-stretch curves.
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 _TORQUE = {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6, "nN.m": 1e-9, "nNm": 1e-9}
 #: Units of columns that an instrument writes in addition to the moduli.

@@ -57,8 +57,8 @@ def summary(fit: LawFit) -> Content:
 
 
 def write(out: Path, curves: list[Curve], fits: list[LawFit], structured: Sequence[str] = ()) -> None:
-    """Write curves.json and curves.png into the existing folder `out`. `structured`: warnings about structured misfits
-    (residuals with a pattern that noise does not explain)."""
+    """Write curves.json and curves.png into the existing folder `out`. `structured`: warnings about structured misfits,
+    in which the residuals have a pattern that noise does not explain."""
     ordered = best_first(fits)
     content = {
         "best": ordered[0].label,

@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: If chi^2 per component is above TOO_FAR, the program warns that the model does not explain the data. Below TOO_NEAR,
-#: the stated noise counts as too large. With FEW components, this happens by chance once in a million times.
+#: If chi^2 per component is above TOO_FAR, the program warns that the model does not explain the data. If it is below
+#: TOO_NEAR for FEW components or more, the stated noise counts as too large. With FEW components, a value below
+#: TOO_NEAR occurs by chance once in a million fits.
 TOO_FAR, TOO_NEAR, FEW = 1.5, 0.4, 50
 #: If chi^2 is too large, a mesh error above this many times the noise of the data is reported too.
 MESH = 1.0
@@ -60,7 +61,7 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
     if found.mesh_over_noise is not None and found.mesh_over_noise > MESH:
         said += (
             f"; the mesh's error in the data is {found.mesh_over_noise:.2g} times the noise: refine the mesh, or use "
-            "order = 2 if it is 1 (the mesh bias does not contain the error of a region border inside elements)"
+            "order = 2 if order is 1 (the mesh bias does not contain the error of a region border inside elements)"
         )
     return (
         f"{said}; check the unit (--unit), the origin of the coordinates, node numbers (from 0), rows of zeros, "
@@ -99,7 +100,8 @@ def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
 
 
 def _mapped(mesh: TetMesh, found: Field) -> np.ndarray:
-    """Return the indices of the nodes with a value of the map: those of elements without a value from a [[region]]."""
+    """Return the indices of the nodes with a value of the map: the nodes of all elements whose parameter is not given
+    by a [[region]]."""
     return np.unique(mesh.element_nodes_on_host[:, ~found.given])
 
 
@@ -218,6 +220,6 @@ def table_of_field(mesh: TetMesh, found: Field) -> str:
     rows.append(
         f"{found.name} from {own.min():.4g} to {own.max():.4g}, known to a factor of "
         f"{factors[0]:.3g} to {factors[1]:.3g} (one standard deviation); the data determine "
-        f"{'at least ' if known == len(found.eigenvalues) else ''}{known} directions of the map; {found.seconds:.1f} s"
+        f"{'at least ' if known == len(found.eigenvalues) else ''}{known} combinations of values; {found.seconds:.1f} s"
     )
     return "\n".join(rows)

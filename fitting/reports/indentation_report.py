@@ -28,8 +28,8 @@ _WIDE, _DEEP = 0.4, 0.2
 def write(
     out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit, level: ContactFit | None = None
 ) -> Content:
-    """Write both files and return the JSON. `level`: second fit without a tilt of the base line, if `fit` has a
-    tilt."""
+    """Write both files and return the JSON. `level`: a second fit with a sloping base line (force before contact),
+    which removes a drift of the sensor. It is None if the data show no drift."""
     out.mkdir(parents=True, exist_ok=True)
     G, errors = fit.modulus / (2 * (1 + rig.poisson)), fit.standard_errors
     alone = half_space(rig, curve.depth - fit.contact_point)
@@ -85,7 +85,7 @@ def indentation_warnings(
     if level is not None:
         told.append(
             "the force rises or falls steadily before contact: the sensor drifts, and this changes modulus and "
-            f"contact point. Without a straight line through these points E = {level.modulus:.5g} ± "
+            f"contact point. If a straight line through these points is subtracted, E = {level.modulus:.5g} ± "
             f"{level.standard_errors[0]:.2g} Pa and d0 = {level.contact_point:.5g} ± {level.standard_errors[1]:.2g} m"
         )
     width = np.sqrt(deepest / rig.radius) if rig.shape == "sphere" else 0.0

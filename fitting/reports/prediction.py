@@ -16,7 +16,8 @@ from fitting.readers.time_tests import TimeTest
 
 
 class Prediction(NamedTuple):
-    """A test and its prediction. The values are in the order of `fitting.fits.together.Together.fitted`."""
+    """A test with m measured values, and its prediction. The values are in the order of
+    `fitting.fits.together.Together.fitted`."""
 
     name: str  # sweep, dispersion, relaxation or creep
     source: str
@@ -34,8 +35,8 @@ class Prediction(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """Factor that multiplies the prediction to give the best fit. Another sample or another strain often changes
-        all values by one factor."""
+        """Factor by which the prediction must be multiplied to fit the test best. With another sample or another
+        strain, all values often differ by one factor."""
         y, p = (v[self.inside] / self.scales[self.inside] for v in (self.measured, self.predicted))
         return float(p @ y / (p @ p))
 
@@ -91,6 +92,6 @@ def sentence(found: Prediction) -> str:
         f"{name}: predicted within {off:.2g} % on average; {100 * found.covered:.0f} % of {inside} numbers lie in the "
         f"95 % interval of the prediction"
     )
-    if abs(found.factor - 1) > 0.005 * off:  # one factor explains half of the error
+    if abs(found.factor - 1) > 0.005 * off:  # a common factor explains half of the error or more
         told += f"; {found.factor:.3g} times the prediction would fit the test best"
     return told + (f"; {share - inside} numbers outside the band are not counted" if inside < share else "")

@@ -128,7 +128,7 @@ def warnings(found: Samples) -> list[str]:
     for name, p in found.populations.items():
         own = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
         if name.startswith("strengths["):
-            continue  # no warning: many strengths are zero or not determined
+            continue  # no warning, because many strengths of a spectrum are zero or not determined
         if p is None and "exponent" in name and np.all(np.abs(own - np.round(own[0])) < 1e-3):
             out.append(
                 f"{name}: the value is {np.round(own[0]):g} in all samples, so the springpot is a spring or dashpot"
@@ -157,7 +157,10 @@ def warnings(found: Samples) -> list[str]:
         )
     failed = [Path(s.source).name for f, s in _pairs(found) if not f.converged]
     if failed:
-        out.append(f"the fit of {', '.join(failed)} did not converge; its best point is given: try fewer modes")
+        out.append(
+            f"the fit of {', '.join(failed)} did not converge, and the parameters with the smallest "
+            "misfit so far are given: try fewer modes"
+        )
     for words, told in COUNTED:
         count = sum(any(words in w for w in f.warnings) for f in found.fits)
         if count:
@@ -206,7 +209,8 @@ def table(found: Samples) -> str:
         middle, new = ends
         rows.append(f"{label:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
     every = [found.values(k) for k in range(len(found.fits))]
-    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # present in most samples
+    # `name`: the parameter that is present in most samples.
+    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))
     rows.append(f"{'sample':32s} {'mean error':>10s}   {labels[name]}")
     for (fit, sweep), own in zip(_pairs(found), every, strict=True):
         value, error = own[name]

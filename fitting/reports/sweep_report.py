@@ -122,8 +122,8 @@ def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | No
 
 
 def band_sensitivity(fit: Fit) -> Content:
-    """Return the changes of the parameters if an end of the band is left out, with the names of `standard_errors`. An
-    entry is None if too few points were left."""
+    """Return the changes of the parameters if one end of the band is ignored, with the names of `standard_errors`. An
+    entry is None if too few points remained for a fit."""
     changes = fit.details.get("band_sensitivity", {})
     return {part: None if found is None else by_stem(found) for part, found in changes.items()}
 
@@ -141,7 +141,7 @@ def by_stem(flat: dict[str, float]) -> Content:
 
 
 def own_numbers(p: Estimate | None, kind: Kind) -> Content:
-    """Return the parameters of a model that is not made of modes, for fit.json."""
+    """Return the parameters of a model that is not made of Prony modes, for fit.json (empty if `p` is None)."""
     if p is None:
         return {}
     rows = zip(p.names, p.values, p.standard_errors, kind.units, strict=True)
@@ -196,7 +196,7 @@ def write(
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
         content["largest_shift_over_standard_error"] = largest_shift(*fits)
-    if profile is not None:  # the profile always belongs to the closed form
+    if profile is not None:  # the profile intervals always belong to the closed-form fit
         content.get("closed_form", content)["profile_intervals_95"] = profile
     if posterior is not None:
         content["posterior"] = posterior_report.summary(posterior)
@@ -251,7 +251,7 @@ def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
     draw_time_constants(times, sweep, fits)
     table.axis("off")
     text = table.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=table.transAxes)
-    text.set_in_layout(False)  # its axes are as large as the text
+    text.set_in_layout(False)  # the height of these axes was already computed from the text
     seconds = f"{fit.run_time:.2g} s run, {fit.compile_time:.2g} s compile"
     plural = "s" if fit.modes > 1 else ""
     mean = 100 * fit.relative_errors(sweep).mean()
@@ -262,7 +262,8 @@ def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
 
 
 def _nearest_of_all(fits: list[Fit]) -> str:
-    """Return a second line for the title: the smallest misfit that a linear material of any spectrum can have."""
+    """Return a second line for the title: the smallest misfit that a linear material of any spectrum can have. The
+    string is empty if this misfit is unknown."""
     misfit = fits[0].details.get("consistency", {}).get("kramers_kronig_misfit")
     if misfit is None:
         return ""
@@ -310,8 +311,8 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
 
 
 def _bands(closed: Fit, sweep: Sweep) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return the ends of the 95 % intervals of G' and G'' at the measured frequencies; empty for a compressed
-    sample."""
+    """Return the ends of the 95 % intervals of G' and G'' at the measured frequencies. The result is empty for a
+    compressed sample."""
     if "precompression" in closed.details:
         return {}
     found = moduli_errors.fitted_moduli(closed, sweep.angular_frequency, sweep.noise_given)
@@ -397,7 +398,7 @@ def _parameter_rows(fit: Fit) -> list[str]:
         places = ((1 + k, f"ratios[{k}]"), (1 + n + k, f"relaxation_times[{k}]"))
         ratio, time = (f"{u.values[j]:.4g} ± {u.standard_errors[j]:.2g}{mark(name)}" for j, name in places)
         rows.append(f"{k + 1:4d} {ratio:>20s} {time:>22s}".rstrip())
-    return [*rows, "* ends of the band decide it"] if decided else rows
+    return [*rows, "* depends on the ends of the band"] if decided else rows
 
 
 def _lines(fit: Fit) -> list[str]:
@@ -424,7 +425,7 @@ def _lines(fit: Fit) -> list[str]:
 
 
 def table(sweep: Sweep, fits: list[Fit]) -> str:
-    """Return a table of parameters ± standard error, side by side for every method; errors and times below."""
+    """Return a table with one column for each method: parameters ± standard error, then misfits and run times."""
     columns = []
     for fit in fits:
         errors = fit.relative_errors(sweep)

@@ -88,7 +88,7 @@ def _total_errors(found: Together, relative: float) -> Content:
 
 
 def _waves(found: Together) -> Content:
-    """Return shear waves over the band of all tests, at four frequencies per decade."""
+    """Return speed and attenuation of shear waves over the band of all tests, at four frequencies per decade."""
     high, low = 1 / min(t.resolved[0] for t in found.tests), 1 / max(t.resolved[1] for t in found.tests)
     omega = np.geomspace(low, high, max(2, 1 + int(4 * np.log10(high / low))))
     density = next((t.density for t in found.tests if isinstance(t, Dispersion)), None)
@@ -134,8 +134,8 @@ def _largest(found: Together) -> list[float]:
 
 
 def table(found: Together, relative: float) -> str:
-    """Return a table of parameters ± standard error, the errors of fits without each test, and the total error of the
-    first parameter."""
+    """Return a table of parameters ± standard error, the standard errors of fits that omit one test each, and the total
+    error of the first parameter."""
     u, n, own = found.uncertainty, found.modes, found.parameters
     heads = [f"without {k}" for k in range(1, len(found.shares) + 1)]
     rows = [f"{k}: {s.name}, {s.points} numbers, {Path(s.source).name}" for k, s in enumerate(found.shares, 1)]

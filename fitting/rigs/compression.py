@@ -52,8 +52,8 @@ def check_strain(strain: float) -> None:
 
 
 def shares(law: Law, strain: float) -> Shares:
-    """Return the factors of a sample that is compressed by `strain` between frictionless plates (formula at the top of
-    this file).
+    """Return the reported moduli, divided by the moduli of the uncompressed sample, for a sample that is compressed by
+    `strain` between frictionless plates (formula at the top of this file).
 
     Raises:
         InputError: the law is not isotropic, or it does not resist the compression.

@@ -47,8 +47,8 @@ _GLUED, _LAYER = 0.4995, 0.5
 #: Displacements, divided by the largest displacement, at which glued samples are simulated. Above the strain _LARGE,
 #: the finer grid is used.
 _GRID, _FINER_GRID, _LARGE = (0.05, 0.5, 1.0), (0.05, 0.25, 0.5, 0.75, 1.0), 0.1
-#: Sizes of the cells at the rims of the plates, divided by the shortest length there. They are tried in this order,
-#: because small cells invert at large compression.
+#: Sizes of the cells at the rims of the plates, divided by the shortest length there. The simulation is tried with the
+#: small cells first. They are more accurate, but may invert at large compression.
 _RIMS = (0.04, 0.1, 0.2)
 #: An indenter counts as going back if its depth falls by more than both _BACK times the largest depth and _SCATTERS
 #: times the scatter of the depth.
@@ -77,15 +77,17 @@ class Described(NamedTuple):
 
 
 def read_described(path: str | Path) -> TimeTest:
-    """Read the described test and convert it to a test in shear, with the strain f(d)/S and the stress F/S. The area S
-    is chosen so that a small strain (for sphere and cone: the largest strain) is d divided by a length of the sample.
+    """Read the described test and convert it to a test in shear, with the strain f(d)/S and the stress F/S. F is the
+    measured force. The area S is chosen so that a small strain (for sphere and cone: the largest strain) is d divided
+    by a length of the sample.
 
     Args:
         path: TOML file with the keys test, data (file with a table of time, displacement and force), and the sizes in
             metres that the test needs. The keys drive, poisson, min_time and ramp (only 0) are optional.
 
     Raises:
-        InputError: one sentence with the file, the key, the value and the remedy.
+        InputError: the description or its data cannot be used. The message names the file, the key, the value and the
+            remedy.
     """
     path = Path(path)
     described = _description(path)
@@ -121,7 +123,8 @@ def read_described(path: str | Path) -> TimeTest:
         time, d, force, told = time[:kept], d[:kept], force[:kept], [*told, *told_of_way]
     if described.test in ("sphere", "cone") and described.drive == "displacement":
         time, d, force = _with_more_between(time, d, force)
-    moved = sign * d if "height" in described.sizes else np.maximum(sign * d, 0.0)  # no force without contact
+    # Without contact, an indenter has no force.
+    moved = sign * d if "height" in described.sizes else np.maximum(sign * d, 0.0)
     strain, stress = curve_of(curve, moved) / section, sign * force / section
     kind = _KINDS[described.drive]
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
@@ -131,9 +134,8 @@ def read_described(path: str | Path) -> TimeTest:
 
 
 def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list[str]]:
-    """Return the number of rows before the indenter goes back, and a note if it does. While the contact shrinks, the
-    force follows another formula (Ting 1966, J. Appl. Mech. 33:845).
-    """
+    """Return the number of rows before the indenter goes back, and a note if the indenter goes back. While the contact
+    shrinks, the force follows another formula (Ting 1966, J. Appl. Mech. 33:845)."""
     depth = scipy.ndimage.median_filter(np.maximum(depth, 0.0), 5, mode="nearest")  # ignores single low values
     scatter = 1.4826 * float(np.median(np.abs(np.diff(depth, 2)))) / np.sqrt(6) if len(depth) > 2 else 0.0
     fall = np.maximum.accumulate(depth) - depth
@@ -148,8 +150,8 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
 
 
 def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the rows, with additional rows between them that have no force (NaN). They are needed because between two
-    measured rows d is linear in time, but f(d) is not."""
+    """Return the rows, with additional rows between them that have no force (NaN). The additional rows are needed
+    because d is linear in time between two measured rows, but f(d) is not."""
     parts = int(np.clip(_MOST_ROWS // len(time), 1, 8))
     place = np.arange((len(time) - 1) * parts + 1) / parts
     rows = np.arange(len(time))
@@ -159,7 +161,8 @@ def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tu
 
 
 def curve_of(curve: Callable[[float], float], d: np.ndarray) -> np.ndarray:
-    """Return f (n,) [m^2] at displacements d (n,) [m]. For d < 0, f is continued linearly."""
+    """Return the elastic force per unit shear modulus f(d) (n,) [m^2] at displacements d (n,) [m]. For d < 0, f is
+    continued linearly."""
     grid = np.linspace(0.0, max(float(d.max()), 0.0), 400)
     values = np.array([0.0, *(curve(each) for each in grid[1:])])
     below = curve(grid[1]) / grid[1] * np.minimum(d, 0.0)
@@ -200,11 +203,14 @@ def _description(path: Path) -> Described:
         raise InputError(f"{path}: drive = {drive!r} is not known: use displacement or force")
     first = _number_of(path, "min_time", table.get("min_time", 0.0))
     if first < 0:
-        raise InputError(f"{path}: min_time = {first:g} cannot be seconds after the load: give 0 or more")
+        raise InputError(
+            f"{path}: min_time = {first:g} is negative: give the time after the load in seconds, 0 or more"
+        )
     ramp = table.get("ramp")
     if ramp is not None and _number_of(path, "ramp", ramp) != 0:
         raise InputError(
-            f"{path}: ramp = {ramp} cannot be used: remove ramp, or give 0 for a step whose rise no row shows"
+            f"{path}: ramp = {ramp} cannot be used: remove ramp, or give ramp = 0 if the load was a step and no row "
+            "shows its rise"
         )
     return Described(test, path.parent / table["data"], sizes, poisson, drive, first, ramp is not None)
 
@@ -230,15 +236,15 @@ def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[
     )
     layer, per_shear = thin_layer.Layer(indenter), 2 * (1 + described.poisson)
     layer.force(np.array([largest]))  # raises InputError for depths beyond the table
-    said = "the contact begins where displacement is 0, without adhesion"
+    said = "the contact is assumed to begin at displacement 0, without adhesion"
     if described.test != "punch":
-        said += ", and grows until the largest displacement"
+        said += ", and to grow until the largest displacement"
     return (lambda d: per_shear * float(layer.force(np.array([d]))[0])), sizes["thickness"], [said]
 
 
 def _glued_curve(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
     """Compute f(d) by finite elements, corrected for the error of the mesh. Returns the same three values as
-    `_elastic`."""
+    `_elastic`: f, the length that divides d, and notes."""
     sizes, way = described.sizes, 1.0 if described.test == "tension" else -1.0
     radius, height = sizes["radius"], sizes["height"]
     if largest >= 0.5 * height:
@@ -250,7 +256,7 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
         raise InputError(
             f"{path}: height = {height:g} m is {height / radius:.3g} radii, but glued samples are computed only up to "
             f"{_SLENDER:g} radii. The glued ends of such a slender sample hardly matter: give a table of strain and "
-            f"shear stress instead (tensile stress / {2 * (1 + described.poisson):.4g}, that is 2 times 1 + poisson)"
+            f"shear stress instead (tensile stress divided by 2 (1 + poisson) = {2 * (1 + described.poisson):.4g})"
         )
     at = largest * np.array(_GRID if largest <= _LARGE * height else _FINER_GRID)
     nu = described.poisson

@@ -35,14 +35,15 @@ SHAPES, STIFFEST = (0.2, 5.0), {"mixed": 1e4, "element": 20.0}
 
 
 class Cells(NamedTuple):
-    """The mesh of a rig. Results of the default mesh are within 1 % of converged results (experiments/TABLES.md)."""
+    """Sizes and kind of the elements of a rig's mesh. Results of the default mesh are within 1 % of converged results
+    (experiments/TABLES.md)."""
 
     size: float | None = None  # [m] length of all cells of a whole cylinder; None: a graded sector
     # In a sector: cell size at the rim of a plate, divided by the shortest dimension of the sample at this rim (radius,
     # half the height, …).
     rim: float = 0.04
     edge: float = 0.02  # in a sector: cell size at the edge of a punch, divided by the shortest dimension at this edge
-    largest: float = 0.34  # in a sector: longest cells, divided by the radius; twice as long along the axis
+    largest: float = 0.34  # in a sector: longest cells, divided by the radius; along the axis, twice this length
     growth: float = cylinders.GROWTH  # increase of the cell length per distance from rims and edge
     corners: int = 24  # corners of the polygon that replaces the circle; a sector has one of its edges
     order: int = 2  # order of the elements
@@ -72,7 +73,7 @@ class _Sample(NamedTuple):
 
 
 def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]:
-    """Run the rig and return its reading (T,) [N] or [m] and the status code (T,) of every step.
+    """Run the rig and return, for each of its T steps, the reading (T,) [N] or [m] and the status code (T,).
 
     Raises:
         InputError: the law is not isotropic, but the mesh is a sector, which needs symmetry around the axis.
@@ -133,12 +134,12 @@ def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
 
 
 def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size: float | Cells | None = None) -> Rig:
-    """Return the rig of a cylinder that is pulled (or pressed) between glued plates. The force is read.
+    """Return the rig of a cylinder that is pulled (or pressed) between glued plates. Its reading is the force [N].
 
     Args:
         radius, height: size of the sample [m].
         dt: time step [s].
-        strains: nominal strain at the end of every step (T,).
+        strains: nominal strain (T,) at the end of each of T steps.
         cell_size: `Cells`, or the edge length [m] of a mesh of the whole cylinder with cells of one size. Default: a
             graded sector.
 
@@ -157,9 +158,11 @@ def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size
 def indentation(
     radius: float, height: float, punch: float, dt: float, depths: Numbers, cell_size: float | Cells | None = None
 ) -> Rig:
-    """Return the rig of a cylinder with a glued flat punch of radius `punch` [m]. Its force is read.
+    """Return the rig of a cylinder with a glued flat punch of radius `punch` [m]. Its reading is the force [N] of the
+    punch.
 
-    The punch is pressed into the cylinder by `depths` (T,) [m]. At a negative depth, the punch pulls.
+    At the end of each of T steps, the punch is pressed into the cylinder by `depths` (T,) [m]. At a negative depth, the
+    punch pulls.
 
     Args:
         radius, height, dt, cell_size: see `tension`. A ring of nodes lies at the edge of the punch.
@@ -177,7 +180,7 @@ def indentation(
     if not NARROWEST * radius <= punch <= (1 - NARROWEST) * radius:
         raise InputError(
             f"punch = {punch:g} m must be between {NARROWEST:g} and {1 - NARROWEST:g} times the radius {radius:g} m: "
-            "change one of them"
+            "change the punch or the radius"
         )
     edge = cells.edge * min(punch, radius - punch, height)
     rings = {punch: edge, radius: cells.rim * min(radius - punch, height)}
@@ -190,8 +193,8 @@ def creep(
 ) -> Rig:
     """Return the rig of a cylinder with a constant tensile stress `stress` [Pa] on its top from time 0 on.
 
-    The stress rises during the first step, as in a rheometer. The mean displacement of the top, weighted with the area,
-    is read.
+    The stress rises during the first step, as in a rheometer. The reading is the mean displacement [m] of the top,
+    weighted with the area.
 
     Raises:
         InputError: a length or a time is not positive, there are no steps, or the stress is not finite.

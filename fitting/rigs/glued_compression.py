@@ -2,9 +2,9 @@
 too coarse.
 
 The sample is glued, so it bulges, and the stresses at the rims of the plates are infinite. In this state, the linear
-elements of the torsion rig are 20 % too stiff; in pure torsion they are only a few percent too stiff. So factors and
-force are computed with quadratic elements on the mesh of a quarter cylinder that is fine at the rims. This is done once
-for each law and strain.
+elements of the torsion rig are 20 % too stiff; in pure torsion they are only a few percent too stiff. So the factors R
+and S (see below) and the force of the compression are computed with quadratic elements on the mesh of a quarter
+cylinder that is fine at the rims. This is done once for each law and strain.
 
 At each frequency, the stress of the sample relaxes by the factor m = G*/G0; after a long time it relaxes by m_inf. Then
 the measured modulus is G0 (R m + S m_inf). The factors R and S come from two harmonic solutions about the compressed
@@ -85,14 +85,14 @@ def _quarter(radius: float, height: float, rim: float, coarser: float) -> lj.Tet
 
 
 def _wider(places: np.ndarray, factor: float) -> np.ndarray:
-    """Move positions that begin at 0: the position next to 0 gets `factor` times its distance from 0; the last one
-    stays."""
+    """Move positions that begin at 0: the position next to 0 gets `factor` times its distance from 0, and the last
+    position does not move."""
     end = places[-1]
     return end * (places / end) ** (1 + np.log(factor) / np.log(places[1] / end))
 
 
 def _on_mesh(mesh: lj.TetMesh, radius: float, law: Law, strain: float) -> Glued | None:
-    """Return factors and force from one mesh. Returns None if the run fails."""
+    """Return the factors R and S and the force from one mesh. Returns None if the run fails."""
     sets = {name: np.asarray(nodes) for name, nodes in mesh.node_sets.items()}
     bottom, top = sets["bottom"], sets["top"]
     # Nodes of the planes y = 0 and x = 0 between the plates, without the axis.
@@ -121,8 +121,8 @@ def _on_mesh(mesh: lj.TetMesh, radius: float, law: Law, strain: float) -> Glued 
     size = 2 * height * (1 - strain) / (np.pi * radius**4) / float(np.asarray(law.shear_modulus()))
 
     def seen(stands: float) -> float:
-        """Return R + S stands: the measured modulus before relaxation (m = 1), divided by G0. Returns NaN if there is
-        no solution."""
+        """Return R + S `stands`: the measured modulus before relaxation (m = 1), divided by G0. `stands` is m_inf.
+        Returns NaN if there is no solution."""
         prony = lj.Prony(ratios=jnp.array([1 - stands]), relaxation_times=jnp.array([1.0]))
         moved = lj.harmonic(replace(turned, viscosity=prony), [1.0], jnp.ones(1, complex), x, turn)
         on_plate, at = 4 * np.asarray(moved.reactions[0].real)[top], np.asarray(x)[top]

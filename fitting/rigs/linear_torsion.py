@@ -26,8 +26,8 @@ from liverjax.tensors.matrices import deformation_gradient, matmul
 
 
 def rest_stiffness(rig: Rig, law: Law) -> jax.Array:
-    """Return the elastic tangent stiffness at rest in the coordinates of the rig (see `plates`), a dense matrix (n, n)
-    [N/m]."""
+    """Return the elastic tangent stiffness at rest, a dense matrix (n, n) [N/m] for the n coordinates of the rig (see
+    `plates`)."""
     mesh = rig.mesh
     V = mesh.points.shape[0]
     dofs = (3 * mesh.tetrahedra[:, :, None] + jnp.arange(3)[None, None]).reshape(-1, 12)
@@ -46,8 +46,8 @@ def rest_stiffness(rig: Rig, law: Law) -> jax.Array:
 
 
 class Response(NamedTuple):
-    """Linear response of the rig when the plate turns by a unit arc length (radius times angle). Values may be
-    complex."""
+    """Linear response of the rig (n coordinates) when the plate turns by a unit arc length (radius times angle). Values
+    may be complex."""
 
     shape: jax.Array  # (n,) coordinates of the rig; the last entry is 1
     stiffness: jax.Array  # force per arc length [N/m]
@@ -76,8 +76,8 @@ def geometry_factor(rig: Rig, law: Law) -> jax.Array:
 
 
 class Vibrations(NamedTuple):
-    """Vibration modes of the elastic rig: K v = value M v, with vectors of unit modal mass. They are not
-    differentiated."""
+    """Vibration modes of the elastic rig: K v = value M v, with the stiffness K, the lumped masses M and vectors v of
+    unit modal mass. Derivatives do not pass through the modes."""
 
     values: jax.Array  # (n,) [1/s^2]
     vectors: jax.Array  # (n, n) [kg^-1/2]
@@ -88,21 +88,21 @@ class Vibrations(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """Matrices of the linearised rig that serve for all frequencies."""
+    """Matrices of the linearised rig with n coordinates. They are the same for all frequencies."""
 
     inverse: jax.Array  # inverse of the stiffness (n, n) for motions too fast for relaxation
-    relaxing: jax.Array | None  # (n, n) relaxing part of the stiffness; None: the whole stress relaxes
-    standing: jax.Array | None  # (n, n) part of the stiffness that does not relax; None: the whole stress relaxes
+    relaxing: jax.Array | None  # (n, n) [N/m] relaxing part of the stiffness; None: the whole stress relaxes
+    standing: jax.Array | None  # (n, n) [N/m] part that does not relax; None: the whole stress relaxes
     held: "Held | None" = None  # the compressed sample; None: not compressed
     stands: Number = 1.0  # fraction of the stress that does not relax
     mass: jax.Array | None = None  # (n,) [kg] for each coordinate; None: no inertia
-    elastic: jax.Array | None = None  # (n, n) [N/m] elastic stiffness, only with inertia
-    modes: Vibrations | None = None  # only with inertia
+    elastic: jax.Array | None = None  # (n, n) [N/m] elastic stiffness; None: no inertia
+    modes: Vibrations | None = None  # vibration modes; None: no inertia
 
 
 def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
-    """Return the stiffness of the rig and its inverse, which serve for all frequencies. With inertia, also return the
-    masses and the vibration modes."""
+    """Return the stiffness of the rig and its inverse, which are the same for all frequencies. If the rig has a
+    density, also return the masses and the vibration modes."""
     rest = _without_inertia(rig, law, prony)
     if rig.density is None:
         return rest
@@ -142,8 +142,8 @@ def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
     """Return two parts (n, n) [N/m] of the stiffness of a compressed sample. The first comes from changes of the
     stress, the second from the constant stress of the compression (geometric stiffness).
 
-    A motion only rotates a stress S that has been constant for a long time. The second part is computed with S before
-    relaxation.
+    A small motion only rotates a stress S that has been constant for a long time. The second part is computed with the
+    value of S before relaxation.
     """
     mesh = rig.mesh
     rest = jnp.zeros(number_of_coordinates(rig), mesh.points.dtype)
@@ -186,7 +186,7 @@ def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -
 
     In this limit, the rig is linear, and dividing by the bias removes the error of the mesh. So the moduli depend
     neither on the mesh nor on the plates. Up to an error of the order of the strain, their derivatives with respect to
-    the parameters equal the derivatives of `torsion.moduli`. So the simulation need not be differentiated. Inertia is
+    the parameters equal the derivatives of `torsion.moduli`. So no derivatives of the simulation are needed. Inertia is
     not included.
 
     Args:
@@ -227,8 +227,8 @@ def held(rig: Rig, law: Law) -> Held:
 
 
 def moving_response(rest: Linearised, modulus: Number, square: Number) -> Response:
-    """Return the response in a steady cycle with inertia (without inertia: `steady_response`). Accelerations are
-    -`square` [1/s^2] times displacements."""
+    """Return the response in a steady cycle with inertia (without inertia: see `steady_response`). The relaxing stress
+    is `modulus` (complex) times the elastic stress; accelerations are -`square` [1/s^2] times displacements."""
     assert rest.mass is not None and rest.elastic is not None and rest.modes is not None
     mass, modes, elastic = rest.mass, rest.modes, rest.elastic
     unit = jnp.zeros(len(mass), complex).at[-1].set(1.0)

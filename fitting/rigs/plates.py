@@ -121,15 +121,15 @@ def work_conjugates(rig: Rig, x: jax.Array, f: jax.Array) -> tuple[jax.Array, ja
 
 
 def coordinates(rig: Rig, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Split the full vector q of coordinates into (u, lift, angle) [m, m, rad]."""
+    """Split the vector q of all coordinates into displacements u [m], lift [m] and angle [rad]."""
     if rig.free_height:
         return q[:-2], q[-2], q[-1] / rig.radius
     return q[:-1], jnp.zeros((), q.dtype), q[-1] / rig.radius
 
 
 def packed(rig: Rig, u: jax.Array, axial: jax.Array, arc: jax.Array) -> jax.Array:
-    """Join u, lift (`axial`) and arc into the full vector of coordinates; or join the forces that are conjugate to
-    them."""
+    """Join displacements u, lift (`axial`) and arc into the vector of all coordinates. Or join the three forces that
+    are work-conjugate to these coordinates."""
     return jnp.concatenate([u, axial[None], arc[None]] if rig.free_height else [u, arc[None]])
 
 

@@ -21,6 +21,7 @@ from liverjax.core.errors import InputError
 WIDEST = 8.0
 #: Above this eta, 1 - K(eta) is below 1e-13 (it falls as eta^2 exp(-2 eta)).
 _LAST_WAVE = 20.0
+#: Numbers of Gauss points over eta and over the contact radius, and of rows of the table.
 _WAVES, _POINTS, _ROWS = 160, 48, 48
 
 
@@ -63,7 +64,7 @@ def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
 
 
 def factors(poisson: float, shape: str) -> Factors:
-    """Compute the table for a sphere or a cone, for contact radii from 0 to 8 times the thickness.
+    """Compute the table of force factors for a sphere or a cone, for contact radii from 0 to 8 times the thickness.
 
     Args:
         poisson: 0 to 0.5.
@@ -103,11 +104,13 @@ def check_indenter(rig: Indenter) -> None:
     for name in ("thickness",) if rig.shape == "cone" else ("thickness", "radius"):
         value = getattr(rig, name)
         if not 0 < value < np.inf:
-            raise InputError(f"{name} = {value} of the indentation must be above 0: give it in m")
+            raise InputError(f"{name} = {value} of the indenter or layer must be above 0: give a length in metres")
     if not 0 <= rig.poisson <= 0.5:
         raise InputError(f"poisson = {rig.poisson} must be from 0 to 0.5: give 0.5 for an incompressible layer")
     if rig.shape == "cone" and not 0 < rig.half_angle < 90:
-        raise InputError(f"half_angle = {rig.half_angle} of the cone must be between 0 and 90: give it in degrees")
+        raise InputError(
+            f"half_angle = {rig.half_angle} of the cone must be between 0 and 90: give the angle in degrees"
+        )
     if rig.shape == "punch" and rig.radius > WIDEST * rig.thickness:
         raise InputError(
             f"radius = {rig.radius} m of the punch is over {WIDEST:g} times the thickness: use a smaller punch"
@@ -115,7 +118,7 @@ def check_indenter(rig: Indenter) -> None:
 
 
 class Layer:
-    """Force of an indenter on its layer. The table is computed once.
+    """Force of an indenter on its layer. The table of forces is computed once, when the object is made.
 
     Raises:
         InputError: the indenter cannot be computed, or a depth is beyond `deepest`.

@@ -175,7 +175,7 @@ class _Cycle(NamedTuple):
     steady: Response
     arc: Number | complex  # amplitude of the last coordinate [m]
     precondition: Callable[[jax.Array], jax.Array]  # approximate inverse of the tangent matrix of the unknowns
-    twist: Number = 0.0  # [N] torque / radius of an unloaded compressed mesh, which is not quite symmetric; subtracted
+    twist: Number = 0.0  # [N] torque / radius at angle 0, subtracted: a compressed mesh is not quite symmetric
 
     def at(self, omega: Number, t: Number) -> jax.Array:
         """Coordinates at time t [s]."""
@@ -214,8 +214,8 @@ def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
 
 
 def _preconditioner(o: _Oscillation, rest: Linearised) -> Callable[[jax.Array], jax.Array]:
-    """Return an approximate inverse of the tangent matrix of a step: the inverse of the elastic stiffness, to which
-    Newmark's masses are added if there is inertia."""
+    """Return an approximate inverse of the tangent matrix of a time step: the inverse of the elastic stiffness. If
+    there is inertia, the masses times 4 / dt^2 (Newmark's method) are added to the stiffness."""
     if rest.modes is None:
         inverse = jax.lax.stop_gradient(rest.inverse if o.by_torque else _without_last(rest.inverse))
         return lambda r: inverse @ r
@@ -310,7 +310,7 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[
     if prony is not None and on_cycle:
         _, slope = jax.linearize(S, jnp.zeros_like(q))
         S_shape = slope(jnp.real(shape)) * arc
-        # A real shape needs one derivative only. The other derivative is a fifth of the compiled program.
+        # A real shape needs only the first derivative. The second one would be a fifth of the compiled program.
         if jnp.iscomplexobj(shape):
             S_shape += slope(jnp.imag(shape)) * 1j * arc
         ratios = viscosity.complex_ratios(prony, o.omega, o.dt)

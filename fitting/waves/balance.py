@@ -61,7 +61,7 @@ FREE, TYPICAL = 1e4, 3000.0
 def _columns_of(band: np.ndarray, a: int, b: int) -> np.ndarray:
     """Return columns a to b of a lower triangle stored by diagonals, from row a to the last nonzero row."""
     bands, size = len(band), b - a
-    out = np.zeros((size, size + bands - 1), band.dtype)  # transposed
+    out = np.zeros((size, size + bands - 1), band.dtype)  # the result, transposed
     diagonals = np.lib.stride_tricks.as_strided(
         out, (size, bands), ((out.shape[1] + 1) * out.itemsize, out.itemsize), writeable=True
     )
@@ -84,7 +84,7 @@ class Balanced(NamedTuple):
         return self._replace(multipliers=self.multipliers[rows], factor=self.factor[:, rows])
 
     def whitened(self, columns: scipy.sparse.csc_array, kind: type = np.complex128) -> np.ndarray:
-        """Return the whitened columns L^-1 `columns` (I, k). For two columns a and b, the scalar product of the
+        """Return the k whitened columns L^-1 `columns` (I, k). For two columns a and b, the scalar product of the
         whitened columns is a^H S^-1 b."""
         left, (bands, n) = columns.astype(kind).toarray(), self.factor.shape
         for a in range(0, n, bands):
@@ -157,8 +157,8 @@ def by_part_and_slice(voxel: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 
 def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy.sparse.csr_array:
-    """Return B (I, P): integrals of the linear shape function of each corner times the divergence of the quadratic
-    shape function of each inner node."""
+    """Return B (I, P) for P pressures at the corners: integrals of the linear shape function of each corner times the
+    divergence of the quadratic shape function of each inner node."""
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
     gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3) of linear shape functions
     second = (1 + np.eye(4)) / 20  # integrals of the products of two linear functions, divided by the volume
@@ -203,11 +203,11 @@ def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float)
 def likeliest(
     C: scipy.sparse.csr_array, B: np.ndarray, d: np.ndarray, sd: float, spread: np.ndarray | None = None
 ) -> Balanced:
-    """Compute the most probable motion (U,) that fulfils the force balance with the matrix C (I, U).
+    """Compute the most probable motion (U,) of U unknowns that fulfils the I equations of the force balance.
 
     Args:
-        C: matrix of the force balance.
-        B: covariance of the forces of the pressures, stored by diagonals.
+        C: matrix (I, U) of the force balance.
+        B: covariance g B B^H of the forces of the pressures, its lower triangle stored by diagonals.
         d: measured motion (U,) [m]; 0 where it was not measured.
         sd: standard deviation of real and imaginary part of one component [m].
         spread: variance (U,) of the difference between each unknown and d, divided by sd^2; None: 1.

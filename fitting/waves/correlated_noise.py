@@ -1,4 +1,4 @@
-"""Noise that is correlated between neighbouring voxels. Estimate how much larger the errors of moduli are than for
+"""Estimate how much noise that is correlated between neighbouring voxels enlarges the errors of moduli, compared with
 white noise.
 
 Scanners and filters smooth the data, so the noise of neighbouring voxels is correlated. Then the data contain fewer
@@ -26,7 +26,7 @@ import scipy.sparse
 from fitting.waves.balance import Balanced
 
 #: WIDTHS: standard deviations [voxels] of the Gaussian filters that are tried. DRAWS: number of random draws for each
-#: width if the body has `SMALL` voxels. REACH: half length of a filter [voxels].
+#: width if the body has SMALL voxels (fewer in a larger body). REACH: half length of a filter [voxels].
 WIDTHS = (0.0, 0.35, 0.45, 0.55, 0.65, 0.75, 0.9, 1.1, 1.4, 1.8)
 DRAWS, SMALL, REACH = 6, 1500, 6
 #: The noise is regarded as correlated if the correlation of neighbouring residuals exceeds the correlation for white
@@ -39,11 +39,12 @@ class Correlation(NamedTuple):
 
     beyond: float  # largest correlation of neighbours along an axis, minus the correlation for white noise
     seen: bool  # whether this difference is larger than expected from white noise
-    enlarged: np.ndarray  # (R,) error of each modulus / its error for white noise (with the given sd if `seen`)
+    enlarged: np.ndarray  # (R,) error of each modulus, divided by that for white noise (with the given sd if `seen`)
 
 
 class _Projection(NamedTuple):
-    """The matrix C of the force balance, the most probable motion, and the voxels of the nodes."""
+    """Computes the residuals of fits at fixed moduli, from the matrix C of the force balance, the most probable motion,
+    and the voxels of the nodes."""
 
     C: scipy.sparse.csr_array
     here: Balanced
@@ -73,9 +74,9 @@ def correlation(
     """Estimate the correlation of the noise from the residuals at the fitted moduli.
 
     Args:
-        C: matrix of the force balance (I, U) at these moduli.
+        C: matrix of the force balance (I, U) at these moduli, with I equations and U unknowns.
         here: the most probable motion.
-        columns: derivatives of C u with respect to the moduli (I, R).
+        columns: derivatives (I, R) of the nodal forces C u with respect to the R moduli.
         d: measured motion (3 V,) [m], x, y, z of a node together.
         sd: assumed standard deviation of real and imaginary part of one component [m].
         voxel: voxel index of each node (V, 3).

@@ -25,8 +25,8 @@ WINDOW = 3
 
 
 def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, window: int = WINDOW) -> np.ndarray:
-    """Return the complex modulus (F, nx, ny, nz) [Pa]. The modulus is NaN outside the mask, and also near the edge of
-    the mask, where derivatives or smoothing would need voxels outside the mask.
+    """Return the complex modulus (F, nx, ny, nz) [Pa] at F frequencies. The modulus is NaN outside the mask, and also
+    near the edge of the mask, where derivatives or smoothing would need voxels outside the mask.
 
     Args:
         field: measured waves. If not all three components are measured, the result is NaN everywhere.
@@ -84,8 +84,8 @@ def _smooth(u: np.ndarray, inside: np.ndarray, widths: list[float]) -> np.ndarra
 
 
 def _second(q: np.ndarray, axis: int, h: float) -> np.ndarray:
-    """Return the second derivative of q along an axis, from differences with the spacing h. It is 0 at the ends of the
-    axis."""
+    """Return the second derivative of q along an axis, from differences with the spacing h. The result is 0 at the ends
+    of the axis."""
     out = np.zeros_like(q)
     rows, to = np.moveaxis(q, axis, 0), np.moveaxis(out, axis, 0)
     to[1:-1] = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / h**2

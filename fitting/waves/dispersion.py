@@ -171,7 +171,7 @@ def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray
         values = [to_number(cells[p], delimiter) if p < len(cells) else None for p, _ in found.values()]
         if not all(v is not None and np.isfinite(v) for v in values):
             raise InputError(
-                f"{path}: line {number}: {line.strip()[:40]!r} has a cell that is not a number; correct it"
+                f"{path}: line {number}: {line.strip()[:40]!r} has a cell that is not a number; correct this line"
             )
         rows.append(values)
     table = np.array(rows, float).reshape(-1, len(found))

@@ -130,7 +130,8 @@ def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patch
 
 def _feet(above: np.ndarray, body: VoxelBody) -> np.ndarray:
     """Return for each node the nearest point (V, 3) [voxels] where the field `above` is zero. The point is estimated
-    from the nodal values (V,) and the gradient of the field. Its distance from the node is at most `REACH`."""
+    from the nodal values (V,) and the gradient of the field. The distance of this point from the node is at most
+    `REACH`."""
     first = body.voxel.min(axis=0)
     at = tuple((body.voxel - first).T)
     grid, known = np.zeros(np.ptp(body.voxel, axis=0) + 1), np.zeros(np.ptp(body.voxel, axis=0) + 1, bool)

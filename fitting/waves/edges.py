@@ -35,7 +35,8 @@ class RegionMatrices(NamedTuple):
     """Matrices for the balance of forces with R regions.
 
     There are U unknowns: the 3 V displacements of the nodes, then the amplitudes of the kinks. C (I, U) is the matrix
-    of the force balance (see `fitting.waves.balance`).
+    of the force balance with I equations (see `fitting.waves.balance`). N is the number of its entries, and P is the
+    number of pressures.
     """
 
     stiffness: np.ndarray  # (R, N) entries of C for a shear modulus of 1 Pa in each region
@@ -54,11 +55,12 @@ class RegionMatrices(NamedTuple):
         return 2 * (self.forces.shape[0] - int(np.sum(np.diff(self.forces.tocsc().indptr) > 0)) - self.kinks)
 
     def rows(self, G: np.ndarray, omega: float) -> scipy.sparse.csr_array:
-        """Return the matrix C (I, U) of the force balance for moduli G (R,) [Pa] at an angular frequency [rad/s]."""
+        """Return the matrix C (I, U) of the force balance, with I equations and U unknowns, for the moduli G (R,) [Pa]
+        of R regions at one angular frequency [rad/s]."""
         return self._filled(G @ self.stiffness - omega**2 * self.mass)
 
     def by_moduli(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivatives (I, R) of the nodal forces C u with respect to the moduli."""
+        """Return the derivatives (I, R) of the nodal forces C u with respect to the moduli of the R regions."""
         return np.stack([self._filled(own) @ u for own in self.stiffness], axis=1)
 
     def by_edges(self, here: balance.Balanced, G: np.ndarray, omega: float) -> np.ndarray:
@@ -91,7 +93,7 @@ class _CutElements(NamedTuple):
 def region_matrices(
     m: Matrices, body: VoxelBody, density: float, s: np.ndarray, farther: np.ndarray | None = None
 ) -> RegionMatrices:
-    """Return the matrices for the balance of forces with R regions.
+    """Return the matrices for the balance of forces in a body with R regions.
 
     Args:
         m, body: the result of `balance.matrices`, and the body for which this result was computed.
@@ -206,7 +208,7 @@ def _integrals(
     """Return the arrays `shear`, `mass` and `divergence` of `_CutElements`.
 
     Args:
-        values: values (K, Q, n) of the shape functions at Q points.
+        values: values (K, Q, n) of the n shape functions at Q points of K elements.
         gradients: gradients (K, Q, n, 3) of the shape functions.
         lam: linear shape functions of the corners (Q, 4).
         weights: integration weights (K, Q).
@@ -221,8 +223,8 @@ def _integrals(
 
 
 def _with_forces(parts: list[_CutElements], kinks: int, nodes: int) -> np.ndarray:
-    """Return for each kink function whether it differs from zero (kinks,). It is zero if the edge meets an element only
-    at a node."""
+    """Return for each kink function whether it differs from zero (kinks,). A kink function is zero if the edge meets an
+    element only at a node."""
     size = np.zeros(kinks)
     for p in parts:
         np.add.at(size, p.functions[:, 10:] - nodes, np.einsum("eaibi->eab", p.shear)[:, range(10, 14), range(10, 14)])
@@ -260,8 +262,8 @@ def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: 
 def _pattern(
     parts: list[_CutElements], rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the sparsity pattern of C: sorted keys of the matrix entries, ends of the rows, and for each part (which
-    of its entries exist, positions of these entries)."""
+    """Return the sparsity pattern of C: sorted keys of the matrix entries and ends of the rows. Also return, for each
+    part, which of its entries exist and the positions of these entries."""
     keys, insides, U = [], [], len(rows)
     for p in parts:
         unknowns, lines = _unknowns_and_rows(p, rows)
@@ -284,7 +286,8 @@ def _unknowns_and_rows(p: _CutElements, rows: np.ndarray) -> tuple[np.ndarray, n
 def _pressure_columns(
     parts: list[_CutElements], rows: np.ndarray, shape: tuple[int, int], corners: int
 ) -> scipy.sparse.csr_array:
-    """Return the nodal forces (I, P R) of the pressures at the corners. Each region has separate pressures."""
+    """Return the nodal forces (I, P R) of unit pressures at P = `corners` corners in R regions. Each region has
+    separate pressures."""
     lines, columns, values = [], [], []
     for p in parts:
         own = p.corners + corners * p.region[:, None]

@@ -40,8 +40,8 @@ class Organ(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Fitted moduli of an organ, and the relative errors of these moduli that are due to the finite elements (mesh
-    bias)."""
+    """Fitted moduli of an organ at F frequencies, and the relative errors of these moduli that are due to the finite
+    elements (mesh bias)."""
 
     whole: Regions  # fit with one region
     labels: np.ndarray | None  # (R,) label of each region
@@ -125,7 +125,7 @@ def notes_on_layers(field: WaveField) -> list[str]:
     return [
         f"{every - kept} of {every} voxels are in no element. An element needs 3 voxels along an axis and shares the "
         f"last one with the next element, so the last layer along {', '.join(axes)} is ignored: measure an odd "
-        "number of voxels"
+        "number of voxels along these axes"
     ]
 
 
@@ -182,7 +182,8 @@ ALIKE = 1.15
 
 
 def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mesh bias of moduli (F, R), the relative error due to the finite elements, and its uncertainty.
+    """Return the mesh bias (relative error due to the finite elements) of the moduli (F, R) of R regions at F
+    frequencies, and the uncertainty of this bias.
 
     The result is (mean, left): mean (F, R) is the mean bias over plane waves; left (F, R, 2 D) contains the
     contribution of each of these waves to the uncertainty of the mean.
@@ -225,7 +226,8 @@ def plane_waves() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def waves_of_field(field: WaveField) -> np.ndarray:
-    """Return the relative energies (F, 2 D) of `plane_waves` in the displacement. The sum at each frequency is 1.
+    """Return the relative energies (F, 2 D) of the 2 D `plane_waves` in the displacement, at F frequencies. The sum at
+    each frequency is 1.
 
     The energy of a direction n is (sum over the axes a of n_a^2 times the mean squared derivative along axis a) to the
     power `SHARPNESS`. This energy is divided between the two waves of this direction, in proportion to the squared

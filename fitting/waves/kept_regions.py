@@ -24,7 +24,8 @@ def kept_in(file: Path, resume: bool, marks: dict[str, object]) -> Keep:
     Args:
         file: HDF5 file. It is written each time new regions are found, completely or not at all.
         resume: whether regions that are already in the file are used; if not, a new file is made.
-        marks: name -> mark. A mark is a digest or a value that identifies the organ and its data.
+        marks: dictionary with a mark for each name. A mark is a digest or a value that identifies the organ and its
+            data.
 
     Raises:
         InputError: the marks in the file differ from `marks`, or the file cannot be read.

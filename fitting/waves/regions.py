@@ -21,7 +21,7 @@ ITERATIONS, ENOUGH = 20, 0.1
 
 
 class MeasuredWaves(NamedTuple):
-    """Measured motion at the nodes of a body."""
+    """Measured motion at the V nodes of a body at F frequencies."""
 
     omega: np.ndarray  # (F,) [rad/s]
     motion: np.ndarray  # (F, 3 V) complex [m], x, y, z of a node together
@@ -46,7 +46,8 @@ class Regions(NamedTuple):
         least 1).
 
         Without an estimate of the correlation, the factor is sqrt(chi^2 / number of equations). If the noise is
-        correlated, the factor is `Correlation.enlarged`; if it is not, the product of both.
+        correlated, the factor is `Correlation.enlarged`. If the noise is not correlated, the factor is the product of
+        these two values.
         """
         factor = np.repeat(np.maximum(1.0, np.sqrt(self.chi2 / self.components))[:, None], self.modulus.shape[1], 1)
         for f, own in enumerate(self.correlations):
@@ -63,7 +64,7 @@ class Regions(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The most probable motion for moduli (R,), with the gradient and the Gauss-Newton Hessian of chi^2 / 2."""
+    """The most probable motion for given moduli G (R,), with the gradient and the Gauss-Newton Hessian of chi^2 / 2."""
 
     G: np.ndarray
     here: Balanced
@@ -164,7 +165,7 @@ def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarr
     larger.
     """
     H = now.hessian + labels
-    silent = np.diagonal(H) == 0  # a region without any element
+    silent = np.diagonal(H) == 0  # the region has no element
     H[silent, silent] = 1.0
     covariance = np.linalg.inv(H)
     covariance[silent, silent] = np.inf

@@ -2,12 +2,12 @@
 
 At frequency f the complex modulus of an element is G = g_f exp(c + l_f). Here g_f is the modulus of a uniform organ
 that is fitted to the same waves. The real part of the exponent is ln(|G| / |g_f|), and the imaginary part is the
-difference of the loss angles of G and g_f. The term c is the mean, over the element, of a complex nodal field (P,) that
-is the same for all frequencies. The real and the imaginary part of this field have the prior of
-`fitting.methods.prior`, with the same standard deviation. Each frequency has a complex unknown l_f, the level, with the
-prior mean 0 and the prior standard deviation `LEVEL`. The levels are needed because the ratios between the values g_f
-may be wrong if the organ is not uniform. With only one frequency there is no level, because a level would have the same
-effect as the mean of c.
+difference of the loss angles of G and g_f. The term c is the mean, over the element, of a complex field (P,) with
+values at P corners, which is the same for all frequencies. The real and the imaginary part of this field have the prior
+of `fitting.methods.prior`, with the same standard deviation. Each frequency has a complex unknown l_f, the level, with
+the prior mean 0 and the prior standard deviation `LEVEL`. The levels are needed because the ratios between the values
+g_f may be wrong if the organ is not uniform. With only one frequency there is no level, because a level would have the
+same effect as the mean of c.
 
 The prior standard deviation of c is increased step by step. The increase ends when chi^2 is as low as the number of
 equations (discrepancy principle; Morozov 1966), or when the logarithm of the evidence, -(chi^2/n + |z|^2)/2 - ln det H,
@@ -51,19 +51,19 @@ LEVEL = 0.5
 #: STEPS: maximum number of Gauss-Newton steps for each of `DEVIATIONS`. NEAR: a search ends if the next step is shorter
 #: than this. FAR: a map has converged if the next step is shorter than this (both in standard deviations of the map).
 STEPS, NEAR, FAR = 40, 0.1, 0.2
-#: The Hessian is computed again if a step is longer than this fraction of the step before: then the search has moved
-#: too far from the point of the last Hessian.
+#: The Hessian is computed again if a step is longer than this fraction of the step before. The search is then too far
+#: from the point at which the last Hessian was computed.
 _SLOW = 0.3
 
 
 class WaveMap(NamedTuple):
     """Map of the complex modulus at F frequencies and P corners, and its uncertainty."""
 
-    exponent: np.ndarray  # c + l_f (F, P) at the corners, complex (module docstring)
+    exponent: np.ndarray  # (F, P) complex: c + l_f, log of the modulus divided by that of a uniform organ
     sd: np.ndarray  # (F, P) complex. Real part: sd of ln |G|; imaginary part: sd of the loss angle
     posterior_sd: np.ndarray  # (F, P) sd of real and of imaginary part of c + l_f, without uncertainty of positions
-    prior_sd: np.ndarray  # (F, P) the same, before the data are used
-    draws: np.ndarray  # (D, F, P) complex: samples of the posterior, with random shifts within the width w
+    prior_sd: np.ndarray  # (F, P) sd of the same quantities before the data are used
+    draws: np.ndarray  # (D, F, P) complex: D posterior samples of c + l_f, randomly shifted within w
     modulus: np.ndarray  # (F, P) complex [Pa]
     deviation: float  # chosen prior standard deviation of c
     length: float  # correlation length of the prior [m]
@@ -77,13 +77,16 @@ class WaveMap(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Input of a search, which is the same in all its steps."""
+    """Input of a search for a map, which is the same in all steps. There are F frequencies, E elements, P corners and L
+    levels."""
 
     m: Matrices
     waves: MeasuredWaves
     whole: np.ndarray  # (F,) complex: modulus g_f of the uniform organ at each frequency [Pa]
-    exponents: tuple[scipy.sparse.csr_array, ...]  # F matrices (E, P + L): (c, L levels) -> c + l_f of the elements
-    slopes: tuple[scipy.sparse.csr_array, ...]  # 3 matrices (P, P): c -> change of c over the width w along x, y, z
+    # F matrices (E, P + L). The product with (c, L levels) gives c + l_f of the E elements.
+    exponents: tuple[scipy.sparse.csr_array, ...]
+    # 3 matrices (P, P). The product with c gives the change of c over the width w along x, y or z.
+    slopes: tuple[scipy.sparse.csr_array, ...]
     p: smooth.Prior
     length: float  # correlation length of the prior [m]
     voxel: np.ndarray | None = None  # (V, 3) voxel index of each node; None: white noise is assumed
@@ -160,10 +163,10 @@ class _Reached(NamedTuple):
 
 
 class _Begun(NamedTuple):
-    """State of a search."""
+    """State of a search for a map, which can be stored and resumed."""
 
-    point: _Reached  # for the current standard deviation
-    visited: list[tuple[_Reached, np.ndarray]]  # end point for each earlier standard deviation, with its `_information`
+    point: _Reached  # state for the current prior standard deviation
+    visited: list[tuple[_Reached, np.ndarray]]  # final state for each earlier sd of the prior, and its `_information`
     history: list[Content]
 
 
@@ -201,7 +204,7 @@ def map_of(
         progress: function that is called after every step, with the index in `DEVIATIONS` and chi^2 per equation.
 
     Raises:
-        InputError: `file` belongs to another fit.
+        InputError: `file` belongs to another fit or cannot be read.
     """
     begin = time.perf_counter()
     begun = _first_or_resumed(course, file if resume else None)
@@ -310,7 +313,7 @@ def _evidence(course: Course, point: _Reached, information: np.ndarray, excess: 
 
 def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reached, np.ndarray]]:
     """Try one standard deviation of the prior after another, until chi^2 is as low as for noise alone, or until the
-    evidence decreases. Each search begins at the result of the search before. Return the end point of each search and
+    evidence decreases. Each search begins at the result of the search before. Return the final state of each search and
     its `_information`."""
     components = course.m.balances * len(course.waves.omega)
     point, visited, history = begun
@@ -414,8 +417,8 @@ def _newton_step(course: Course, point: _Reached, information: np.ndarray, exces
 
 
 def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None:
-    """Return a point with a lower cost than `point`, after the whole step or a fraction of the step. Return None if no
-    such point is found."""
+    """Return the state after the whole step or a fraction of the step, with a lower cost than the state `point`. Return
+    None if no tested fraction lowers the cost."""
     for part in (1.0, 0.5, 0.25, 0.1):
         new = _reached(course, point.z + part * step, point.k)
         if new.cost < point.cost:
@@ -426,8 +429,8 @@ def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None
 def _spread(
     course: Course, point: _Reached, information: np.ndarray, draws: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return prior and posterior standard deviations (F, P) of c + l_f, and differences (D, F, P) between posterior
-    samples and the map."""
+    """Return prior and posterior standard deviations (F, P) of c + l_f, and the differences (D, F, P) between D =
+    `draws` posterior samples and the map."""
     scales, n = course.scales(point.k)[:, None], len(point.z)
     L = np.linalg.cholesky(_hessian(course, point.k, information))
 
@@ -464,7 +467,7 @@ def _write(file: Path | None, course: Course, begun: _Begun) -> None:
 
 def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
     """Return the state with which the search begins: a uniform organ, or the state of an earlier run in the file. The
-    end points of the searches that the earlier run has finished are evaluated again."""
+    final states of the searches that the earlier run has finished are evaluated again."""
     if file is None or not file.is_file():
         return _Begun(_reached(course, np.zeros(course.exponents[0].shape[1], complex), 0), [], [])
     try:

@@ -24,7 +24,7 @@ class VoxelBody(NamedTuple):
     inner: np.ndarray  # (V,) bool: nodes with elements of their part on all sides; there the forces balance
     part: np.ndarray  # (V,) number of the part of each node
     whole: TetMesh  # linear mesh of the undivided body, for fields that are continuous between the parts
-    corner: np.ndarray  # (P,) node of `whole` for each node of `linear`
+    corner: np.ndarray  # (P,) node of `whole` for each of the P nodes of `linear`
 
 
 def voxel_body(
@@ -138,7 +138,7 @@ def _every_second(offset: tuple[int, ...], cells: tuple[int, ...]) -> tuple[slic
 
 
 def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
-    """Interpolate a field that is linear in each element: return its values (V,) at all nodes. `corners`: its values at
+    """Return the values (V,) at all nodes of a field that is linear in each element. `corners`: values of the field at
     the nodes of `body.whole`."""
     from liverjax.mesh.adjacency import PAIRS
 

@@ -16,7 +16,8 @@ UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "rad": 1.0}
 
 
 class WaveField(NamedTuple):
-    """Complex displacements U on the voxels of a box. The displacement u(t) is the real part of U exp(i omega t)."""
+    """Complex displacements U on the voxels of a box, at F frequencies. The displacement u(t) is the real part of U
+    exp(i omega t)."""
 
     frequencies: np.ndarray  # (F,) [Hz], ascending
     displacement: np.ndarray  # (F, nx, ny, nz, 3) complex [m]; NaN where it is not measured
@@ -151,7 +152,7 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
             )
         several = np.isfinite(u) & np.any(np.isfinite(u) & (u != 0), axis=-1, keepdims=True)
         zeros = (u == 0) & several
-        zeros &= zeros.sum(axis=(0, 1, 2)) < FEW * several.sum(axis=(0, 1, 2))  # many zeros may be a plane of symmetry
+        zeros &= zeros.sum(axis=(0, 1, 2)) < FEW * several.sum(axis=(0, 1, 2))  # many zeros may be due to symmetry
         if zeros.any():
             notes.append(
                 f"field {f + 1} has {zeros.sum()} components that are exactly 0 in voxels that move: write NaN where a "
@@ -179,7 +180,7 @@ def with_noise(field: WaveField, noise: float | None) -> WaveField:
 
 
 def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
-    """Return the complex displacements (F, nx, ny, nz, 3) of the file in its unit, and notes."""
+    """Return the complex displacements (F, nx, ny, nz, 3) in the unit of the file, and notes."""
     told: list[str] = []
     if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, equally spaced
         u = _instants(name, "phases", found["phases"])
@@ -232,7 +233,8 @@ def _layout(name: str) -> str:
 
 
 def _instants(name: str, field: str, values: Numbers) -> np.ndarray:
-    """Check an array with the motion at T instants of one period, and return it (F, T, nx, ny, nz, 3)."""
+    """Check an array with the motion at T instants of one period, and return the array with the shape (F, T, nx, ny,
+    nz, 3)."""
     u = _array_of_numbers(name, field, values)
     if u.ndim not in (5, 6) or u.shape[-5] < 3 or u.shape[-1] not in (1, 3) or np.iscomplexobj(u):
         raise InputError(

@@ -10,7 +10,9 @@ LAW = "name of a law of this package (with typical parameters), or FILE.py:LAW, 
 
 def add_out(command: argparse.ArgumentParser) -> None:
     """Add --out, the folder of the results."""
-    command.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder of the results (here)")
+    command.add_argument(
+        "--out", type=Path, default=Path(), metavar="DIR", help="folder of the results (default: this folder)"
+    )
 
 
 def with_joined_numbers(arguments: Sequence[str]) -> list[str]:

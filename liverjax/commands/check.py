@@ -18,12 +18,12 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the table of a law's gradient check and draw its figure. Return 1 if a row of the table failed."""
+    """Check the derivatives of a law: print a table and draw a figure. Return 1 if a row of the table failed."""
     import jax
 
     from liverjax.laws import figures, gradient_check
 
-    jax.config.update("jax_enable_x64", True)  # the limits of the check are for 64 bits
+    jax.config.update("jax_enable_x64", True)  # the limits of the check are for double precision
     law, label = gradient_check.load(options.law), options.law.rpartition(":")[2]
     file = options.out / f"check_{label}.png"
     writable(options.out, (file.name,))

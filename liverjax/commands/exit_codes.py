@@ -13,7 +13,7 @@ from pathlib import Path
 from liverjax.core import program_cache
 from liverjax.core.errors import InputError
 
-#: Error numbers of a full disk. Not every system has quotas.
+#: Error numbers of a full disk and of an exhausted disk quota. Not every system has quotas.
 FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 
@@ -47,8 +47,10 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
             print(f"error: {error}", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
-            print("stopped" + ("; finished parts are kept: go on with --resume" if resumable else ""), file=sys.stderr)
-            return 130  # the code that shells use
+            print(
+                "stopped" + ("; finished parts are kept: continue with --resume" if resumable else ""), file=sys.stderr
+            )
+            return 130  # the code that shells use for Ctrl-C
         except BrokenPipeError:  # the reader of a pipe has closed it
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
@@ -56,14 +58,15 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
             if error.errno is None or error.errno not in FULL:
                 raise
             print(
-                f"error: {os.strerror(error.errno)}: the last file is not complete; free some space and repeat",
+                f"error: {os.strerror(error.errno)}: the last file is not complete; free disk space and repeat the "
+                "command",
                 file=sys.stderr,
             )
             return 2
 
 
 def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
-    """Print a note about optional files in the folder of results that are older than the `begin` of this run."""
+    """Print a note about optional files in the folder of results that are older than this run (its time `begin`)."""
     names = [name for name in getattr(options, "optional_files", ()) if _older(options.out / name, begin)]
     if names:
         verb = "is" if len(names) == 1 else "are"

@@ -16,8 +16,8 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command = parsers.add_parser(
         "play",
         help="pull a body with the mouse in a browser",
-        description="Serve a page on this machine that shows the body of a scene. One step is computed per picture, "
-        "and the mouse can pull the body.",
+        description="Serve a page on this machine that shows the body of a scene. One step is computed per picture. "
+        "The user can pull the body with the mouse.",
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
     command.add_argument(
@@ -25,7 +25,10 @@ def add(parsers: argparse._SubParsersAction) -> None:
     )
     command.add_argument("--no-browser", action="store_true", help="do not open the page")
     command.add_argument(
-        "--steps", type=int, metavar="N", help="without a page, pull the body for N steps and print steps per second"
+        "--steps",
+        type=int,
+        metavar="N",
+        help="without a page, pull the body for N steps and print the number of steps per second",
     )
     command.set_defaults(run=run)
 
@@ -59,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _without_page(playing: "Playing", steps: int) -> int:
-    """Pull the node that is farthest from the fixed nodes by a tenth of the body's size. Return 1 if a step failed."""
+    """Pull one node, the farthest from the fixed nodes, by a tenth of the body's size. Return 1 if a step failed."""
     import numpy as np
 
     from liverjax.core import status
@@ -71,7 +74,7 @@ def _without_page(playing: "Playing", steps: int) -> int:
     centre = X[np.concatenate(held)].mean(axis=0) if held else X.mean(axis=0)
     nodes = np.setdiff1d(playing.nodes, np.concatenate(held)) if held else playing.nodes
     if not len(nodes):
-        raise InputError("[[fixed]] and [[displaced]] contain the whole surface: leave a node free that can be pulled")
+        raise InputError("[[fixed]] and [[displaced]] contain the whole surface: leave at least one surface node free")
     node = int(nodes[np.argmax(np.linalg.norm(X[nodes] - centre, axis=1))])
     away = X[node] - centre
     to = X[node] + 0.1 * playing.size * away / max(float(np.linalg.norm(away)), 1e-300)

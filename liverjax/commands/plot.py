@@ -39,7 +39,9 @@ def run(options: argparse.Namespace) -> int:
         if name.endswith(".toml"):
             raise InputError(f"{name} is a scene: run it with liverjax simulate, and draw its result.h5")
         if Path(name).exists() and not name.endswith((".h5", ".py")) and name not in (*laws.LAWS, "all"):
-            raise InputError(f"{name} is a file or a folder, and not a law: give the result.h5 of a run to draw it")
+            raise InputError(
+                f"{name} is a file or a folder, and not a law: give the name of a law, or the result.h5 of a run"
+            )
     for option, of_results in (("field", True), ("step", True), ("stretch", False)):
         if getattr(options, option) is not None and bool(results) != of_results:
             raise InputError(

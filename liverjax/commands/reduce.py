@@ -22,14 +22,15 @@ def add(parsers: argparse._SubParsersAction) -> None:
         type=float,
         default=1e-4,
         metavar="X",
-        help="neglected fraction of the motions (1e-4)",
+        help="fraction of the displacements that the modes may neglect (1e-4)",
     )
     command.add_argument("--modes", type=int, default=40, metavar="N", help="maximum number of modes (40)")
     command.add_argument(
         "--runs",
         type=int,
         metavar="N",
-        help="number of full runs (all rows): two thirds are the first rows, the others those with the largest errors",
+        help="number of full runs (one per row). Two thirds use the first rows, the others the rows with the largest "
+        "estimated errors",
     )
     command.set_defaults(run=run)
 

@@ -22,9 +22,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
     command.add_argument("--vtu", action="store_true", help="also write a series of files for ParaView")
     command.add_argument("--png", action="store_true", help="also draw the last state")
-    command.add_argument(
-        "--every", type=int, default=50, metavar="N", help="number of steps between two writes of the results (50)"
-    )
+    command.add_argument("--every", type=int, default=50, metavar="N", help="write the results after each N steps (50)")
     command.add_argument("--resume", action="store_true", help="continue a run that was stopped")
     command.add_argument(
         "--fields", metavar="NAMES", help="fields to write, separated by commas: cauchy_stress,volume_ratio,…"
@@ -37,14 +35,14 @@ def add(parsers: argparse._SubParsersAction) -> None:
         "--about",
         type=Path,
         metavar="RESULT.h5",
-        help="only for a harmonic scene: the body vibrates about the last state of this run",
+        help="only for kind = 'harmonic': the body vibrates about the last state of this run",
     )
     add_out(command)
     command.set_defaults(run=run, optional_files=("reactions.csv", "result.png", "vtu"))
 
 
 def run(options: argparse.Namespace) -> int:
-    """Simulate the scene and write its results. Return 1 if a step failed; the results before this step are kept."""
+    """Simulate the scene and write the results of all steps. Return 1 if a step failed."""
     import numpy as np
     from tqdm import tqdm
 
@@ -75,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
         if ran is None:
             ran = long_run.run(scene, text, target, options.every, options.resume, report)
     except OSError as error:
-        print(f"stopped: {target}: {error.strerror}; free some space and go on with --resume", file=sys.stderr)
+        print(f"stopped: {target}: {error.strerror}; free disk space and continue with --resume", file=sys.stderr)
         return 1
     finally:
         bar.close()
@@ -118,8 +116,8 @@ def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[
 
 
 def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:
-    """Return (run, scene): run is the run with a reduced model, or None if the full model has to run. scene is the
-    scene without the reduced model."""
+    """Return (run, scene): the run with the reduced model, or None if the full model has to run; and the scene without
+    the reduced model."""
     if not scene.solve.reduced:
         return None, scene
     from liverjax.core.struct import replace

@@ -16,8 +16,8 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command = parsers.add_parser(
         "sweep",
         help="run a scene for every row of a table",
-        description="Run a scene for every row of a table. If the run is stopped, --resume continues it; at most one "
-        "chunk of rows is lost.",
+        description="Run a scene for every row of a table. If the run is stopped, --resume continues it. At most one "
+        "chunk of rows must be repeated.",
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
     command.add_argument(
@@ -35,11 +35,11 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument(
         "--rows", nargs="+", type=int, default=[], metavar="N", help="only these rows, numbered from 1"
     )
-    command.add_argument(
-        "--chunk", type=int, default=16, metavar="N", help="number of rows between two writes of the results (16)"
-    )
+    command.add_argument("--chunk", type=int, default=16, metavar="N", help="write the results after each N rows (16)")
     command.add_argument("--devices", type=int, metavar="N", help="spread the rows over N CPU devices (1)")
-    where = "run as process I of N processes that meet at HOST:PORT; without values, the cluster (SLURM) gives them"
+    where = (
+        "run as process I of N processes, connected through HOST:PORT; without values, the cluster (SLURM) gives them"
+    )
     command.add_argument("--distributed", nargs="*", metavar="HOST:PORT N I", help=where)
     command.set_defaults(run=run)
 
@@ -73,7 +73,8 @@ def run(options: argparse.Namespace) -> int:
         done = sweep.run(table, out, options.resume, process, bar.update)
     except OSError as error:
         print(
-            f"error: {out}: {error.strerror or error}: finished chunks are kept, go on with --resume", file=sys.stderr
+            f"error: {out}: {error.strerror or error}: finished chunks are kept, continue with --resume",
+            file=sys.stderr,
         )
         return 1
     finally:
@@ -87,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     for said in (*cautions_of_mesh(table.scene.mesh), *_of_crushed(done.crushed)):
         print(f"caution: {said}", file=sys.stderr)
     if done.failed:
-        print(f"to run them again: --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
+        print(f"to run these rows again: --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
     return 1 if done.failed else 0
 
 
@@ -98,8 +99,8 @@ def _of_crushed(rows: dict[int, float]) -> list[str]:
     named = ", ".join(map(str, list(rows)[:20])) + (", …" if len(rows) > 20 else "")
     how_many = f"{len(rows)} row{'s' if len(rows) > 1 else ''} ({named}; worst: row {worst}, J = {rows[worst]:.2g})"
     return [
-        f"elements end below a fifth or above five times their volume in {how_many}, which is not possible in tissue: "
-        "use a larger bulk modulus or smaller loads"
+        f"at the end, elements have less than a fifth or more than five times their volume in {how_many}, which is "
+        "impossible in tissue: use a larger bulk modulus or smaller loads"
     ]
 
 
@@ -118,7 +119,7 @@ def _share(given: list[str]) -> tuple[int, int]:
 
     option = f"--distributed {' '.join(given)}"
     if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
-        raise InputError(f"{option}: give HOST:PORT, the number of processes and the index of this one, or nothing")
+        raise InputError(f"{option}: give HOST:PORT, the number of processes and the index of this process, or nothing")
     if given and not _is_address(given[0]):
         raise InputError(f"{option}: {given[0]} is not HOST:PORT with a port of 1 to 65535: give e.g. node1:12345")
     if given and int(given[1]) < 1:

@@ -4,7 +4,7 @@ import importlib
 import sys
 from types import ModuleType
 
-#: Old name -> new name.
+#: Old name -> new name of each module that has moved.
 MOVED = {
     "liverjax.batch": "liverjax.simulation.batch",
     "liverjax.boundary": "liverjax.physics.boundary",
@@ -61,7 +61,7 @@ def moved_module(package: str, name: str) -> ModuleType:
     """Return the module with the old name PACKAGE.NAME.
 
     Raises:
-        AttributeError: no module had this name.
+        AttributeError: no module has this old name.
     """
     if f"{package}.{name}" not in MOVED:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")

@@ -10,31 +10,36 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 
-#: Fields of regions that may be dictionaries of numbers; they are checked together with the numbers of the scene.
+#: Fields of a `Region` that may be dictionaries of numbers. They are skipped here: `scenes.checks.regions` checks them.
 _DICTIONARIES = ("law", "viscosity", "porosity")
-#: Maximum count of numbers in a message. If there are more, the message shows only the first wrong one and its index.
+#: Maximum number of values that a message shows. If an array has more values, the message shows only the first wrong
+#: value and its position in the array.
 _FEW = 8
-#: Maximum whole number, since compiled programs store 32-bit integers.
+#: Largest allowed whole number, since compiled programs store whole numbers with 32 bits.
 _LARGEST = 2**31 - 1
 
 
 def check_fields(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
-    """Raise `InputError` if a value of a struct is out of bounds, not finite or not a number. Nothing is compiled.
+    """Raise `InputError` if a value of a struct is out of bounds, not finite or not a number.
+
+    The check compiles nothing.
 
     Args:
-        thing: any struct; structs inside it are also checked. Values that are None, or unknown inside jit, are skipped.
-        name: name of the struct. It is put before the names of its fields: ``law`` gives ``law.mu``.
-        leave: fields to skip, because they are checked elsewhere.
+        thing: any struct; structs inside this struct are also checked. Values that are None, or unknown inside jit, are
+            not checked.
+        name: name of the struct. The names in messages begin with this name: ``law`` gives ``law.mu``.
+        leave: fields that are not checked here, because another function checks them.
 
     Raises:
-        InputError: the message contains the dotted name, the value, the bound and a remedy.
+        InputError: a value is out of bounds, not finite or not a number. The message contains its dotted name (for
+            example law.mu), the value, its bound and a remedy.
     """
     for dotted, metadata, value in _fields(thing, name, leave):
         check_bound(dotted, metadata, value)
 
 
 def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str, Mapping, object]]:
-    """Yield the dotted name, metadata and value of every field that has a bound or a unit."""
+    """Yield dotted name, metadata and value of every field that has a bound or a unit, without the fields `leave`."""
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
         if value is None or field.name in leave or (isinstance(value, dict) and field.name in _DICTIONARIES):
@@ -60,7 +65,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         value: a number, an array, or a sequence of numbers or arrays. Values inside jit, grad or vmap are not checked.
 
     Raises:
-        InputError: the value is not a number, not finite, out of bounds, or not one of the words of a static field.
+        InputError: the value is not a number, not finite or out of bounds; or a static field does not allow this word.
     """
     lower = metadata.get("lower")
     if metadata.get("static"):
@@ -76,7 +81,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         return
     if type(value) is int and not finite(value):
         raise InputError(f"{where} is a whole number with hundreds of digits: give a smaller number")
-    if type(value) is float or type(value) is int:  # the most frequent case is fast, since every run checks all values
+    if type(value) is float or type(value) is int:  # a faster way for single numbers, since every run checks all values
         leaves, numbers = [value], None
         least = most = value
     else:
@@ -94,7 +99,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
 
 
 def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -> None:
-    """Raise an error for the first bound that one of the numbers (n,) violates."""
+    """Raise an error for the first bound that one of the numbers (n,) violates. The error shows `where` and `value`."""
     unit, typical = metadata.get("unit", "1"), metadata.get("typical")
     if not np.isfinite(numbers).all():
         raise InputError(
@@ -115,7 +120,7 @@ def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -
 
 
 def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> np.ndarray:
-    """Return the numbers of all leaves as one array (n,)."""
+    """Return the numbers of all leaves of a value as one array (n,). Raise InputError if a leaf is not a number."""
     try:
         if any(isinstance(leaf, (str, bytes, bool, dict)) for leaf in leaves):
             raise TypeError
@@ -126,12 +131,15 @@ def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> n
 
 
 def _in(unit: str) -> str:
-    """Return " in " and the unit, or an empty string for a number without a unit."""
+    """Return " in " and the unit, for a message. Return an empty string if the quantity has no unit."""
     return "" if unit == "1" else f" in {unit}"
 
 
 def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> str:
-    """Return name and value as a string. If there are many numbers, show only the first wrong number."""
+    """Return name and value as a string for a message.
+
+    If the value has many numbers, the string shows only the first wrong number.
+    """
     if numbers.size > _FEW:
         first = int(np.argmax(wrong))
         return f"{where}, number {first + 1} of {numbers.size}, = {numbers[first]:g}"
@@ -141,10 +149,10 @@ def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> st
 
 
 def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
-    """Raise `InputError` if the shape of an array is not in `allowed`. None is allowed.
+    """Raise `InputError` if the shape of an array is not in `allowed`. A value of None is not checked.
 
     Raises:
-        InputError: the array has another shape.
+        InputError: the array has a shape that is not in `allowed`.
     """
     if value is not None and np.shape(value) not in allowed:
         words = " or ".join("one number" if shape == () else f"shape {shape}" for shape in allowed)
@@ -152,7 +160,10 @@ def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
 
 
 def finite(value: float) -> bool:
-    """Return whether a number is finite as a float. Whole numbers may have any number of digits."""
+    """Return whether a number is finite as a float.
+
+    A whole number with hundreds of digits is not: it is too large for a float.
+    """
     try:
         return math.isfinite(value)
     except OverflowError:
@@ -181,7 +192,7 @@ def _is_numbers(value: object) -> bool:
         return finite(value)
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError):  # a JAX tracer, which has no value, cannot come from a file
+    except (TypeError, ValueError):  # a JAX tracer (inside jit) has no value and is not from a file
         return False
     return array.dtype.kind in "fiu" and bool(np.all(np.isfinite(array)))
 
@@ -190,7 +201,7 @@ def check_one(where: str, value: object) -> None:
     """Raise `InputError` if a value of a scene file is not one finite number.
 
     Raises:
-        InputError: the message begins with `where`.
+        InputError: the value is not one finite number. The message begins with `where`.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not finite(value):
         raise InputError(f"{where} = {value!r} is not a number: give a number")

@@ -1,8 +1,9 @@
 """Compile a function for given arguments, and keep the compiled program (here: program) on disk.
 
-To find a compiled program in JAX's own cache, JAX must first trace the function: it runs the Python code without
-numbers, which takes seconds for a large function. Here a program is found without tracing, because its key is computed
-from the structure and the shapes of the arguments. The files are in the folder of `liverjax.core.program_cache`.
+Before JAX can find a compiled program in its own cache, it must trace the function (run the Python code without
+numbers). This takes seconds for a large function. Here a program is found without tracing: its file name contains a
+key, which is computed from the structure and the shapes of the arguments. The files are in the folder of
+`liverjax.core.program_cache`.
 """
 
 import dataclasses
@@ -25,32 +26,36 @@ import numpy as np
 from liverjax.core import program_cache
 from liverjax.core.files import whole
 
-#: The folder's name contains a digest of the sources of these packages. A program must not depend on other code.
+#: Packages whose functions and structs a stored program may use. The name of the folder contains a digest of their
+#: source files.
 OWN = ("liverjax.", "fitting.")
 
 
-#: Options for a program that takes longer to compile than to run. XLA's newer kernels run up to twice as fast, but take
-#: 1.5 times as long to compile. In jax 0.11 and later there are only the newer kernels.
+#: Compiler options for a program that takes longer to compile than to run: they select XLA's older CPU kernels. The
+#: newer kernels run up to twice as fast, but take 1.5 times as long to compile. jax 0.11 and later have only the newer
+#: kernels.
 _QUICK: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 
 
 class _Unknown(Exception):
-    """Raised for things that the key cannot describe, for example a user's law, or a function inside another one."""
+    """Raised if the key cannot describe a function or an argument, for example a law that a user has written."""
 
 
 def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False) -> Callable[..., Any]:
-    """Compile `function` for arguments with these types and shapes, on one device.
+    """Compile `function` for arguments with these types and shapes, on one device. Return the compiled function.
 
-    A call of the result with such arguments only runs the compiled program.
+    A call of the compiled function, with arguments of the same types and shapes, compiles nothing.
 
     Args:
         function: a function at the top level of a module, or `functools.partial` of such a function. The keywords of
             the partial become constants of the program.
-        arguments: pytrees of arrays and numbers. With structs that a user has defined, nothing is kept on disk.
-        short: whether the program runs for a second or less, so that a quick compilation is more important than speed.
+        arguments: pytrees of arrays and numbers. If they contain structs that a user has defined, the program is not
+            stored on disk.
+        short: whether the program runs for a second or less. Then a short compilation is more important than a short
+            run.
     """
     folder, options = program_cache.folder(), _QUICK if short and jax.default_backend() == "cpu" else {}
-    if folder is None or jax.default_backend() != "cpu":  # other devices use only JAX's cache
+    if folder is None or jax.default_backend() != "cpu":  # programs for other devices are only in JAX's cache
         return jax.jit(function).lower(*arguments).compile(options)
     try:
         file = folder / f"whole_{_function_name(function)}-{_key(function, arguments, options)}-cache"
@@ -60,9 +65,9 @@ def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False)
 
 
 def _made(file: Path, function: Callable[..., Any], arguments: tuple, options: dict) -> Callable[..., Any]:
-    """Compile the function for flat lists of arrays, since their structure can be saved.
+    """Compile the function, and store the program in `file` if possible.
 
-    Save the program if possible.
+    The compiled function has flat lists of arrays as arguments and results, because JAX can store only such lists.
     """
     structure = jax.tree.structure(arguments)
     shape: list[Any] = []
@@ -72,7 +77,7 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple, options: d
         shape[:] = [jax.tree.structure(out)]
         return jax.tree.leaves(out)
 
-    # JAX's cache must not find or store this program: a program that was read from disk cannot be written again.
+    # JAX's own cache must not find or store this program: a program that JAX has read from disk cannot be stored again.
     flat.__name__ = f"program_{uuid.uuid4().hex}"
     keep_from = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", math.inf)
@@ -87,24 +92,25 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple, options: d
         content = zlib.compress(pickle.dumps((*serialize_executable.serialize(program), example)), 1)
         with whole(file, f".{os.getpid()}.part") as beside:
             beside.write_bytes(content)
-    except Exception:  # e.g. callbacks, a full disk, another JAX: the program runs, but is not saved
+    except Exception:  # e.g. callbacks in the program, or a full disk: the program runs, but is not stored
         pass
     return partial(_called, program, shape[0])
 
 
 def _found(file: Path) -> Callable[..., Any] | None:
-    """Read the program in a file. Returns None if no program can be read."""
+    """Read the program that is stored in a file. Returns None if the file does not exist or cannot be read."""
     if not file.exists():
         return None
     try:
         from jax.experimental import serialize_executable
 
-        # XLA uses SciPy's LAPACK. JAX registers it only when a factorisation is lowered for the first time.
+        # A stored program may call SciPy's LAPACK, which JAX registers only when it first lowers (translates) a
+        # factorisation.
         jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.result_type(float)))
         kept, given, taken, example = pickle.loads(zlib.decompress(file.read_bytes()))
         program = serialize_executable.deserialize_and_load(kept, given, taken, execution_devices=jax.devices()[:1])
         return partial(_called, program, jax.tree.structure(example))
-    except Exception:  # a broken file, or another release: the program is compiled and written again
+    except Exception:  # a broken file, or a file of another JAX version: the program is compiled and stored again
         return None
 
 
@@ -117,7 +123,10 @@ def _function_name(function: Callable[..., Any]) -> str:
 
 
 def _top(function: Any) -> str:
-    """Return the name of a function at the top level of a module. A function inside another one raises `_Unknown`."""
+    """Return the name of a function at the top level of a module.
+
+    For a function inside another one, `_Unknown` is raised.
+    """
     module, name = function.__module__, function.__qualname__
     if not module.startswith(OWN) or not name.isidentifier():
         raise _Unknown
@@ -125,7 +134,7 @@ def _top(function: Any) -> str:
 
 
 def _key(function: Callable[..., Any], arguments: tuple, options: dict | None = None) -> str:
-    """Return the digest of everything that the program depends on, except the sources."""
+    """Return a digest of everything on which the compiled program depends, except the source files."""
     fixed = function.keywords if isinstance(function, partial) else {}
     if isinstance(function, partial) and function.args:
         raise _Unknown
@@ -141,7 +150,7 @@ def _key(function: Callable[..., Any], arguments: tuple, options: dict | None = 
 
 
 def _said(thing: Any, static: bool = False) -> Any:
-    """Describe an argument for the key: types, static values, and the shapes of all other numbers."""
+    """Describe an argument for the key by its types, its static values, and the shapes of all other numbers."""
     if thing is None or isinstance(thing, (str, bool)):
         return repr(thing)
     if isinstance(thing, FunctionType) and static:

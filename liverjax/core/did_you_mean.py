@@ -1,4 +1,4 @@
-"""Check words from users, and write the hint at the end of a message about an unknown word."""
+"""Check words that users have written, and give the end of a message about an unknown word."""
 
 import difflib
 from collections.abc import Iterable
@@ -9,9 +9,8 @@ from liverjax.core.errors import InputError
 def hint(word: str, known: Iterable[str], before: str = "") -> str:
     """Return the end of a message about an unknown word.
 
-    It contains the most similar known word, or all known words if none is similar.
-
-    `before` is written before each known word, for example "law.".
+    This end contains the known word that is most similar, or all known words if none is similar. `before` is written
+    before each known word, for example "law.".
     """
     words = list(known)
     longer = [name for name in words if len(word) > 2 and name.startswith(word)]
@@ -20,11 +19,11 @@ def hint(word: str, known: Iterable[str], before: str = "") -> str:
 
 
 def as_word(value: object, where: str) -> str:
-    """Return the value if it is a string. This check is needed before the word is looked up.
+    """Return the value if it is a string, and raise InputError if not. Only a string can be compared with known words.
 
     Args:
         value: a value of a scene file.
-        where: its name, for the message.
+        where: name of the value, for the message.
 
     Raises:
         InputError: the value is not a string.

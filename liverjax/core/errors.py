@@ -1,5 +1,8 @@
-"""The exception for unusable input. Unusable input raises no other exception."""
+"""The exception that is raised for unusable input of a user. No other exception is raised for such input."""
 
 
 class InputError(ValueError):
-    """Raised for unusable input. The message gives file or field, value and remedy. Commands exit with code 2."""
+    """Raised for unusable input. The message gives the file or field, its value and a remedy.
+
+    Commands exit with code 2.
+    """

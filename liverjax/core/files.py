@@ -1,4 +1,4 @@
-"""Test folders for results before a computation, and write files completely or not at all.
+"""Check, before a computation, that results can be written. Write each file completely or not at all.
 
 A progress file contains marks (digests) of its problem, so that a run continues only from a file of the same problem.
 """
@@ -15,7 +15,7 @@ from liverjax.core.errors import InputError
 
 
 def writable(out: Path, files: tuple[str, ...]) -> None:
-    """Make the folder `out` for the results `files`, and test whether it can be written.
+    """Make the folder `out` for the results `files`, and check that files can be written into this folder.
 
     Raises:
         InputError: `out` is a file or cannot be written, or one of `files` is a folder.
@@ -30,12 +30,12 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
         with tempfile.TemporaryFile(dir=out):
             pass
     except OSError as error:
-        raise InputError(f"--out {out}: {error.strerror}; name a folder that can be written") from None
+        raise InputError(f"--out {out} cannot be used ({error.strerror}): name a folder that can be written") from None
 
 
 @contextmanager
 def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
-    """Yield a temporary path next to `file`. At the end, the file at this path is renamed to `file`.
+    """Yield a temporary path next to `file`. At the end of the context, the temporary file is renamed to `file`.
 
     If the process is killed or an error occurs, `file` does not change. After an error the temporary file is removed.
 
@@ -61,7 +61,10 @@ def mark_of(*arrays: object) -> str:
 
 
 def refuse_other(file: Path, held: Mapping[str, object], marks: Mapping[str, object]) -> None:
-    """Raise `InputError` if the marks `held` in `file` differ from `marks`. The message lists the different marks."""
+    """Raise `InputError` if the marks `held` (from `file`) differ from `marks`.
+
+    The message lists the marks that differ.
+    """
     other = [name for name, own in marks.items() if held.get(name) != own]
     if other:
         raise InputError(

@@ -1,7 +1,8 @@
 """Histories of loads and motions: tables of numbers at increasing times.
 
-A history is linear between two times, and constant before the first and after the last time. One number per time is a
-factor that multiplies the load. Three numbers per time are the vector itself.
+A history is linear between two times, and constant before the first and after the last time. A table with one number
+per time contains factors that multiply the load or motion. A table with three numbers per time contains the vector of
+the load or motion itself.
 """
 
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, Numbers
 
-#: Columns of a file: a factor, or a vector.
+#: Columns of a history file, for factors and for vectors.
 _FACTOR, _VECTOR = ("time", "factor"), ("time", "x", "y", "z")
 
 
@@ -24,10 +25,11 @@ def read_history(value: object, name: str, forms: tuple[int, ...] = (1, 3)) -> t
     Args:
         value: rows `[[t, factor], …]` or `[[t, x, y, z], …]`; or a CSV file with columns time,factor or time,x,y,z.
         name: name of the load or motion with this history, for messages.
-        forms: allowed counts of numbers per time.
+        forms: allowed numbers of values per time: 1 (a factor), 3 (a vector), or both.
 
     Raises:
-        InputError: a file that cannot be read, wrong columns, numbers that are not finite, times that do not increase.
+        InputError: the file cannot be read, the columns are wrong, a number is not finite, or the times do not
+            increase.
     """
     wanted = " or ".join("[[time, factor], …]" if n == 1 else "[[time, x, y, z], …]" for n in forms)
     if isinstance(value, (str, Path)):
@@ -52,7 +54,7 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     kinds = [_FACTOR if n == 1 else _VECTOR for n in forms]
     wanted = " or ".join(",".join(kind) for kind in kinds)
     try:
-        text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a byte order mark first
+        text = path.read_text(encoding="utf-8-sig")  # files of spreadsheet programs begin with a byte order mark
     except OSError as error:
         raise InputError(f"{name} history {path} cannot be read ({error.strerror}): give columns {wanted}") from None
     except UnicodeDecodeError:
@@ -75,11 +77,10 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
 
 
 def check_times(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> None:
-    """Raise `InputError` if a history made in Python cannot be used. Times inside jit are not checked.
+    """Raise `InputError` if a history made in Python cannot be used. Times that are unknown inside jit are not checked.
 
     Raises:
-        InputError: times without a history or a history without times, shapes that do not match, times that do not
-            increase.
+        InputError: only one of times and history is given, their shapes do not match, or the times do not increase.
     """
     if (times is None) != (history is None):
         raise InputError(f"{name} needs both times and history, or none of them: give both, or remove both")
@@ -95,11 +96,11 @@ def check_times(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1
     falls = np.flatnonzero(~(np.diff(np.asarray(times)) > 0))
     if not count[0] or falls.size:
         found = f"{times[falls[0] + 1]:g} s after {times[falls[0]]:g} s" if count[0] else "none"
-        raise InputError(f"{name} history must have increasing times, but has {found}: sort them")
+        raise InputError(f"{name} history must have increasing times, but has {found}: sort the times")
 
 
 def entry_at(time: Number, times: Any, history: Numbers) -> jax.Array:
-    """Interpolate the factor (), or the vector (3,), at a time [s]."""
+    """Return the factor (), or the vector (3,), at a time [s], by linear interpolation in the history."""
     values = jnp.asarray(history)
     if values.ndim == 1:
         return jnp.interp(time, times, values)
@@ -107,9 +108,9 @@ def entry_at(time: Number, times: Any, history: Numbers) -> jax.Array:
 
 
 def value_at(value: object, time: Number, times: Any, history: Any) -> Any:
-    """Return a value at a time [s]: the value times the factor of its history, or the vector of its history.
+    """Return a value at a time [s]: `value` times the factor of its history, or the vector of its history.
 
-    Without a history, the value is constant.
+    If `history` is None, the value is constant.
     """
     if history is None:
         return value

@@ -42,14 +42,17 @@ def get(thing: Any, name: str, refusal: str) -> Any:
 
 
 def put(thing: Any, name: str, value: object, refusal: str) -> Any:
-    """Return a copy of `thing` with `value` at a dotted name (it may be a JAX tracer). See `walk` for the arguments."""
+    """Return a copy of `thing` with `value` at a dotted name. `value` may be a JAX tracer.
+
+    See `walk` for the arguments.
+    """
     for step in reversed(walk(thing, name, refusal)):
         value = step.with_inside(value)
     return value
 
 
 def metadata(thing: Any, name: str, refusal: str) -> dict[str, object]:
-    """Return unit and bounds of the field at a dotted name. See `walk` for the arguments and errors."""
+    """Return the metadata (unit, bounds, …) of the field at a dotted name. See `walk` for the arguments and errors."""
     last = next(step for step in reversed(walk(thing, name, refusal)) if dataclasses.is_dataclass(step.owner))
     return dict(last.owner.__dataclass_fields__[last.key].metadata)
 
@@ -64,7 +67,7 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
         refusal: beginning of the error message.
 
     Raises:
-        InputError: there is no value with this name. The message suggests a similar name.
+        InputError: no value has this name. The message suggests a similar name.
     """
     steps: list[PathStep] = []
     path, inside = name.split("."), thing
@@ -83,7 +86,7 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
 
 
 def _names_that_end_in(thing: object, name: str) -> list[str]:
-    """Return at most three dotted names of numbers that end in `name`. Case and a unit in brackets are ignored."""
+    """Return at most three dotted names of numbers that end in `name`. Capitals and a unit in brackets are ignored."""
     end = name.partition("[")[0].strip().lower()
     every = _names_of_numbers(thing) if end else ()
     return list(itertools.islice((own for own in every if f".{own}".lower().endswith(f".{end}")), 3))
@@ -107,7 +110,7 @@ def _names_of_numbers(struct: object, before: str = "") -> Iterator[str]:
 def _keys(thing: Any, path: list[str], refusal: str, before: str) -> tuple[list, list[str]]:
     """Return the keys for the first words of a path, and the remaining words.
 
-    `before` is the part of the dotted name before the path.
+    `before` is the beginning of the dotted name, without the path. It is used in messages.
     """
     word, rest = path[0], path[1:]
     if dataclasses.is_dataclass(thing):
@@ -142,7 +145,7 @@ def _keys_of_struct(thing: Any, path: list[str], refusal: str, before: str) -> t
 
 
 def _is_place(word: str) -> bool:
-    """Return whether a word is an index as Python writes it: 2, but not 02, which would be a second name for 2."""
+    """Return whether a word is an index in Python's notation: 2 is allowed. 02 is not, so that 2 has only one name."""
     return word.isascii() and word.isdigit() and str(int(word)) == word
 
 

@@ -5,7 +5,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-#: The colours of Okabe and Ito, which people with any kind of colour vision can distinguish.
+#: Colours of Okabe and Ito. People with any kind of colour vision can distinguish them.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
@@ -15,7 +15,7 @@ def pyplot() -> Any:
 
     Matplotlib is imported only if needed, because the import is slow.
     """
-    os.environ["MPLBACKEND"] = "Agg"  # an unknown backend in this variable would stop the import
+    os.environ["MPLBACKEND"] = "Agg"  # with an unknown backend in this variable, the import would fail
     import matplotlib
 
     matplotlib.use("Agg")
@@ -25,7 +25,7 @@ def pyplot() -> Any:
 
 
 def import_meanwhile() -> None:
-    """Import pyplot in a thread. The import takes a second; meanwhile, a computation outside of Python can run."""
+    """Import pyplot in a thread. The import takes about a second. During this time a compiled program can run."""
     threading.Thread(target=pyplot, daemon=True).start()
 
 

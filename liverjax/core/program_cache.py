@@ -1,8 +1,8 @@
 """Keep compiled programs (here: programs) on disk, so that a machine compiles each program only once.
 
-This is JAX's cache in a separate folder of the user's cache directory. The name of the folder depends on the releases,
-the sources and the processor, so no other release, checkout or machine uses its programs. The environment variable
-`LIVERJAX_CACHE` can name another folder; "off" means no cache.
+JAX's own cache stores the programs, in a separate folder of the user's cache directory. The name of the folder depends
+on the versions of liverjax and JAX, on the source files and on the processor. So other versions, sources or machines
+never use these programs. The environment variable `LIVERJAX_CACHE` can name another folder; "off" means no cache.
 """
 
 import hashlib
@@ -16,10 +16,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 SWITCH = "LIVERJAX_CACHE"
-#: Maximum size of all programs on disk [bytes]. If they are larger, the next command removes the programs that were not
-#: used for the longest time. A program takes 10 kB to 1 MB.
+#: Maximum size of all programs on disk [bytes]. If the programs together are larger, the next command removes those
+#: that were not used for the longest time. A program takes 10 kB to 1 MB.
 LIMIT = 500_000_000
-#: A program is not kept if its compilation takes less than this time [s]. Finding a program takes a few milliseconds.
+#: A program is stored only if its compilation takes at least this time [s]. Reading a program takes a few milliseconds.
 WORTH_KEEPING = 0.05
 
 
@@ -27,21 +27,25 @@ _in_use: list[Path] = []
 
 
 def folder() -> Path | None:
-    """Return the folder in which programs are kept now. Returns None outside of `kept_on_disk`, or without a cache."""
+    """Return the folder in which programs are stored now.
+
+    Returns None outside of `kept_on_disk`, or if there is no cache.
+    """
     return _in_use[-1] if _in_use else None
 
 
 @contextmanager
 def kept_on_disk() -> Iterator[Path | None]:
-    """Read and write compiled programs on disk inside this context. It yields the folder, or None without a cache.
+    """Read and write compiled programs on disk inside this context. It yields the folder of the cache.
 
-    There is no cache if `LIVERJAX_CACHE` is "off" or if the folder cannot be written. If the user has set a folder for
-    JAX's cache (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder, and there is no cache here. Programs that cannot
-    be read are compiled again.
+    It yields None if there is no cache. There is no cache if `LIVERJAX_CACHE` is "off" or if the folder cannot be
+    written. If the user has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder, and there
+    is no cache here. Programs that cannot be read are compiled again.
     """
     chosen = _folder()
     with warnings.catch_warnings():
-        # A broken entry, a full disk, or another process that removes old entries only causes another compilation.
+        # The cache warns of broken entries, a full disk, or entries that another process removed. These warnings are
+        # not shown, since the programs are then only compiled again.
         warnings.filterwarnings("always", "Error (reading|writing) persistent compilation cache")
         show = warnings.showwarning
 
@@ -66,18 +70,19 @@ def _switch_on(folder: Path) -> None:
 
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
-    # JAX sets TF_CPP_MIN_LOG_LEVEL to 1 if it is not set.
+    # JAX itself sets TF_CPP_MIN_LOG_LEVEL to 1 if the user has not set it.
     if "JAX_LOGGING_LEVEL" not in os.environ and os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
-        # XLA writes an error for every CPU program that it reads, because it treats two of its tuning flags as missing
-        # features of the processor. The folder is only for this processor, so the error has no meaning here.
+        # XLA logs an error for every CPU program that it reads, because it treats two of its own tuning flags as
+        # missing features of the processor. The programs in the folder are only for this processor, so the error is
+        # wrong.
         jax.config.update("jax_logging_level", "CRITICAL")
 
 
 def _folder() -> Path | None:
-    """Return the folder for these releases, these sources and this processor.
+    """Return the folder for these versions, source files and processor. The folder is made if it does not exist.
 
-    The folder is made if it does not exist. Returns None if this cache is not used: it
-    is switched off, JAX uses another folder, or the folder cannot be written.
+    Returns None if this cache is not used: it is switched off, JAX uses another folder, or the folder cannot be
+    written.
     """
     chosen = os.environ.get(SWITCH, "")
     if chosen.lower() == "off" or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
@@ -95,17 +100,17 @@ def _folder() -> Path | None:
 
 
 def _user_cache() -> Path:
-    """The user's cache directory on this platform."""
+    """Return the user's cache directory on this platform."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches"
     given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return given if given.is_absolute() else Path.home() / ".cache"  # XDG's rules ignore relative paths
+    return given if given.is_absolute() else Path.home() / ".cache"  # by the XDG standard, relative paths are ignored
 
 
 def _name() -> str:
-    """Return the name of the folder: the releases, and a digest of sources and processor."""
+    """Return the name of the folder: the versions of liverjax and JAX, and a digest of source files and processor."""
     import liverjax
 
     package = Path(liverjax.__file__).parent
@@ -116,7 +121,7 @@ def _name() -> str:
 
 
 def _processor() -> str:
-    """Return kind and features of the processor. A program compiled for one processor may not run on another."""
+    """Return kind and features of the processor. A program compiled for one processor may not run on another one."""
     said = f"{platform.system()} {platform.machine()} {platform.processor()}\n"
     try:
         first = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0]
@@ -129,7 +134,7 @@ def _processor() -> str:
 def _forgotten(folder: Path, message: str) -> bool:
     """Return whether a warning is about the cache.
 
-    If the warning names a broken entry, this entry is removed, since JAX would keep it.
+    If the warning names a broken entry, this entry is removed. Otherwise JAX would try to read it again and again.
     """
     if "persistent compilation cache" not in message:
         return False
@@ -141,14 +146,14 @@ def _forgotten(folder: Path, message: str) -> bool:
 
 
 def bound(root: Path, limit: int = LIMIT) -> None:
-    """Remove the least recently used programs, until all releases together take at most `limit` bytes."""
+    """Remove the least recently used programs, until the programs of all versions take at most `limit` bytes."""
     entries = []
     for entry in root.glob("*/*-cache"):
         try:
             found = entry.stat()
-        except OSError:  # another process was faster
+        except OSError:  # another process has removed the entry
             continue
-        # Some file systems do not record when a file was last read. Then the time of writing is used.
+        # Some file systems do not record when a file was last read. Then the time at which it was written is used.
         entries.append((max(found.st_atime, found.st_mtime), found.st_size, entry))
     left = sum(size for _, size, _ in entries)
     for _, size, entry in sorted(entries):
@@ -161,5 +166,5 @@ def bound(root: Path, limit: int = LIMIT) -> None:
 def _remove(entry: Path) -> None:
     try:
         entry.unlink()
-    except OSError:  # already removed, or in use (on Windows): the next command tries again
+    except OSError:  # the entry is already removed, or in use (on Windows): the next command tries again
         return

@@ -1,4 +1,4 @@
-"""Result codes of solves, and one sentence of advice for each code. Compiled programs contain only the codes."""
+"""Result codes of solves, and one sentence of advice for each code. Compiled programs return only the codes."""
 
 CONVERGED = 0
 STALLED = 1
@@ -32,7 +32,7 @@ ADVICE = {
 }
 
 
-#: Short words for tables.
+#: Short names of the result codes, for tables.
 NAMES = {
     CONVERGED: "converged",
     STALLED: "stalled",

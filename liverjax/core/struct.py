@@ -17,19 +17,17 @@ Numbers = Number | Sequence[float] | Sequence[Sequence[float]]
 Array = np.ndarray | jax.Array
 #: Index numbers of nodes, elements or triangles.
 Indices = Array
-#: A table of a TOML file, or the content of a JSON file. The values are checked when they are read.
+#: A table of a TOML file, or the content of a JSON file. Its values are checked when they are used.
 Content = dict[str, Any]
 
 
 def static(
     default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None, words: Sequence[str] = ()
 ) -> Any:
-    """Declare a field that is part of the structure, for example a tag or a count.
+    """Declare a field that is part of the structure of a pytree, for example a tag or a count.
 
-    The field has no gradient, and a new value needs a new compilation.
-
-    With `lower`, the value must be a whole number, `lower` or more. With `words`, the value must be one of these words
-    (see `liverjax.core.bounds`).
+    The field has no gradient, and a new value needs a new compilation. With `lower`, the value must be a whole number,
+    `lower` or more. With `words`, the value must be one of these words (see `liverjax.core.bounds`).
     """
     metadata = {"static": True, "about": about, "lower": lower, "words": tuple(words)}
     return dataclasses.field(default=default, metadata=metadata)
@@ -58,9 +56,9 @@ def param(
     Args:
         unit: SI unit, ``"1"`` for a pure number. Fields in ``Pa`` scale together in `liverjax.laws.scaled`.
         about: one line for ``python -m liverjax laws``.
-        each: whether the value is a sequence with one number per term (or the components of a direction).
-        typical: value for a soft tissue with a shear modulus of about 1 kPa. It is used if only the name of a law is
-            given.
+        each: whether the value is a sequence: one number for each term of a law, or the components of a direction.
+        typical: value for a soft tissue with a shear modulus of about 1 kPa. It is used if a user gives only the name
+            of a law.
         default: see `dataclasses.field`.
         limits: ``lower`` and ``upper`` are inclusive bounds; ``above`` is a strict lower bound; ``nonzero=True`` means
             that 0 is not allowed.
@@ -83,8 +81,8 @@ def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.
 
     Args:
         about: one line about the field.
-        places: name of a method that returns the indices in this field for a word. For example, `support.0` is at the
-            first index of ``named("support")``.
+        places: name of a method of the struct. For a word, the method returns the indices of this field whose entries
+            have this name. For example, `support.0` is the entry at the first index of ``named("support")``.
         default: see `dataclasses.field`.
     """
     return dataclasses.field(default=default, metadata={"about": about, "unnamed": places or True})
@@ -101,8 +99,8 @@ def struct(cls: type[T]) -> type[T]:
 
     def flatten(thing: Any) -> tuple[tuple, tuple]:
         values = thing.__dict__
-        # The class is part of the structure. `register_dataclass` of jaxlib 0.10.0 to 0.12.0.1 ignores it when
-        # structures are compared: a jitted function may then run the program of one law with numbers of another.
+        # The class is part of the structure. `register_dataclass` of jaxlib 0.10.0 to 0.12.0.1 ignores the class when
+        # it compares structures: a jitted function may then use the program of one law with the numbers of another law.
         return tuple(values[name] for name in data), (made, *(values[name] for name in meta))
 
     def flatten_with_keys(thing: Any) -> tuple[tuple, tuple]:

@@ -10,7 +10,7 @@ from liverjax.tensors.matrices import Matrix, Vector, cofactor, deformation_grad
 
 
 def volume_gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
-    """Derivatives dJ/dx_a = cof(F) D_a [1/m] for the four corners a, at every integration point. D_a: shape vectors."""
+    """Derivatives dJ/dx_a = cof(F) D_a [1/m] at integration points, for corners a with shape function gradients D_a."""
     cof = cofactor(F)
     g = [matvec(cof, tuple(mesh.gradients[a])) for a in range(3)]
     return [tuple(-(x + y + z) for x, y, z in zip(*g, strict=True)), *g]

@@ -6,8 +6,9 @@ second derivatives of the energy density W with respect to I_a and I_b, summed o
     f_i  = V0 sum_a W_a v_a,i                                             v_a,i = dI_a/dx_i
     K_ij = V0 [ sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j ]
 
-So the cost does not grow with the number of terms g^k(I1, I2) h^k(J) of W. No matrix is inverted. In all functions the
-force is the gradient of the energy, f = + dW/dx; the nodal force in the chapter is -dW/dx.
+V0 is the reference volume of the element, x_i is the position of node i, and (x) is the tensor product. The cost does
+not grow with the number of terms g^k(I1, I2) h^k(J) of W. No matrix is inverted. In all functions the force is the
+gradient of the energy, f = + dW/dx; the nodal force in the chapter is -dW/dx.
 
 A linear element has one integration point. At each point of a quadratic element the formulas are the same, with the
 corners that `liverjax.mesh.shape_functions` describes.
@@ -31,7 +32,7 @@ from liverjax.tensors.matrices import Matrix, deformation_gradient, dot, stored,
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Corner pairs of the blocks that are computed. The other blocks follow from these.
+#: Pairs of corners for which stiffness blocks are computed. The other blocks follow from these blocks.
 _PAIRS = ((1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 
 
@@ -42,7 +43,11 @@ def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
-    """Nodal forces (V, 3) [N] due to first Piola-Kirchhoff stresses P [Pa]: sums of V0 P D_a over the points."""
+    """Nodal forces (V, 3) [N] due to first Piola-Kirchhoff stresses P [Pa].
+
+    The force at corner a is the sum of V0 P D_a over the integration points, with volumes V0 and gradients D_a [1/m] of
+    the shape functions.
+    """
     D, V0 = mesh.gradients, mesh.weights
     forces: Any = [[V0 * dot(P[i], tuple(D[a])) for i in range(3)] for a in range(3)]
     if mesh.order > 1:
@@ -75,10 +80,11 @@ def linear_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
 def element_stiffness(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> dict[tuple[int, int], Matrix]:
-    """Blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3 at every point: 45 different entries per point.
+    """Stiffness blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3: 45 different entries per integration point.
 
-    `terms` is "contracted", or "chapter": six terms for each product g h of W (`liverjax.laws.terms.chapter_terms`).
-    The other blocks follow from the symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
+    `terms` is "contracted", or "chapter" for six terms per product g(I1, I2) h(J) of W
+    (`liverjax.laws.terms.chapter_terms`). The other blocks follow from the symmetry, K_ba = K_ab^T, and from K_0b =
+    -(K_1b + K_2b + K_3b).
     """
     F, pairs = stored(deformation_gradient(mesh, x)), tuple((a - 1, b - 1) for a, b in _PAIRS)
     D = [tuple(mesh.gradients[a]) for a in range(3)]
@@ -143,7 +149,7 @@ def element_matrices(
 
 
 def of_nodes(order: int, corners: jax.Array) -> jax.Array:
-    """Matrices (E, 9 n^2) of elements with n nodes, from the matrices (Q, E, 144) of the corners at every point."""
+    """Matrices (E, 9 n^2) of elements with n nodes, from those (Q, E, 144) of the corners at Q integration points."""
     Q, E = corners.shape[:2]
     c = jnp.asarray(basis(order).c, corners.dtype)
     K = jnp.einsum("akq,qekilj,blq->eaibj", c, corners.reshape(Q, E, 4, 3, 4, 3), c)

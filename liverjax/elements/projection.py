@@ -1,4 +1,4 @@
-"""Element stiffness without negative eigenvalues, from the singular values of F, without LAPACK or an inverse.
+"""Element stiffness without negative eigenvalues, computed from the singular values of F, without LAPACK.
 
 Let F = U diag(s) V^T. In the axes of U and V, the second derivative of an isotropic energy has two kinds of blocks: one
 3 x 3 matrix for the three stretches, and one 2 x 2 matrix [[a, b], [b, a]] for each pair of axes. The eigenvalues of
@@ -98,7 +98,7 @@ def blocks(
         parts: pairs (weight, law); the energy is the weighted sum.
         S: constant second Piola-Kirchhoff stress that is added, or None.
         F: deformation gradient, a tuple matrix.
-        D: shape vectors of the nodes.
+        D: gradients of the shape functions of the nodes.
         pairs: node pairs of the blocks, as indices into D.
         volume: derivatives of a volumetric energy that is added, or None.
     """
@@ -182,7 +182,8 @@ def _diagonal_matrix(value: Any) -> Matrix:
 def _fibre(W4: Number, W44: Number, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     """Fibre stiffness 2 W_4 (a.D_i)(a.D_j) I + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa; negative eigenvalues are set to 0.
 
-    W_4 and W_44 are derivatives with respect to the invariant I4, a is the fibre direction, and D are shape vectors.
+    W_4 and W_44 are derivatives with respect to the invariant I4, a is the fibre direction, and D_i are the gradients
+    of the shape functions.
     """
     Fa = matvec(F, a)
     across = jnp.maximum(2 * W4, 0.0)

@@ -92,7 +92,7 @@ def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.s
 
 
 def _all_shape_vectors(mesh: TetMesh) -> jax.Array:
-    """Gradients of the shape functions: (E, 4, 3) for linear elements, otherwise (Q, E, n, 3)."""
+    """Gradients of the shape functions: (E, 4, 3) for linear elements; otherwise (Q, E, n, 3): Q points, n nodes."""
     D = jnp.transpose(mesh.shape_vectors, (2, 0, 1))
     D = jnp.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
     return D if mesh.order == 1 else jnp.einsum("akq,ekj->qeaj", jnp.asarray(basis(mesh.order).c, D.dtype), D)
@@ -104,7 +104,7 @@ def _gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
 
 
 def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:
-    """Energy W as a function of C. The Cholesky factor serves as F: F^T F = C and J > 0. Fibres are also possible."""
+    """Energy W as a function of C. F is the transposed Cholesky factor of C (F^T F = C, J > 0), also with fibres."""
     return law.energy(jnp.swapaxes(jnp.linalg.cholesky(0.5 * (C + jnp.swapaxes(C, -1, -2))), -1, -2))
 
 

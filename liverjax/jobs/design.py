@@ -13,7 +13,7 @@ _BEGINNINGS = tuple(f"# {kind}".encode() for kind in KINDS)
 
 
 def number_of(text: str) -> float:
-    """Convert a cell of a table to a number. Unlike in Python, underscores and non-ASCII digits are not allowed.
+    """Convert a table cell (a string) to a number. Underscores and non-ASCII digits are not allowed (unlike in Python).
 
     Raises:
         ValueError: the string is not such a number.
@@ -37,7 +37,7 @@ def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
         except ValueError:
             raise InputError(f"{text!r} is not a range: write name=low:high, e.g. law.mu=500:1000") from None
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
-            raise InputError(f"{text!r} does not rise: write name=low:high, e.g. law.mu=500:1000")
+            raise InputError(f"{text!r} does not rise from low to high: write name=low:high, e.g. law.mu=500:1000")
         if not name.strip():
             raise InputError(f"{text!r} contains no name: write name=low:high, e.g. law.mu=500:1000")
         if name in ranges:
@@ -64,7 +64,7 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
         raise InputError(f"--kind {kind} is not known: use {', '.join(KINDS)}")
     if rows < 1 or not ranges:
         raise InputError(
-            f"--rows {rows} with {len(ranges)} parameters makes no table: give at least one row and one parameter"
+            f"--rows {rows} and {len(ranges)} parameters make no table: give at least one row and one parameter"
         )
     low, high = np.array(list(ranges.values())).T
     if kind == "grid":
@@ -92,11 +92,13 @@ def write_table(file: Path, names: list[str], rows: np.ndarray, note: str) -> No
     text = f"# {note}\n" + "".join(",".join(line) + "\n" for line in lines)
     try:
         if file.is_file() and file.stat().st_size and not file.read_bytes().startswith(_BEGINNINGS):
-            raise InputError(f"{file} exists and is not a table of design: name another file, or remove it")
+            raise InputError(
+                f"{file} exists and is not a table of `liverjax design`: give another file, or remove this file"
+            )
         if file.exists() and not file.is_file():  # e.g. the terminal, a pipe
             file.write_text(text, encoding="utf-8")
             return
         with whole(file) as beside:
             beside.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{file} cannot be written ({error.strerror}): name another file") from None
+        raise InputError(f"{file} cannot be written ({error.strerror}): give another file") from None

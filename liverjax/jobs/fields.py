@@ -1,7 +1,7 @@
 """Fields of a finished run: stress, strain, stretches, volume ratio, energy, velocity of the fluid.
 
-The equations of every step are evaluated again at the positions of the run. So the history variables (viscous stress,
-fluid) are the same as in the run. Nothing is solved again.
+The equations of every step are evaluated again at the positions of the run, but not solved again. So the history
+variables (viscous stress, fluid) are the same as in the run.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ from liverjax.simulation.equations import Equations, Sizes, State, advanced, equ
 from liverjax.simulation.run import Result, prepared
 from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant, pack
 
-#: Name -> unit.
+#: Name of each field -> unit.
 FIELDS = {
     "cauchy_stress": "Pa",
     "green_strain": "1",
@@ -36,17 +36,17 @@ def check(names: list[str], scene: Scene) -> None:
     """Raise `InputError` if a field is unknown, or if the scene does not have it.
 
     Raises:
-        InputError: the message names the field.
+        InputError: a field is unknown, or needs a porous body. The message names the field.
     """
     for name in names:
         if name not in FIELDS:
             raise InputError(f"[output] fields: {name!r} is not known: {hint(name, FIELDS)}")
     if "fluid_velocity" in names and scene.porosity is None:
-        raise InputError("[output] fields: fluid_velocity needs [porosity]; remove fluid_velocity")
+        raise InputError("[output] fields: fluid_velocity needs [porosity]: remove fluid_velocity")
 
 
 def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarray]:
-    """Return fields (T, E, …) of a finished run, as means over each element.
+    """Return fields (T, E, …) of a finished run at T steps, as means over each element.
 
     The fields are cauchy_stress (3, 3) [Pa] including the fluid pressure, green_strain (3, 3), principal_stretches (3,)
     with the largest first, volume_ratio J, energy [Pa] of the law per reference volume, and fluid_velocity (3,) [m/s]
@@ -76,14 +76,15 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
 
 @jax.jit
 def _put_again(scene: Scene, sizes: Sizes, state: State, given: Any) -> tuple[State, tuple]:
-    """Return the state after a step that ended at positions x, and values at the integration points (…, Q, E).
+    """Return the state after a step that ended at positions x, and values (…, Q, E) at Q points of each element.
 
-    These are first Piola-Kirchhoff stress, deformation gradient F, energy density and fluid velocity.
+    The points are integration points. The values are first Piola-Kirchhoff stress, deformation gradient F, energy
+    density and fluid velocity.
     """
     k, x, pressure = given
     mesh, e = scene.mesh, equations(scene, state, k, sizes)
     F = deformation_gradient(mesh, x)
-    if e.mixed is not None:  # mixed pressures are not in the result, but follow from the volumes
+    if e.mixed is not None:  # pressures of mixed volumes are not in the result, but follow from the volumes
         pressure = e.mixed.settled(mesh, determinant(F))
     P = _whole_stress(e, F, pressure)
     law = law_at_rest(scene)

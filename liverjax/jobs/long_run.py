@@ -1,8 +1,8 @@
 """Run a scene in parts of some steps each. Finished parts stay on disk, so that a killed run can continue from them.
 
 A folder next to the output has one file per part, with the results of its steps and the state after its last step.
-Every part begins with a new tangent matrix, even if the run was not stopped before this part. So a resumed run gives
-exactly the same numbers.
+Every part begins with a new tangent matrix, also in a run that is not stopped. So a resumed run gives exactly the same
+numbers.
 """
 
 import time
@@ -30,10 +30,10 @@ _ROWS = ("times", "positions", "reactions", "pressure", "status")
 
 
 class Ran(NamedTuple):
-    """A finished run and its computing time. Parts that were read from disk count as 0 s."""
+    """A finished run and its computing time. Parts that were read from disk do not count."""
 
     result: Result  # numpy arrays
-    steps: int  # steps that were computed now
+    steps: int  # number of steps that were computed and not read from disk
     run_time: float  # [s]
     compile_time: float  # [s]
     beside: Mapping[str, tuple[np.ndarray, str]] = {}  # additional datasets of the result: name -> values, unit
@@ -48,7 +48,7 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
     """
     folder = resumable_parts.beside(out)
     if folder.exists() and not resume:
-        raise InputError(f"{folder} holds an unfinished run: go on with --resume, or remove it")
+        raise InputError(f"{folder} contains an unfinished run: continue with --resume, or remove this folder")
     if resume and not folder.exists() and out.exists() and text is not None:
         try:
             with h5py.File(out) as file:
@@ -56,7 +56,7 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
         except (OSError, tomllib.TOMLDecodeError):  # not a result of a scene
             return
         if before != tomllib.loads(text):  # comments may differ
-            raise InputError(f"{out} is the result of another scene: name another --out, or remove --resume")
+            raise InputError(f"{out} is the result of another scene: give another --out, or remove --resume")
 
 
 def run(
@@ -76,10 +76,12 @@ def run(
         every: number of steps per part.
         resume: whether to continue from the parts on disk.
         report: function that is called with the number of every finished step, including steps from disk. It is called
-            at the end of each part, because JAX cannot keep a program on disk that calls Python while it runs.
+            at the end of each part, because JAX cannot store a compiled program on disk if this program calls Python
+            functions.
 
     Raises:
-        InputError: parts on disk without `resume`, parts of another scene, or parts in use by another process.
+        InputError: there are parts on disk and `resume` is false; the parts belong to another scene; another process
+            uses the parts.
         OSError: the disk is full; finished parts are kept.
     """
     steps, folder = scene.solve.steps, resumable_parts.beside(out)
@@ -91,7 +93,7 @@ def run(
         return _run_parts(scene, steps, None, report)
     resumable_parts.make_folder(folder)
     with resumable_parts.locked(folder / "lock_0"):
-        # The text names files (mesh, history) with content that may change, so all numbers are also compared.
+        # The scene file names other files (mesh, history). Their content may change, so all numbers are also compared.
         numbers = resumable_parts.digest(*jax.tree.leaves(scene))
         resumable_parts.same(
             {"scene": text, "numbers": numbers, "every": every, "versions": versions()}, folder / "run.json"
@@ -127,7 +129,7 @@ def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[
     return Ran(whole, computed, run_time, compile_time)
 
 
-#: A run takes about a second if the number of integration points times the number of steps has this value.
+#: A run takes about one second if the number of integration points times the number of steps has this value.
 _SHORT = 100_000
 
 

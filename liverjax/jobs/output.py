@@ -36,7 +36,7 @@ def write_hdf5(
 ) -> None:
     """Write a run to an HDF5 file. Arrays become datasets; status, iterations and `attributes` become attributes.
 
-    The datasets are the results of all steps, the mesh, `fields` (T, E, …) and `beside` (values and unit). An array
+    The datasets are the results of the T steps, the mesh, `fields` (T, E, …) and `beside` (values and unit). An array
     with one number per step becomes a dataset if it is too long for an attribute; `read_by_step` reads both forms. The
     nodes of quadratic tetrahedra (E, 10) are in the order of VTK.
     """
@@ -77,7 +77,7 @@ def write_hdf5(
 
 
 def read_by_step(file: "h5py.File", name: str) -> np.ndarray:
-    """Read the numbers (T,) with a name of `BY_STEP` from result.h5: an attribute, or in long runs a dataset."""
+    """Read the numbers (T,) of T steps with a name of `BY_STEP` from result.h5: an attribute or, if long, a dataset."""
     return np.asarray(file.attrs[name] if name in file.attrs else file[name][()])
 
 

@@ -15,9 +15,9 @@ from liverjax.mesh.tetrahedra import tet_mesh
 class Surface(NamedTuple):
     """The surface to draw, with the labels of the picture."""
 
-    before: np.ndarray  # (V, 3) [m]
-    after: np.ndarray  # (V, 3) [m]
-    triangles: np.ndarray  # (m, 3)
+    before: np.ndarray  # # (V, 3) [m] positions before the run
+    after: np.ndarray  # (V, 3) [m] positions after the run
+    triangles: np.ndarray  # (m, 3) node numbers of m triangles
     values: np.ndarray  # (V,) values that the colours show
     label: str
     title: str
@@ -35,7 +35,7 @@ DRAWN = {
 
 
 def draw_surface(file: Path, surface: Surface) -> None:
-    """Draw the surface before (grey) and after the run (coloured) to a PNG file."""
+    """Draw the surface before the run (grey) and after the run (coloured) to a PNG file."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     before, after, triangles = surface.before, surface.after, surface.triangles
@@ -59,7 +59,7 @@ def draw_surface(file: Path, surface: Surface) -> None:
 
 
 def of_result(file: Path, name: str, step: int | None = None) -> Surface:
-    """Read the surface from result.h5, with a field, `displacement` or `pressure` as its colour.
+    """Read the surface from result.h5. A field, `displacement` or `pressure` gives its colours.
 
     Args:
         file: result.h5 of `liverjax simulate`.
@@ -76,11 +76,11 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
     try:
         with h5py.File(file) as data:
             if "sweep" in data.attrs:
-                raise InputError(f"{file} holds the runs of a sweep: give the result.h5 of one run")
+                raise InputError(f"{file} contains the runs of a sweep: give the result.h5 of one run")
             if "modes" in data:
-                raise InputError(f"{file} holds a reduced model: run it, and draw the result.h5 of that run")
+                raise InputError(f"{file} contains a reduced model: run it, and give the result.h5 of this run")
             if "frequencies_Hz" in data:
-                raise InputError(f"{file} holds harmonic motion: write it for ParaView with simulate --vtu")
+                raise InputError(f"{file} contains harmonic motion: use simulate --vtu to write it for ParaView")
             tets, before, after = data["tetrahedra"][()][:, :4], data["reference"][()], data["positions"]
             steps, fields = len(after), list(data.get("fields/vertices", ()))
             known = ["displacement", *(["pressure"] if "pressure" in data else []), *fields]

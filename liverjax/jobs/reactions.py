@@ -1,4 +1,4 @@
-"""Support forces on the body over time, for each fixed, displaced or support condition: table of `reactions.csv`."""
+"""Forces of the supports on the body over time, one for each support condition: the table of `reactions.csv`."""
 
 from typing import Any
 
@@ -42,7 +42,8 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
 
 
 def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
-    """Return {name: force (T, 3) [N]} of each fixed, displaced or sliding condition, from nodal forces (T, V, 3).
+    """Return {name: force (T, 3) [N]} of each fixed, displaced or sliding condition. `reactions` (T, V, 3) [N]: T
+    steps.
 
     The force of a fixed or displaced condition acts along the axes that it constrains. The force of a sliding support
     acts along its normal. If two conditions constrain the same axis of a node, the force along this axis counts only
@@ -78,7 +79,7 @@ def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:
-    """Return {name: force (T, 3) [N] on the body} of elastic supports, and of ligaments that end outside of the body.
+    """Return {name: force (T, 3) [N] on the body} of elastic supports, and of ligaments with an end outside the body.
 
     Args:
         scene: the scene that was run.

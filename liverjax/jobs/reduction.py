@@ -25,7 +25,7 @@ from liverjax.solvers.problem import StepStatistics
 
 
 def learnt(model: ReducedModel) -> str:
-    """Describe the learnt correction of a model in one sentence."""
+    """Return one sentence about the learnt correction of a model."""
     if model.correction is None:
         return "no correction: too few training runs, or no correction reduced the errors"
     left = np.asarray(model.correction.left)
@@ -45,7 +45,7 @@ def make(
     """Run the full model for each row of a table, and write the reduced model that is made from these runs.
 
     Raises:
-        InputError: an unusable scene, table, tolerance or output.
+        InputError: the scene, the table, the tolerance or the output cannot be used.
     """
     if modes < 1:
         raise InputError(f"--modes {modes} must be above 0: give e.g. 40")

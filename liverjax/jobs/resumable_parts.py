@@ -68,7 +68,7 @@ def make_folder(folder: Path) -> None:
         probe.write_text("")
         probe.unlink()
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; name an --out that can be written") from None
+        raise InputError(f"{folder}: {error.strerror}; give an --out that can be written") from None
 
 
 @contextmanager
@@ -83,7 +83,7 @@ def locked(file: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise InputError(
-                f"{file.parent} is in use by another process: wait for it, or name another --out"
+                f"{file.parent} is in use by another process: wait until that process ends, or give another --out"
             ) from None
         yield
 
@@ -102,8 +102,8 @@ def same(identity: Mapping[str, object], file: Path) -> None:
     for key, value in json.loads(file.read_text()).items():
         if identity.get(key) != value:
             raise InputError(
-                f"{file.parent} holds parts of another {file.stem} (not the same {key}): name another --out, or remove "
-                "this folder"
+                f"{file.parent} contains parts of another {file.stem} (not the same {key}): give another --out, or "
+                "remove this folder"
             )
 
 

@@ -1,4 +1,4 @@
-"""Sweeps: run one scene with many parameter sets. Results stay valid if the process is killed at any moment.
+"""Sweeps: run one scene with many parameter sets. The process may be killed at any moment: finished results stay valid.
 
 The table has one parameter set per row. The sets are run in chunks. A finished chunk is a separate file in
 FILE.h5.parts, which is written under a temporary name and then renamed. When all chunks are finished, they are joined
@@ -41,7 +41,7 @@ from liverjax.simulation.automatic import with_solver
 from liverjax.simulation.batch import simulate_batch
 from liverjax.simulation.cautions import LEAST_J, MOST_J
 
-#: Name of an output that may be stored for every run -> function of result and reference positions (V, 3) [m].
+#: Name of an output that can be stored for every run -> function of the result and the reference positions (V, 3) [m].
 OUTPUTS: dict[str, Callable] = {
     "final_positions": lambda result, reference: result.positions[-1],
     "positions": lambda result, reference: result.positions,
@@ -55,7 +55,7 @@ _UNITS = {"final_reactions": "N", "largest_pressure": "Pa", "status": "1", "resi
 
 
 class Sweep(NamedTuple):
-    """The runs to compute. `identity` contains everything on which the results depend."""
+    """The N runs to compute, with P parameters each. `identity` contains all input that determines the results."""
 
     scene: Scene
     names: tuple[str, ...]
@@ -73,7 +73,7 @@ class Done(NamedTuple):
     file: Path | None  # None: other processes still have chunks to compute
     failed: dict[int, int]  # row number -> status code
     computed: int  # number of runs that this process computed now
-    crushed: dict[int, float]  # row number of a converged run -> its final volume ratio J, if no tissue can reach it
+    crushed: dict[int, float]  # row number of a converged run -> final volume ratio J if it is impossible in tissue
 
 
 def read_sweep(
@@ -87,7 +87,7 @@ def read_sweep(
     """Read a sweep from a scene file and a table with a header of dotted names. All rows are checked before any run.
 
     Raises:
-        InputError: an unusable scene or table, a name that the scene does not have, or a value out of bounds.
+        InputError: the scene or the table cannot be used; the scene does not have a name; a value is out of bounds.
     """
     scene = load_scene(scene_file)
     names, rows = read_table(parameters)
@@ -153,7 +153,7 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     for mark, name in ((";", "semicolons"), ("\t", "tabs")):
         if lines and mark in lines[0] and "," not in lines[0]:
-            raise InputError(f"{file} has {name} between its cells: write commas, and decimal points")
+            raise InputError(f"{file} has {name} between its cells: write commas between cells, and decimal points")
     table = [[cell.strip() for cell in row] for row in csv.reader(lines)]
     if len(table) < 2:
         raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row per run")
@@ -161,11 +161,13 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     if "" in names:
         raise InputError(f"{file}: column {names.index('') + 1} has no name: give it a name, or remove its comma")
     if len(set(names)) < len(names):
-        raise InputError(f"{file} names {max(names, key=names.count)} twice: remove one column")
+        raise InputError(f"{file} names {max(names, key=names.count)} twice: remove one of the two columns")
     rows = []
     for k, row in enumerate(table[1:]):
         if len(row) != len(names):
-            raise InputError(f"{file}: row {k + 1} has {len(row)} values for {len(names)} names: complete it")
+            raise InputError(
+                f"{file}: row {k + 1} has {len(row)} values for {len(names)} names: give one value for each name"
+            )
         for name, cell in zip(names, row, strict=True):
             try:
                 finite = np.isfinite(number_of(cell))
@@ -197,14 +199,14 @@ def run(
         report: function that is called after each chunk with the number of runs in it.
 
     Raises:
-        InputError: results that exist already, that belong to another sweep, or that another process uses.
+        InputError: the results exist already, belong to another sweep, or are in use by another process.
         OSError: the disk is full; finished chunks are kept.
     """
     folder = resumable_parts.beside(out)
     if out.exists():
         return _already(sweep, out, resume)
     if folder.exists() and not resume and process[1] == 1:
-        raise InputError(f"{folder} holds an unfinished sweep: go on with --resume, or remove it")
+        raise InputError(f"{folder} contains an unfinished sweep: continue with --resume, or remove this folder")
     resumable_parts.make_folder(folder)
     with resumable_parts.locked(folder / f"lock_{process[0]}"):
         resumable_parts.same(sweep.identity, folder / "sweep.json")
@@ -264,14 +266,14 @@ def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
 
 def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
     if not resume:
-        raise InputError(f"{out} exists already: name another --out, or remove it")
+        raise InputError(f"{out} exists already: give another --out, or remove this file")
     try:
         with h5py.File(out) as file:
             if json.loads(file.attrs["sweep"]) != json.loads(json.dumps(sweep.identity)):
-                raise InputError(f"{out} belongs to another sweep: name another --out, or remove it")
+                raise InputError(f"{out} belongs to another sweep: give another --out, or remove this file")
             codes, J = file["status"][:], file["volume_ratios"][:]
     except (OSError, KeyError):
-        raise InputError(f"{out} is not the result of a sweep: name another --out, or remove it") from None
+        raise InputError(f"{out} is not the result of a sweep: give another --out, or remove this file") from None
     return Done(out, _failures(sweep, codes), 0, _crushed(sweep, codes, J))
 
 
@@ -285,13 +287,13 @@ def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
             if not all(f.exists() for f in files):
                 return Done(None, {}, computed, {})
             codes, J = _join(sweep, out, files)
-    except (InputError, FileNotFoundError):  # another process is joining them
+    except (InputError, FileNotFoundError):  # another process is joining the parts
         return Done(None, {}, computed, {})
     resumable_parts.remove(folder)
     return Done(out, _failures(sweep, codes), computed, _crushed(sweep, codes, J))
 
 
-#: Bytes that HDF5 needs in addition to the datasets.
+#: Number of bytes that HDF5 needs in addition to the datasets.
 _HEADERS = 100_000
 
 
@@ -316,7 +318,7 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> tuple[np.ndarray, np.nd
         joined["parameters"].attrs["names"] = list(sweep.names)
         if sweep.probes:
             joined["probe_nodes"] = np.array(sweep.probes, dtype=int)
-        if "reference" not in joined:  # with a loaded mesh every run has a different reference
+        if "reference" not in joined:  # with a loaded mesh every run has a different reference shape
             joined["reference"] = np.asarray(sweep.scene.mesh.points)
         joined["reference"].attrs["unit"] = "m"
         joined["tetrahedra"] = meshio_cells(sweep.scene.mesh)[1]

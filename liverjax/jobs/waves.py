@@ -29,7 +29,7 @@ from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.mesh_error import HarmonicError, harmonic_errors
 from liverjax.waves.rest import under_its_weight
 
-#: A warning is given if the reactions of the relaxed body and of the run differ by more than this fraction.
+#: The program warns if the reactions of the relaxed body and of the run differ by more than this fraction.
 _RESTED = 0.05
 
 
@@ -47,12 +47,12 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 
     Args:
         scene: `Scene`.
-        about: result.h5 of a run of the same mesh. The body vibrates about the last state of this run. With None, it
-            vibrates about the state of rest under gravity and pre-tension, or about the reference shape.
+        about: result.h5 of a run of the same mesh. The body vibrates about the last state of this run. If `about` is
+            None, the body vibrates about the state of rest under gravity and pre-tension, or about the reference shape.
         mesh_error: whether to estimate the discretisation error of the mesh.
 
     Raises:
-        InputError: `harmonic` cannot solve the scene, or the file is not a result of this mesh.
+        InputError: `harmonic` cannot solve the scene, or the file `about` is not a result of this mesh.
     """
     x, reactions = (under_its_weight(scene), None) if about is None else _last_state(about, scene)
     begin = time.perf_counter()
@@ -74,10 +74,11 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
             x, reactions = (np.asarray(given[name][-1]) for name in ("positions", "reactions"))
             code = int(np.ravel(read_by_step(given, "status"))[-1])
     except (OSError, KeyError, IndexError) as error:
-        raise InputError(f"--about {file} holds no positions: give result.h5 of a run of this scene") from error
+        raise InputError(f"--about {file} holds no positions: give the result.h5 of a run of this scene") from error
     if x.shape != scene.mesh.points.shape:
         raise InputError(
-            f"--about {file} has {len(x)} nodes, the scene has {scene.mesh.number_of_nodes}: give a run of this mesh"
+            f"--about {file} has {len(x)} nodes, but the scene has {scene.mesh.number_of_nodes}: give a run of the "
+            "same mesh"
         )
     if code not in (status.CONVERGED, status.ONE_STEP):
         raise InputError(f"--about {file}: its last step is {status.NAMES[code]}; give a run that ended in equilibrium")
@@ -87,7 +88,7 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
 def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> list[str]:
     """Return a warning if the reactions (V, 3) [N] of the run differ from those of the relaxed body at positions x.
 
-    Then the stress of the run also differs from the relaxed stress. A porous body is not compared.
+    If so, the stress of the run also differs from the relaxed stress. There is no warning for a porous body.
     """
     pulled = np.linalg.norm(reactions, axis=1)
     if scene.porosity is not None or not pulled.any():
@@ -104,14 +105,14 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
     return [
         f"the relaxed body has other forces in the state of {name} than the run ({100 * apart:.2g} % difference), and "
         "the harmonic motion uses the relaxed body: let the run rest for much longer than its relaxation times, and "
-        "use the same material in both"
+        "use the same material in both scenes"
     ]
 
 
 def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
-    """Return the relative mesh errors (F,) of the motion, and of the largest support force, at each frequency.
+    """Return the relative mesh errors of the motion (F,), and of the largest support force (F,), at F frequencies.
 
-    They are NaN at frequencies without motion or without force. The mesh error must have been estimated before.
+    The errors are NaN at frequencies without motion or without force. The mesh error must have been estimated before.
     """
     error, found = waves.mesh_error, waves.found
     if error is None:
@@ -128,7 +129,7 @@ def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str, object]) -> None:
-    """Write frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), mesh and `attributes`."""
+    """Write F frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), mesh and `attributes`."""
     import h5py
 
     arrays = {name: (getattr(waves.found, name), unit) for name, unit in _UNITS.items()}

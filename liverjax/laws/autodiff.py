@@ -9,7 +9,7 @@ from liverjax.laws.base import Law
 
 
 def first_piola(law: Law, F: jax.Array) -> jax.Array:
-    """Return dW/dF [Pa] at one (3, 3) or many (..., 3, 3) deformation gradients, by reverse mode."""
+    """Return dW/dF [Pa] at one (3, 3) or many (..., 3, 3) deformation gradients, by reverse-mode differentiation."""
     return jax.grad(lambda F: jnp.sum(law.energy(F)))(F)
 
 
@@ -21,8 +21,8 @@ def tangent(law: Law, F: jax.Array) -> jax.Array:
 def derivative(function: Callable[[jax.Array], jax.Array], A: jax.Array) -> jax.Array:
     """Differentiate an element-wise function of matrices A (…, n, m), by forward mode.
 
-    The result has the shape of the function's values, followed by (n, m). Each direction is applied to all elements at
-    the same time, so that a law may have one parameter value for each element.
+    The result has the shape of the function's values, followed by (n, m). In each direction, all elements are
+    differentiated at the same time, so that a law may have one parameter value for each element.
     """
     n, m = A.shape[-2:]
     directions = jnp.eye(n * m, dtype=A.dtype).reshape(n * m, n, m)

@@ -1,6 +1,8 @@
 """The base class of material laws: a strain energy and its derivatives.
 
-A law is a frozen pytree made with `liverjax.core.struct.struct`. Its energy is the sum of one or more of these:
+A law is an immutable pytree, made with the decorator `liverjax.core.struct.struct`. I1, I2 and J are invariants of the
+deformation, C is the right Cauchy-Green tensor, and lambda_m are the principal stretches. The energy of a law is the
+sum of one or more of these terms:
 
 * `isochoric_energy(Ibar1, Ibar2)`, a function of Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2;
 * `stretch_energy(X_1, …)`, a function of X_k = sum_m (J^(-1/3) lambda_m)^alpha_k - 3; `exponents()` gives all alpha_k;
@@ -8,8 +10,8 @@ A law is a frozen pytree made with `liverjax.core.struct.struct`. Its energy is 
   the axes are the coordinate axes;
 * the volumetric energy U(J), defined by the fields `bulk` and `volumetric`.
 
-Alternatively, a law overrides `strain_energy(I)`, the complete energy. This is a function of the invariants that the
-law lists in `invariants` (I1, I2, I4, J; I4 = a . C a needs a field `fibre`). Only the listed invariants are computed.
+Alternatively, a law overrides `strain_energy(I)`, the complete energy. The argument I contains only the invariants that
+the law lists in `invariants` (I1, I2, I4, J). I4 = a . C a, with the fibre direction a, needs a field `fibre`.
 Derivatives are computed by scalar automatic differentiation, unless the law defines `isochoric_derivatives`,
 `stretch_derivatives`, `green_derivatives` or `energy_derivatives`.
 """
@@ -64,17 +66,23 @@ class Law(Energies):
         return change(self)
 
     def isochoric_part(self) -> Any:
-        """Return the law without U(J). Returns None if the energy cannot be split or has no isochoric part."""
+        """Return the law without its volumetric energy U(J).
+
+        Returns None if the energy cannot be split or has no isochoric part.
+        """
         if self.isochoric_energy is None and self.stretch_energy is None:
             return None
         return self if self.bulk is None else replace(self, bulk=None)
 
     def volumetric_part(self) -> Any:
-        """Return U(J) as a separate law. Returns None if the law has no U(J)."""
+        """Return the volumetric energy U(J) as a separate law. Returns None if the law has no volumetric energy."""
         return None if self.bulk is None else Volumetric(bulk=self.bulk, volumetric=self.volumetric)
 
     def without_volume(self) -> Any:
-        """Return the law without each U(J) that is a separate term of its energy. Returns None if nothing is left."""
+        """Return the law without its volumetric energy U(J). If U(J) is not a separate term, return the law itself.
+
+        Laws whose only energy is U(J) return None.
+        """
         split = self.isochoric_part()
         if split is not None:
             return split
@@ -92,10 +100,14 @@ class Law(Energies):
         return pack(invariant_terms.first_piola(self, unpack(_floating(F))))
 
     def tangent(self, F: jax.Array) -> jax.Array:
-        """Tangent d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), from hand-derived stiffness blocks for unit vectors."""
+        """Tangent d2W/dF dF [Pa], shape (..., 3, 3, 3, 3).
+
+        It comes from the hand-derived stiffness between two nodes, with unit vectors instead of gradients of shape
+        functions.
+        """
         A = invariant_terms.tangent(invariant_terms.state(self, unpack(_floating(F))))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
-        # pack gives (..., i, k). Stacking L as last axis, and then J as second axis, gives (..., i, J, k, L).
+        # `pack` returns arrays (..., i, k). L is stacked as the last axis, and then J before k: (..., i, J, k, L).
         return jnp.stack([r[0] for r in rows], axis=-3)
 
     def __add__(self, other: "Law") -> "Sum":
@@ -127,7 +139,8 @@ class Sum(Law):
     def isochoric_part(self):
         """Return the sum of the isochoric parts.
 
-        Laws with only a volumetric energy do not contribute. Returns None if another law has no isochoric part.
+        Laws with only a volumetric energy do not contribute. Returns None if one of the other laws has no isochoric
+        part.
         """
         parts = [law.isochoric_part() for law in self.laws if not isinstance(law, Volumetric)]
         return None if any(part is None for part in parts) else _added(parts)
@@ -137,11 +150,11 @@ class Sum(Law):
         return _added([part for part in (law.volumetric_part() for law in self.laws) if part is not None])
 
     def without_volume(self):
-        """Return the sum of the laws, each without its U(J)."""
+        """Return the sum of the laws without their volumetric energies. Returns None if no law has another energy."""
         return _added([part for part in (law.without_volume() for law in self.laws) if part is not None])
 
     def check(self):
-        """Check every summand."""
+        """Check every law of the sum."""
         for law in self.laws:
             law.check()
 
@@ -156,7 +169,8 @@ class Sum(Law):
     def energy_derivatives(self, I):
         """Return the sum of the laws' derivatives with respect to the invariants.
 
-        The sum is formed before the assembly, so a second law only adds scalar operations.
+        The derivatives are added before stress and stiffness are computed, so a second law adds only scalar
+        operations.
         """
         first, second = {}, {}
         fibres = fibre_invariants(self.laws)
@@ -180,9 +194,9 @@ class Sum(Law):
 
 @struct
 class Volumetric(Law):
-    """A law that consists of U(J) only.
+    """A law whose only energy is the volumetric energy U(J).
 
-    W = K/2 (J - 1)^2 ("quadratic"), K/2 ln^2 J ("log") or K/4 (J^2 - 1 - 2 ln J) ("simo").
+    U = K/2 (J - 1)^2 ("quadratic"), K/2 ln^2 J ("log") or K/4 (J^2 - 1 - 2 ln J) ("simo").
     """
 
     bulk: Number = param("Pa", "bulk modulus K", lower=0.0, typical=7700.0)
@@ -195,7 +209,7 @@ class Volumetric(Law):
         return self
 
     def without_volume(self):
-        """Return None, since nothing is left."""
+        """Return None, since this law has no other energy than U(J)."""
         return None
 
     def strain_energy(self, I):
@@ -232,10 +246,13 @@ def summands(law: Law) -> tuple[Law, ...]:
 
 
 def isochoric_part(law: Law) -> Any:
-    """Return the law without U(J). Returns None if the energy cannot be split or has no isochoric part."""
+    """Return the law without its volumetric energy U(J).
+
+    Returns None if the energy cannot be split or has no isochoric part.
+    """
     return law.isochoric_part()
 
 
 def volumetric_part(law: Law) -> Any:
-    """Return U(J) as a separate law. Returns None if the law has no U(J)."""
+    """Return the volumetric energy U(J) as a separate law. Returns None if the law has no volumetric energy."""
     return law.volumetric_part()

@@ -16,19 +16,19 @@ from liverjax.tensors.subsets import Subsets, in_subset, put_together
 class ByRegion(Law):
     """Several laws, one for each subset of the elements.
 
-    A parameter of a law may have one value for each element of the whole body (E,). Only the values of the law's subset
-    are used.
+    A parameter of a law may have one value for each of the E elements of the whole body. The law uses only the values
+    of the elements in its subset.
     """
 
     laws: tuple[Law, ...] = unnamed("one law for each subset")
     subsets: Subsets = param("1", "the elements of each law")  # type: ignore[assignment]
 
     def pieces(self) -> tuple[Law, ...]:
-        """Return the laws, with parameters for the elements of the whole body."""
+        """Return the laws. Parameters with one value per element have values for all elements of the body."""
         return self.laws
 
     def piece(self, k: int) -> Law:
-        """Return law k with the parameters of its elements."""
+        """Return law k. Parameters with one value per element have values only for the elements of this law."""
         return in_subset(self.subsets, k, self.laws[k])
 
     def each(self, change: Callable[[Law], Law]) -> "ByRegion":

@@ -1,4 +1,4 @@
-"""A law that is continued smoothly below a chosen J, so that flat and inverted elements have a finite energy."""
+"""A law with another energy below a chosen volume ratio J, so that flat and inverted elements have a finite energy."""
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,11 @@ from liverjax.tensors.matrices import determinant
 
 @struct
 class Continued(Law):
-    """A law of I1, I2 and J that is unchanged above J = c. Energy and stress are continuous at c.
+    """A law of I1, I2 and J that is unchanged above J = c. Energy and stress are continuous at J = c.
 
     Below c, an isochoric energy is evaluated at c^2/(2c - J) instead of J. This value is positive, so the isochoric
     invariants exist. A volumetric energy is replaced by its second-order Taylor series at c. The energy increases
-    towards inversion.
+    while an element is flattened and inverted.
     """
 
     law: Law = unnamed("the law that is continued")
@@ -27,7 +27,7 @@ class Continued(Law):
         return self.law.invariants if "J" in self.law.invariants else (*self.law.invariants, "J")
 
     def isochoric_part(self) -> Law | None:
-        """Return the law without its volumetric energy. Returns None if its energy cannot be split."""
+        """Return the law without its volumetric energy. Returns None if the energy cannot be split."""
         part = self.law.isochoric_part()
         return None if part is None else Continued(law=part, below=self.below)
 
@@ -78,7 +78,7 @@ class Continued(Law):
         return self.law.bulk_modulus()
 
     def _whole(self) -> Law:
-        """Return the original law without its volumetric part."""
+        """Return the original law without its volumetric energy, or with it if the energy cannot be split."""
         part = self.law.isochoric_part()
         return self.law if part is None else part
 
@@ -95,15 +95,15 @@ class Continued(Law):
 
 
 def continued(law: Law, below: float) -> Law:
-    """Return the law with finite energy and forces for every J. It is unchanged above J = `below` (see `Continued`).
+    """Return the law with finite energy and forces for every J. It is the same law above J = `below` (see `Continued`).
 
     Args:
         law: a law of I1, I2 and J, or a sum of such laws.
-        below: c, between 0 and 1, e.g. 0.1.
+        below: volume ratio c below which the energy is replaced, between 0 and 1, e.g. 0.1.
 
     Raises:
-        InputError: c is out of bounds; or the law has an energy of principal stretches, of fibres or of Green's strain
-            (which is always finite).
+        InputError: c is not between 0 and 1, or the law has an energy of principal stretches, of fibres or of Green's
+            strain. (An energy of Green's strain is finite for every J, so it needs no change.)
     """
     if isinstance(below, bool) or not isinstance(below, (int, float)) or not 0 < below < 1:
         raise InputError(f"law continued_below = {below!r} must lie between 0 and 1: give e.g. 0.1")
@@ -112,8 +112,8 @@ def continued(law: Law, below: float) -> Law:
         for attribute, kind in kinds.items():
             if getattr(part, attribute) is not None:
                 raise InputError(
-                    f"law continued_below is for energies of I1, I2 and J, not for {type(part).__name__} of {kind}: "
-                    "remove continued_below"
+                    f"law continued_below needs an energy of I1, I2 and J, but {type(part).__name__} has an energy of "
+                    f"{kind}: remove continued_below"
                 )
     first, *others = (Continued(law=part, below=float(below)) for part in law.summands())
     return sum(others, first)

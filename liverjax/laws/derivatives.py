@@ -15,7 +15,7 @@ ORDER = ("I1", "I2", "I4", "J")
 
 
 def accumulate(total: dict, key: object, value: object) -> None:
-    """Add a value to an entry of a table of derivatives, in place. A missing entry gets the value."""
+    """Add a value to the entry `key` of a table of derivatives, in place. A missing entry gets this value."""
     total[key] = total[key] + value if key in total else value
 
 
@@ -29,7 +29,7 @@ def reduced(I: Invariants) -> tuple[Any, Any]:
 
 
 def split_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
-    """Return the derivatives of w(Ibar1, Ibar2) with respect to I1, I2 and J (book chapter, section 4.1.2)."""
+    """Return the derivatives of the energy w(Ibar1, Ibar2) with respect to I1, I2, J (book chapter, section 4.1.2)."""
     m = I.J ** (-2 / 3)
     inverse_J = 1 / I.J
     Ibar = {"I1": m * I.I1} if "I1" in law.invariants else {}

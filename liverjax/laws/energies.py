@@ -29,7 +29,8 @@ class Energies:
     green_derivatives: Any = None
     #: Method that returns the exponents alpha_k of a `stretch_energy`.
     exponents: Any
-    #: Fields of the volumetric energy U(J), and fields for directions. None means no such energy or direction.
+    #: Fields of the volumetric energy U(J), and fields for directions. None means that the law has no such energy or
+    #: direction.
     bulk: Number | None = None
     volumetric: str
     fibre: Numbers | None = None
@@ -38,7 +39,7 @@ class Energies:
     subsets: Any = None
 
     def strain_energy(self, I: Invariants) -> Any:
-        """Return the energy density [Pa] at the invariants that the law lists."""
+        """Return the energy density [Pa] for the values `I` of the invariants that the law lists."""
         W = 0.0
         if self.isochoric_energy is not None:
             W = W + self.isochoric_energy(*reduced(I))
@@ -50,7 +51,7 @@ class Energies:
         return W if U is None else W + U.strain_energy(I)
 
     def energy_derivatives(self, I: Invariants) -> tuple[First, Second]:
-        """Return dW/dI_a and d2W/dI_a dI_b for scalar invariants. A missing key means 0 and needs no computation."""
+        """Return dW/dI_a and d2W/dI_a dI_b for scalar invariants I_a. A derivative that is always 0 has no key."""
         if type(self).strain_energy is not Energies.strain_energy:
             return autodiff_derivatives(self, I)
         first, second = split_derivatives(self, I) if self.isochoric_energy is not None else ({}, {})
@@ -62,7 +63,7 @@ class Energies:
         return first, second
 
     def volumetric_part(self) -> "Energies | None":
-        """Return U(J) as a separate law. Returns None if the law has no U(J)."""
+        """Return the volumetric energy U(J) as a separate law. Returns None if the law has no volumetric energy."""
         return None
 
     # -- parts of a law -----------------------------------------------------------------------------------------------
@@ -72,11 +73,11 @@ class Energies:
         return (self,)
 
     def pieces(self) -> tuple[Any, ...]:
-        """Return the laws of the body. This is only the law itself, unless regions have laws of other kinds."""
+        """Return the laws of the body: only this law, unless the regions of the body have laws of different kinds."""
         return (self,)
 
     def piece(self, k: int) -> Any:
-        """Return law k of `pieces`, with the parameters of the elements that have this law."""
+        """Return law k of `pieces`. Its parameters have values only for the elements of this law."""
         return self
 
     # -- arguments of the energies -------------------------------------------------------------------------------------
@@ -94,12 +95,15 @@ class Energies:
         return I if self.bulk is None else I._replace(J=determinant(F))
 
     def material_axes(self, like: Number) -> Matrix:
-        """Return fibre, sheet and normal as columns, in the precision of `like`. Without a fibre: coordinate axes."""
+        """Return fibre, sheet and normal as columns, in the precision of `like`.
+
+        If the law has no fibre, the columns are the coordinate axes.
+        """
         return orthogonal_axes(self.fibre, None if self.fibre is None else self.sheet, like)
 
 
 def fibre_invariants(laws: tuple) -> dict[str, Energies]:
-    """Return {name of an invariant a . C a: law with the fibre a} for a sum of laws. Fibres of laws may differ."""
+    """Return {name of an invariant a . C a: law with the fibre a} for a sum of laws. Fibres of the laws may differ."""
     if len(laws) == 1:
         return {"I4": laws[0]} if "I4" in laws[0].invariants else {}
     return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}

@@ -20,7 +20,7 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
     Args:
         named: label -> law.
         file: picture to write.
-        stretches: range of stretches; the amount of shear goes up to the upper end minus 1.
+        stretches: range of stretches. The amount of shear goes from 0 to the upper end of this range minus 1.
     """
     figure, axes = pyplot().subplots(1, 4, figsize=(13, 3.4), layout="constrained")
     for axis, (test, what) in zip(axes, homogeneous.TESTS.items(), strict=True):
@@ -31,8 +31,8 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
             style = ("-", "--", ":")[k // len(COLOURS) % 3]
             axis.plot(driven, stress, style, color=COLOURS[k % len(COLOURS)], label=name)
             ends.append((np.nanmin(stress), np.nanmax(stress)))
-        low, high = 3 * np.nanmedian(ends, axis=0)  # large stresses of an exponential law must not hide other curves
-        if low < high:  # false for NaN
+        low, high = 3 * np.nanmedian(ends, axis=0)  # otherwise very large stresses would hide other curves
+        if low < high:  # this condition is false for NaN
             axis.set_ylim(max(low, axis.get_ylim()[0]), min(high, axis.get_ylim()[1]))
         axis.set(title=test.replace("_", " "), xlabel="amount of shear" if what == "shear" else "stretch")
         axis.grid(alpha=0.3)

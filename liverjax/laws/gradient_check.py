@@ -16,17 +16,17 @@ from liverjax import laws
 from liverjax.core.errors import InputError
 from liverjax.laws import Law, autodiff, homogeneous
 
-#: Steps of the difference quotients, relative to F.
+#: Steps of the difference quotients: norms of the change of the deformation gradient F.
 STEPS = 10.0 ** -np.arange(1.0, 10.5, 0.5)
-#: Limit for the relative error of difference quotients. Roundoff and truncation give at least about eps^(2/3) of the
-#: largest term. The factor 1000 allows for large terms that cancel.
+#: Limit for the relative error of difference quotients. Their roundoff and truncation errors are at least about
+#: eps^(2/3) of the largest term (eps: machine precision). The factor 1000 allows for large terms that cancel.
 DIFFERENCE_LIMIT = 1e3 * np.finfo(float).eps ** (2 / 3)
-#: Limit for the relative error of exact results. It allows roundoff in sums of some hundred terms, and cancellation in
-#: deviatoric parts.
+#: Limit for the relative difference of results that are equal apart from roundoff. It allows for sums of some hundred
+#: terms, and for cancellation in deviatoric parts.
 EXACT_LIMIT = 1e-10
 #: Ranges of stretch for the comparisons. The narrower ranges are for laws with a limiting stretch, e.g. Gent's law.
 _MODERATE, _NARROWER = (0.7, 1.4), ((0.85, 1.18), (0.95, 1.05), (0.99, 1.01))
-#: Both arrays have the same length, so that they share one compiled program.
+#: Values at which stability is checked. Both arrays have the same length, so that they share one compiled program.
 STRETCHES, SHEARS = np.linspace(0.2, 4.0, 381), np.linspace(0.0, 3.8, 381)
 
 
@@ -55,7 +55,7 @@ class Check(NamedTuple):
 
 
 def load(name: str) -> Law:
-    """Return an included law by its name, or the law FILE.py:LAW of a Python file. A class gets its typical parameters.
+    """Return an included law by its name, or the law FILE.py:LAW of a Python file. A class gets its typical values.
 
     Raises:
         InputError: the law or file does not exist, the file does not run, or a parameter has no typical value.
@@ -65,7 +65,7 @@ def load(name: str) -> Law:
     file, _, attribute = name.rpartition(":") if ":" in name else (name, "", "")
     if not Path(file).is_file():
         raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
-    # `dataclasses` needs the registered module. The name is private, since the file may be called jax.py.
+    # `dataclasses` needs a module in `sys.modules`. It gets another name than its file, which may be called jax.py.
     spec = importlib.util.spec_from_file_location(f"_law_file_{Path(file).stem}", file)
     if spec is None:
         raise InputError(f"{file} is not a Python file: give FILE.py:LAW")
@@ -103,7 +103,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _try(law: Law, name: str) -> None:
-    """Evaluate the law once. Every error is raised as `InputError`."""
+    """Evaluate the shapes of energy, stress and tangent of the law. Every error is raised as `InputError`."""
     for shape in ((), (2,)):
         F = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 0.9, 1.05])), (*shape, 3, 3))
         for what, expected in (("energy", shape), ("first_piola", (*shape, 3, 3)), ("tangent", (*shape, 3, 3, 3, 3))):
@@ -111,18 +111,18 @@ def _try(law: Law, name: str) -> None:
                 found = jax.eval_shape(lambda law, F, what=what: getattr(law, what)(F), law, F).shape
             except Exception as error:
                 raise InputError(
-                    f"{name}: its {what} cannot be evaluated ({_reason(error)}): correct the law, list every invariant "
-                    "that it uses in `invariants`, give one direction for fibres, and write conditions on parameters "
+                    f"{name}: its {what} cannot be evaluated ({_reason(error)}): correct the law. List all invariants "
+                    "of its energy in `invariants`, give a single fibre direction, and write conditions on parameters "
                     "with jnp.where"
                 ) from None
             if found != expected:
                 raise InputError(
-                    f"{name}: its {what} of F {F.shape} has shape {found}, not {expected}: correct the law"
+                    f"{name}: for F of shape {F.shape}, its {what} has shape {found}, not {expected}: correct the law"
                 )
 
 
 def _try_parts(law: Law, name: str) -> None:
-    """Make the isochoric and volumetric parts of the law once. Every error is raised as `InputError`."""
+    """Evaluate the shapes of the isochoric and volumetric energies. Every error is raised as `InputError`."""
     for what in ("isochoric_part", "volumetric_part"):
         try:
             part = getattr(law, what)()
@@ -130,9 +130,9 @@ def _try_parts(law: Law, name: str) -> None:
                 jax.eval_shape(part.energy, jnp.eye(3))
         except Exception as error:
             raise InputError(
-                f"{name}: its {what} cannot be evaluated ({_reason(error)}): a field bulk needs a field volumetric "
-                "(volumetric: str = lj.static('quadratic')); a law with its own strain_energy must work with bulk = "
-                "None, or define both parts"
+                f"{name}: its {what} cannot be evaluated ({_reason(error)}): if the law has a field bulk, add a field "
+                "volumetric (volumetric: str = lj.static('quadratic')). A law that overrides strain_energy must work "
+                "with bulk = None, or define isochoric_part and volumetric_part"
             ) from None
 
 
@@ -159,7 +159,7 @@ def _typical_law(cls: type, name: str) -> Law:
 
 
 def check(law: Law) -> Check:
-    """Run all checks and return one row for each check. A wrong law raises no error, but some of its rows fail."""
+    """Run all checks, and return one row for each. A wrong law raises no error, but some rows have `passed` = False."""
     programs = [jax.jit(lambda law, F, what=what: getattr(law, what)(F)) for what in _PROGRAMS]
     energy, stress, tangent = (partial(program, law) for program in programs)
     more, stable = _stability(law, tangent)
@@ -186,8 +186,8 @@ def check(law: Law) -> Check:
 def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarray, Row]:
     """Return deformation gradients, directions, and a row with their range of stretches.
 
-    The range is `_MODERATE`, or, if the law is not finite there, the widest range of `_NARROWER` in which the law is
-    finite.
+    The stretches lie in `_MODERATE`. If energy, stress or tangent is not finite there, the widest range of `_NARROWER`
+    in which all three are finite is used. If there is no such range, the row fails.
     """
     for low, high in (_MODERATE, *_NARROWER):
         F, D = _samples(low, high)
@@ -217,7 +217,7 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
     """
     low, high = max(stable[0], 0.5), min(stable[1], 2.0)
     sets = [("", law, F)]
-    if low < high:  # if only the rest state is stable, the stress is roundoff
+    if low < high:  # otherwise only the rest state is stable, where the stress is roundoff
         sets.append((f", stretches {low:.2g} to {high:.2g}", law, _samples(low, high)[0]))
     sets.append((", parameters times 0.8 (0: 0.1)", _with_other_parameters(law), F))
     rows = []
@@ -226,7 +226,7 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
         exact, found = jax.jit(oracle), []
         for where, own, at in sets:
             ours, theirs = (_as_numbers(partial(f, own), at).reshape(len(at), -1) for f in (program, exact))
-            # A law may have a limiting stretch. So beyond moderate stretches, values that are not finite are ignored.
+            # A law may have a limiting stretch. So values that are not finite are ignored beyond moderate stretches.
             known = (np.isfinite(ours) & np.isfinite(theirs)).all(axis=1) | (where == "")
             if np.any(known):
                 found.append(_exact(f"{name} by hand against autodiff{where}", ours[known], theirs[known]))
@@ -240,7 +240,7 @@ def _with_other_parameters(law: Law) -> Law:
 
 
 def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]:
-    """Return a row: is the energy the sum of its parts? Viscosity and mixed elements use only the parts."""
+    """Check that the energy is the sum of its isochoric and volumetric parts. Viscosity uses only these parts."""
     isochoric, volumetric = law.isochoric_part(), law.volumetric_part()
     if isochoric is None or volumetric is None:
         return []
@@ -270,8 +270,8 @@ def _as_numbers(function: Callable, F: np.ndarray) -> np.ndarray:
     return np.asarray(function(jnp.asarray(F)), float)
 
 
-#: To find a jump of the stiffness at rest, the stiffness is computed at the distance `NEAR` from rest. Without a jump,
-#: the relative change of the stiffness is less than `JUMP`.
+#: To find a jump of the stiffness at rest, the stiffness is computed for small strains of size `NEAR`. If there is no
+#: jump, the relative change of the stiffness is less than `JUMP`.
 NEAR, JUMP = 1e-7, 1e-4
 
 
@@ -281,10 +281,10 @@ def _rotation(seed: int) -> np.ndarray:
 
 
 def _samples(low: float = _MODERATE[0], high: float = _MODERATE[1]) -> tuple[np.ndarray, np.ndarray]:
-    """Return deformation gradients with stretches between `low` and `high`, and directions of unit length."""
+    """Return 12 deformation gradients with stretches between `low` and `high`, and 12 directions in which F changes."""
     rng = np.random.default_rng(2)
     stretches = rng.uniform(low, high, (12, 3))
-    stretches[:3, 1] = stretches[:3, 0]  # two equal stretches
+    stretches[:3, 1] = stretches[:3, 0]  # some samples have two equal stretches
     F = np.stack([_rotation(k) @ np.diag(s) @ _rotation(k + 100) for k, s in enumerate(stretches)])
     D = rng.standard_normal((12, 3, 3))
     return F, D / np.linalg.norm(D, axis=(1, 2))[:, None, None]
@@ -357,7 +357,7 @@ def _mean_moduli(A: np.ndarray) -> np.ndarray:
 
 
 def _near_rest() -> np.ndarray:
-    """Return deformation gradients (n, 3, 3) very close to rest, in pairs of opposite directions."""
+    """Return deformation gradients (n, 3, 3) with very small strains, in pairs of opposite strains."""
     D = _samples()[1]
     D = np.concatenate([np.eye(3)[None], D + np.transpose(D, (0, 2, 1))])
     return np.eye(3) + NEAR * np.concatenate([D, -D])
@@ -416,16 +416,16 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
     return rows, ranges
 
 
-#: In a step with a jump, the change of the energy differs from the work of the stress. If the difference is above the
-#: fraction `_MISSED`, the step is divided into `_PARTS` substeps, and the worst substep again (`_CUTS` times). A jump
-#: stays in one substep. Without a jump, the difference decreases.
+#: If the energy jumps in a step of the stretch, its change differs from the work of the stress. If the difference is
+#: above the fraction `_MISSED` of the change, the step is divided into `_PARTS` substeps, then its worst substep, and
+#: so on (`_CUTS` times). The difference due to a jump stays in one substep. Other differences decrease.
 _MISSED, _PARTS, _CUTS = 0.05, 32, 3
 
 
 def _jumps(law: Law, energy: Callable) -> list[Row]:
     """Return a row if the energy jumps, so that its change is not the work of the stress.
 
-    Checks at single states cannot find a jump.
+    The other checks, at single states, cannot find a jump.
     """
     stress = jax.jit(partial(homogeneous.nominal_stress, law))
     # If a law depends only on the volume, its energy is 0 in these tests, apart from roundoff.
@@ -460,7 +460,7 @@ def _jumps(law: Law, energy: Callable) -> list[Row]:
 
 
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Return for each state (n,) whether the nominal stress increases. One-sided differences are used at the ends."""
+    """Return whether the nominal stress increases at each state (n,). At the ends, differences are one-sided."""
     stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
     with np.errstate(all="ignore"):
         return np.gradient(stress, driven) > 0
@@ -469,7 +469,7 @@ def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarra
 def ellipticity(A: np.ndarray) -> np.ndarray:
     """Return the minimum eigenvalue (n,) [Pa] of the acoustic tensor A_iJkL n_J n_L over 203 directions n."""
     k = np.arange(200) + 0.5
-    z, angle = 1 - k / 200, np.pi * (1 + 5**0.5) * k  # Fibonacci points on the upper half sphere
+    z, angle = 1 - k / 200, np.pi * (1 + 5**0.5) * k  # the directions n are Fibonacci points on a half sphere
     n = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
     n = np.concatenate([n, np.eye(3)])
     finite = np.isfinite(A).all(axis=(1, 2, 3, 4))

@@ -20,7 +20,7 @@ def deformation_gradient(test: str, driven: Number, stretch: Any = 1.0) -> jax.A
 
     Args:
         test: one of `TESTS`.
-        driven: stretches along axis 1 (and 2 in `equibiaxial`) or amounts of shear (...).
+        driven: stretches along axis 1 (in `equibiaxial` also along axis 2) or amounts of shear, any shape (...).
         stretch: uniaxial stretch along axis 1 before the shear, only for `simple_shear`.
     """
     v = jnp.asarray(driven, float)
@@ -43,9 +43,10 @@ def deformation_gradient(test: str, driven: Number, stretch: Any = 1.0) -> jax.A
 def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
     """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample without traction along axis 3.
 
-    P = dW/dF - p cof F with P_33 = 0. The volumetric energy of a law does not contribute. A law without a separate
-    volumetric energy is evaluated at det F = 1. `constant` means that F is data and that no derivative with respect to
-    F is needed. For a law of principal stretches, derivatives with respect to its parameters then need much less time.
+    P = dW/dF - p cof F, with the pressure p for which P_33 = 0. The volumetric energy of a law does not contribute. A
+    law without a separate volumetric energy is evaluated at det F = 1. `constant` means that F is data and that no
+    derivative with respect to F is needed. Then the derivatives of a law of principal stretches with respect to its
+    parameters need much less time.
     """
     split = law.isochoric_part()
     if constant and split is not None and split.stretch_energy is not None:

@@ -16,13 +16,13 @@ _ITERATIONS, _LONGEST = 30, 0.5
 
 
 def read_layer(table: object, name: str) -> Law:
-    """Read the law of a layer or bar from its table. The bulk modulus has no effect and need not be given.
+    """Read the law of a layer or bar from its table. The bulk modulus has no effect and may be omitted.
 
     Raises:
         InputError: a law or parameter is unknown. The message begins with `name`.
     """
     if not isinstance(table, dict) or "name" not in table:
-        raise InputError(f'{name} law needs name = "…": python -m liverjax laws lists the names')
+        raise InputError(f'{name} law needs name = "…": see the names with python -m liverjax laws')
     values = {key: value for key, value in table.items() if key != "name"}
     fields = {f.name: f for f in dataclasses.fields(find(table["name"]))}  # type: ignore[arg-type]
     without = "bulk" in fields and "bulk" not in values
@@ -37,7 +37,8 @@ def check(law: Law, name: str) -> None:
     """Raise `InputError` if a law has directions, or parameters that contradict each other.
 
     Raises:
-        InputError: the message begins with `name` if the law has directions.
+        InputError: the law has directions (then the message begins with `name`), or its parameters contradict each
+            other.
     """
     if any(one.fibre is not None or one.green_energy is not None for one in law.summands()):
         raise InputError(f"{name}.law has directions, which a layer or bar cannot use: use an isotropic law")
@@ -45,10 +46,11 @@ def check(law: Law, name: str) -> None:
 
 
 def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
-    """Energy density (Q, m) [Pa] of a layer without stress through its thickness.
+    """Energy density (Q, m) [Pa] of a layer without stress through its thickness, at Q points of m elements.
 
     Args:
-        law: isotropic law, evaluated at J = 1. If `solved`, J is such that the stress through the thickness is 0.
+        law: isotropic law. If `solved` is False, it is evaluated at J = 1. Otherwise it is evaluated at the J for which
+            the stress through the thickness is 0.
         C: C_11, C_12, C_22 (Q, m) of the in-plane right Cauchy-Green tensor.
         solved: whether the thickness stretch is an unknown.
     """
@@ -66,20 +68,20 @@ def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
 
 
 def _thinned(density: Any, start: jax.Array) -> jax.Array:
-    """Return the logarithm (Q, m) of the thickness stretch with the minimum energy. The derivatives of this
-    result are exact."""
+    """Return the logarithm (Q, m) of the thickness stretch for which the energy is a minimum. The derivatives of
+    this result are exact."""
 
     def slope(u: jax.Array) -> jax.Array:
         return jax.jvp(density, (u,), (jnp.ones_like(u),))[1]
 
     def newton(u: jax.Array) -> jax.Array:
         first, second = jax.jvp(slope, (u,), (jnp.ones_like(u),))
-        # With |second| the step decreases the energy even if the energy is not convex.
+        # A division by |second| gives a step that decreases the energy even if the energy is not convex.
         return u - jnp.clip(first / jnp.where(second == 0, 1.0, jnp.abs(second)), -_LONGEST, _LONGEST)
 
     frozen = jax.lax.stop_gradient
     u = jax.lax.fori_loop(0, _ITERATIONS, lambda _, u: frozen(newton(u)), frozen(start))
-    # At the root, one more iteration makes the first derivative exact, and another one the second derivative.
+    # At the solution, one more iteration makes the first derivative exact, and another one the second derivative.
     return newton(newton(u))
 
 

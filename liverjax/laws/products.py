@@ -31,7 +31,7 @@ class Product(NamedTuple):
 
 
 class Group(NamedTuple):
-    """A function phi(sum_k W^k) of products. `slopes` returns phi' and phi''; None means phi(s) = s."""
+    """A function phi(s) of the sum s of products W^k. `slopes` returns phi'(s) and phi''(s); None means phi(s) = s."""
 
     products: list[Product]
     slopes: Callable[[Number], tuple[Number, Number]] | None = None
@@ -48,7 +48,7 @@ def _isochoric(c: Number, i: int, j: int) -> list[Product]:
 
 
 def groups(law: Law) -> list[Group]:
-    """Return the products of a single law. Raise `InputError` if the law cannot be written in this form."""
+    """Return the energy of a law (not a sum of laws) as groups of products. If impossible, raise `InputError`."""
     match law:
         case NeoHookean():
             return [Group(_isochoric(law.mu / 2, 1, 0))]

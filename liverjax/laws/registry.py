@@ -55,7 +55,7 @@ def find(name: str) -> type[Law]:
 
 
 def parameters(law: Any) -> list[dataclasses.Field]:
-    """Return the numeric fields of a law, in order, with their `unit`, bounds and `about` in `metadata`."""
+    """Return the numeric fields of a law. `metadata` of a field has its unit, bounds and description (`about`)."""
     return [f for f in dataclasses.fields(law) if not f.metadata.get("static")]
 
 
@@ -79,7 +79,7 @@ def create(name: str, **values: Numbers) -> Law:
             raise InputError(f"law {name} needs parameter {key} [{field.metadata.get('unit', '')}]: give {key} = …")
     for key, value in values.items():
         if value is None and known[key].default is None:
-            continue  # an optional coefficient that is not given
+            continue  # an optional coefficient is not given
         check_value(f"law {name}: {key}", known[key].metadata, value)
     law = cls(**{k: _sequence(v) if known[k].metadata.get("each") else v for k, v in values.items()})
     if not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(law)):
@@ -88,7 +88,7 @@ def create(name: str, **values: Numbers) -> Law:
 
 
 def _sequence(value: Any) -> Any:
-    """Return the parameters of the terms as a tuple, so that each is a leaf. An array of directions is not changed."""
+    """Return a list of numbers as a tuple, so that each number is a leaf of the pytree. Directions stay an array."""
     if isinstance(value, (list, tuple)) and not any(isinstance(v, (list, tuple)) for v in value):
         return tuple(value)
     if jnp.ndim(value) == 0:
@@ -110,7 +110,7 @@ def check_value(where: str, metadata: Any, value: Any) -> None:
 
 
 def typical(name: str) -> Law:
-    """Return the law with typical parameters, scaled to a ground-state shear modulus of 770 Pa (synthetic values)."""
+    """Return the law with typical parameters, scaled to a ground-state shear modulus of 770 Pa (not measured)."""
     values = {f.name: f.metadata["typical"] for f in parameters(find(name))}
     law = find(name)(**values)
     return scaled(law, 770.0 / law.shear_modulus())

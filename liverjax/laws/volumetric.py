@@ -1,4 +1,4 @@
-"""Volumetric energies U(J) and their two derivatives."""
+"""Volumetric energies U(J), and their first and second derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,12 @@ def _log(K, J):
 
 
 def _simo(K, J):
-    # J^2 - 1 = (J - 1)(J + 1): no cancellation at rest.
+    # J^2 - 1 is computed as (J - 1)(J + 1), so that there is no cancellation at rest.
     return 0.25 * K * ((J - 1) * (J + 1) - 2 * jnp.log(J)), 0.5 * K * (J - 1) * (J + 1) / J, 0.5 * K * (1 + 1 / J**2)
 
 
-#: Name -> function of (K, J) that returns U, U' and U''. U is K/2 (J-1)^2, K/2 ln^2 J or K/4 (J^2 - 1 - 2 ln J).
+#: Name -> function of bulk modulus K and volume ratio J that returns U, U' and U''.
+#: U is K/2 (J-1)^2, K/2 ln^2 J or K/4 (J^2 - 1 - 2 ln J).
 VOLUMETRIC = {"quadratic": _quadratic_energy, "log": _log, "simo": _simo}
 
 

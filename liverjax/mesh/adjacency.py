@@ -14,14 +14,15 @@ from liverjax.core.struct import Indices, param, static, struct
 #: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
-#: A mesh has patches of `PATCH_SIZE` nodes, up to `FEW_PATCHES` patches. A larger mesh has patches of `LARGE_PATCH`
-#: nodes, since the number of iterations must not grow with the mesh. There are at most `MOST_PATCHES` patches, since
-#: the coarse matrix is dense with 12 unknowns per patch.
+#: Patches are groups of nearby nodes for the coarse space of the linear solver. A mesh has patches of `PATCH_SIZE`
+#: nodes, but at most `FEW_PATCHES` patches. A larger mesh has patches of `LARGE_PATCH` nodes, so that the number of
+#: iterations of the solver does not grow with the mesh. There are at most `MOST_PATCHES` patches, since the coarse
+#: matrix is dense with 12 unknowns per patch.
 PATCH_SIZE, FEW_PATCHES, LARGE_PATCH, MOST_PATCHES = 80, 32, 160, 192
 
-#: Two neighbours are near if their distance is below `NEAR` times the root mean square distance of each of them to its
-#: neighbours. A cluster has at most `LARGEST_CLUSTER` nodes. A mesh has clusters if at least the fraction `SHARE` of
-#: its vertices has a near neighbour.
+#: Clusters are groups of near nodes in thin elements. Two neighbours are near if their distance is below `NEAR` times
+#: the root mean square distance of each of the two to its neighbours. A cluster has at most `LARGEST_CLUSTER` nodes. A
+#: mesh has clusters if at least the fraction `SHARE` of its vertices has a near neighbour.
 NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
 
 
@@ -29,7 +30,8 @@ NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
 class Clusters:
     """Groups (clusters) of near nodes in thin elements, and the pairs of nodes that give the entries of their matrices.
 
-    The matrix of a cluster with M nodes has M x M blocks. The block of its members a < b has the index a M + b.
+    There are G clusters with at most M nodes. The matrix of a cluster has M x M blocks, one for each pair of members.
+    The block of the members a and b has the index a M + b. n is the number of pairs of nodes.
     """
 
     nodes: jax.Array = param("1", "members of every cluster (G, M), padded with 0")
@@ -43,7 +45,10 @@ class Clusters:
 
 @struct
 class Pattern:
-    """Edges, and the neighbours of every node in rows of equal length W (ELL format): the assembly needs no search."""
+    """The N edges, and the neighbours of every node in rows of equal length W (ELL format).
+
+    With these rows, the assembly of a matrix needs no search.
+    """
 
     edges: jax.Array = param("1", "node numbers (2, N), the lower first")
     element_edges: jax.Array = param("1", "edge number of each node pair in `PAIRS` (6, E)")
@@ -68,7 +73,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
     functions, widest = _patch_functions(jax.lax.stop_gradient(points) if traced else points, near)
     tets = np.asarray(tetrahedra, dtype=int).reshape(-1, 4)
     if tets.size and (tets.min() < 0 or tets.max() >= number_of_nodes):
-        tets = tets[:0]  # `check_mesh` raises an error for this mesh
+        tets = tets[:0]  # no pattern; `check_mesh` raises an error for this mesh
     both = np.stack([np.sort(tets[:, p], axis=1) for p in PAIRS])  # (6, E, 2)
     code, inverse = np.unique(both[..., 0].astype(np.int64) * number_of_nodes + both[..., 1], return_inverse=True)
     low, high = np.divmod(code, number_of_nodes)
@@ -101,7 +106,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
 
 
 def node_numbers(of: Any) -> jax.Array:
-    """Return a copy as 32-bit integers, made by NumPy because JAX would compile a program for each shape."""
+    """Return a copy as 32-bit integers. NumPy makes it, because JAX would compile a program for each shape."""
     return jax.device_put(np.asarray(of).astype(np.int32))
 
 
@@ -142,7 +147,10 @@ def vertex_clusters(points: np.ndarray, edges: np.ndarray) -> Clusters | None:
 
 
 def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) -> Clusters | None:
-    """Return the clusters of shape functions, from their numbers (n, E), positions (N, 3) [m] and signs (n, E)."""
+    """Return the clusters of N shape functions, of which every element has n. Returns None if few elements are thin.
+
+    `nodes`, `signs` (n, E): numbers and signs of the functions of every element. `places` (N, 3) [m]: positions.
+    """
     a, b = np.triu_indices(len(nodes), 1)
     pairs, elements = np.stack([nodes[a], nodes[b]]).reshape(2, -1), np.tile(np.arange(nodes.shape[1]), len(a))
     group = near_groups(places, np.unique(np.sort(pairs, axis=0), axis=1))
@@ -153,7 +161,8 @@ def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) 
 def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Return the group number of every node (V,).
 
-    Nodes form a group if chains of near `pairs` (2, N) connect them. Groups that are too large are divided.
+    A chain of near nodes (see `NEAR`) connects the nodes of a group. `pairs` (2, N): nodes that are neighbours. Groups
+    that are too large are divided.
     """
     count, (one, other) = len(places), pairs
     square = np.sum((places[one] - places[other]) ** 2, axis=1)
@@ -180,7 +189,7 @@ def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _packed(group: np.ndarray) -> np.ndarray:
-    """Join small groups, up to the size of the largest group, so that blocks of equal size need little padding."""
+    """Join small groups until they are about as large as the largest group. Then their matrices need little padding."""
     size = np.bincount(group)
     largest, free, last = int(size.max()), 0, 0
     new = np.arange(len(size))
@@ -194,12 +203,12 @@ def _packed(group: np.ndarray) -> np.ndarray:
 def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, ...]) -> Clusters | None:
     """Return clusters, from the group number of each node (V,) and pairs (2, n) of nodes.
 
-    `sources` has one entry for each pair. Returns None if every group has only one node.
+    The arrays in `sources` have one entry for each pair. Returns None if every group has only one node.
     """
     size = np.bincount(group)
     if size.max(initial=0) < 2:
         return None
-    number = np.cumsum(size > 1) - 1  # number of a group among all groups with several nodes
+    number = np.cumsum(size > 1) - 1  # number of a group, counting only groups with several nodes
     order = np.argsort(group, kind="stable")
     place = np.empty(len(group), int)
     place[order] = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)

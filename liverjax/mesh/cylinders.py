@@ -34,7 +34,7 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
     stops = np.unique([0.0, *cells, length])
     parts = [np.zeros(1)]
     for low, high in itertools.pairwise(stops):
-        # Geometric spacing at both ends, so that cells much shorter than the interval are resolved.
+        # The spacing of x is geometric at both ends, so that cells much shorter than the interval are resolved.
         half = np.concatenate([np.zeros(1), np.geomspace(1e-6, 0.5, 500)])
         x = low + (high - low) * np.concatenate([half, 1 - half[-2::-1]])
         cell = np.full_like(x, largest)
@@ -61,7 +61,7 @@ def graded_cylinder(radii: np.ndarray, heights: np.ndarray, match_area: bool = T
         A mesh with the node sets bottom, top and mantle.
 
     Raises:
-        InputError: radii or heights that do not increase, or radii that do not begin at 0.
+        InputError: radii or heights do not increase, or radii do not begin at 0.
     """
     radii, heights = _rising("radii", radii), _rising("heights", heights)
     corners = _corners(radii)
@@ -77,7 +77,7 @@ class Sector(NamedTuple):
 
     mesh: TetMesh  # node sets bottom, top, mantle, axis, start (the plane y = 0) and end
     normal: np.ndarray  # normal (3,) of the plane `end`
-    parts: float  # number of such sectors in a cylinder
+    parts: float  # number of such sectors in the whole cylinder
     stretch: float  # distance of a ring's corners from the axis, divided by the radius of the ring
 
 
@@ -93,13 +93,13 @@ def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1
         slices: number of edges of a ring in the sector; `corners` / 4 gives a quarter of the cylinder.
 
     Raises:
-        InputError: radii or heights that do not increase, radii that do not begin at 0, or a sector that is half of the
-            cylinder or more.
+        InputError: radii or heights do not increase, radii do not begin at 0, or the sector is half of the cylinder or
+            more.
     """
     radii, heights = _rising("radii", radii), _rising("heights", heights)
     if not 0 < 2 * slices < corners:
         raise InputError(
-            f"slices = {slices} of {corners} must make less than half a cylinder: use fewer slices, at least 1"
+            f"slices = {slices} must be at least 1 and less than half of corners = {corners}: change one of the two"
         )
     stretch, step = _stretch(corners), 2 * np.pi / corners
     angle = step * np.arange(slices + 1)
@@ -133,7 +133,7 @@ def _stretch(corners: int) -> float:
 
 
 def _corners(radii: np.ndarray) -> np.ndarray:
-    """Return the number of corners of the ring at each radius except the first."""
+    """Return the number of corners of each ring (of each radius except the first, which is 0)."""
     width = np.diff(radii)
     edge = width.max()
     found, last = [], 6
@@ -183,7 +183,7 @@ def _ring_of_triangles(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
 def _rising(name: str, places: np.ndarray) -> np.ndarray:
     places = np.asarray(places, float)
     if places.ndim != 1 or len(places) < 2 or not np.all(np.isfinite(places)) or not np.all(np.diff(places) > 0):
-        raise InputError(f"{name} = {places} must be two or more increasing numbers: sort them")
+        raise InputError(f"{name} = {places} must be two or more increasing numbers: correct these numbers")
     if name == "radii" and places[0] != 0:
         raise InputError(f"radii begin at {places[0]:g}: begin with 0, the axis")
     return places

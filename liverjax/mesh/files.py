@@ -26,8 +26,7 @@ CELLS = {1: "tetra", 2: "tetra10"}
 _NAMES = {1: "linear", 2: "quadratic"}
 #: Edges of a quadratic element in the order of VTK and meshio.
 _VTK = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
-#: A middle node is moved onto its straight edge if its distance from the edge's middle is above this fraction of the
-#: edge's length.
+#: An edge counts as curved if the distance of its middle node from its middle is above this fraction of its length.
 _STRAIGHT = 1e-6
 
 
@@ -55,21 +54,22 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     if order is None:
         kinds = ", ".join(sorted({block.type for block in data.cells}))
         held = f"{kinds} but no linear or quadratic tetrahedra" if kinds else "no cells"
-        raise InputError(f"mesh file {path}: it holds {held}; export tetrahedra of 4 or 10 nodes")
+        raise InputError(f"mesh file {path} contains {held}; export tetrahedra of 4 or 10 nodes")
     cell = CELLS[order]
     blocks = [block.data for block in data.cells if block.type == cell]
     others = sorted({b.type for b in data.cells if b.type != cell and not b.type.startswith(_FLAT_CELLS)})
     if others:
         raise InputError(
-            f"mesh file {path}: it holds {', '.join(others)} beside {_NAMES[order]} tetrahedra; remesh the whole body "
+            f"mesh file {path} contains {', '.join(others)} in addition to {_NAMES[order]} tetrahedra; remesh the body "
             f"with {4 if order == 1 else 10}-node tetrahedra"
         )
     points, tets = np.asarray(data.points, dtype=float)[:, :3] * UNITS[unit], np.vstack(blocks)
     if points.shape[1] != 3:
-        raise InputError(f"mesh file {path}: its points have {points.shape[1]} coordinates; give three")
+        raise InputError(f"mesh file {path}: the points have {points.shape[1]} coordinates; give three")
     if tets.min(initial=0) < 0 or tets.max(initial=0) >= len(points):
         raise InputError(
-            f"mesh file {path}: tetrahedra name node {tets.max()}, but there are {len(points)} nodes; renumber them"
+            f"mesh file {path}: tetrahedra contain node numbers that do not exist (largest number {tets.max()}, number "
+            f"of nodes {len(points)}); export the mesh again"
         )
     sets = _node_sets(data, tets, f"mesh file {path}"), _element_sets(data, cell)
     groups = _named_triangles(data)
@@ -84,7 +84,8 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     size = float(np.ptp(points, axis=0).max())
     if size > _LARGE and unit == "m":
         warnings.warn(
-            f"mesh file {path} is {size:.4g} m long: if its numbers are millimetres write unit = 'mm'", stacklevel=2
+            f"mesh file {path} is {size:.4g} m long: if its coordinates are in millimetres, write unit = 'mm'",
+            stacklevel=2,
         )
     return mesh
 
@@ -101,7 +102,7 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     of_file = tets[:, [4 + _VTK.index(pair) for pair in PAIRS]]
     if np.any(np.isin(of_file, used)):
         raise InputError(
-            f"{name}: a node is a vertex of one element and an edge middle of another; export the mesh again"
+            f"{name}: a node is a vertex of one element and an edge middle of another element; export the mesh again"
         )
     new[of_file] = middles
     straight = np.asarray(mesh.points)
@@ -111,8 +112,8 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     curved = of_file[off > _STRAIGHT * length]
     if len(curved) and _permuted(points[of_file], straight[middles], length):
         raise InputError(
-            f"{name}: the middle nodes of its elements are not in the order of its format (each lies on another edge "
-            "of the same element); export the mesh again, as VTU or Gmsh"
+            f"{name}: the middle nodes of the elements are not in the order of the file format (each lies on another "
+            "edge of its element); export the mesh again, as VTU or Gmsh"
         )
     if len(curved):
         warnings.warn(
@@ -136,14 +137,14 @@ def _permuted(points: np.ndarray, middles: np.ndarray, length: np.ndarray) -> bo
 
 #: Pattern at the beginning of a file that meshio cannot read -> kind of the file, and a remedy.
 _FOREIGN = {
-    r"\$NOD\b": "it is in Gmsh's format of version 1 ($NOD, $ELM); open it in Gmsh and save it as version 4 or VTK",
-    r"DATASET\s+POLYDATA|type=.PolyData": "it holds VTK polygons, a surface; fill the surface with tetrahedra "
+    r"\$NOD\b": "the file has Gmsh's format of version 1 ($NOD, $ELM); open it in Gmsh and save it as version 4 or VTK",
+    r"DATASET\s+POLYDATA|type=.PolyData": "it contains VTK polygons (a surface); fill the surface with tetrahedra "
     "(Gmsh, TetGen) and export an unstructured grid",
 }
 
 
 def _read_quietly(path: Path) -> Any:
-    """Read a file with meshio, and hide what meshio prints. If this fails, the `InputError` gives the reason."""
+    """Read a file with meshio, and hide the output of meshio. If meshio fails, raise `InputError` with the reason."""
     import meshio
 
     try:
@@ -158,18 +159,18 @@ def _read_quietly(path: Path) -> Any:
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
             return meshio.read(path)
-    except SystemExit:  # meshio exits if no reader accepts the file, and prints the reasons
+    except SystemExit:  # meshio prints the reasons and exits if none of its readers accepts the file
         reason = " ".join(said.getvalue().split()) or f"its content is not in the format of {path.suffix} files"
     except KeyError as error:  # a missing attribute, or a missing entity of a Gmsh group
         reason = f"the entry {error.args[0]} is missing"
     except Exception as error:  # meshio's readers raise many kinds of errors
         reason = " ".join(str(error).split()) or type(error).__name__
-    raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh 2.2")
+    raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export the mesh as VTU or Gmsh 2.2")
 
 
 #: Cells of surfaces and edges. A file may have them in addition to its tetrahedra.
 _FLAT_CELLS = ("vertex", "line", "triangle", "quad", "polygon")
-#: A body longer than this [m] is probably a mesh in millimetres.
+#: If a body is longer than this [m], the unit of the mesh file is probably millimetres.
 _LARGE = 10.0
 
 
@@ -187,13 +188,14 @@ def _node_sets(data: Any, tets: np.ndarray, name: str) -> dict[str, np.ndarray]:
         if key in sets and set(sets[key].tolist()) != set(nodes.tolist()):
             raise InputError(
                 f"{name}: {key!r} is a set of {len(sets[key])} nodes and a group of triangles with {len(nodes)} nodes: "
-                "rename one of them"
+                "rename the set or the group"
             )
         sets[key] = nodes
     return sets
 
 
-#: A cell array of whole numbers is ignored if it has more different numbers than this: they are probably cell numbers.
+#: An array of whole numbers, one for each cell, is ignored if it has more different numbers than this: such numbers are
+#: probably numbers of cells, not of groups.
 _MOST_GROUPS = 100
 
 
@@ -206,7 +208,7 @@ def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
     return _cell_groups(data, (cell,), 3)
 
 
-#: Types of surface cells with named groups that become node sets, and the edges of a triangle.
+#: Types of surface cells whose named groups become node sets; edges of a triangle.
 _TRIANGLES, _EDGES = ("triangle", "triangle6"), ((0, 1), (1, 2), (0, 2))
 
 
@@ -251,7 +253,7 @@ def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str, np.ndarray]:
-    """Return {name of a group: numbers of its cells}, counted over all blocks of the types `cells`.
+    """Return {name of a group: numbers of its cells}. The cells of all blocks of types `cells` are counted together.
 
     A group of tetrahedra without a name is named by its number. A group of surface cells without a name is ignored.
     """
@@ -273,13 +275,13 @@ def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str,
             continue
         values = values.astype(int)
         if name.startswith("set:"):
-            if values.any() or all(kind in cells for kind in kinds):  # otherwise the set has other kinds of cells
+            if values.any() or all(kind in cells for kind in kinds):  # otherwise it is a set of other cells
                 sets[name.removeprefix("set:")] = np.flatnonzero(values)
             continue
         groups = np.unique(values)
         for group in groups if len(groups) <= _MOST_GROUPS else ():
             if dimension == 3 or (int(group), name) in names:
-                # Here a cell in several groups has only the number of its first group; cell sets contain all groups.
+                # In these arrays a cell has only the number of its first group. Cell sets contain all groups of a cell.
                 sets.setdefault(names.get((int(group), name), f"{name}={group}"), np.flatnonzero(values == group))
     return sets
 

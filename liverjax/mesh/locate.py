@@ -8,7 +8,7 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: A point counts as inside if all its barycentric coordinates are above minus this number.
+#: A point is in a tetrahedron if all its barycentric coordinates are above minus this number.
 _INSIDE = 1e-9
 #: Two vertices coincide if their distance is below this fraction of the body's size.
 SAME_PLACE = 1e-9
@@ -26,7 +26,7 @@ class Pieces(NamedTuple):
 
 
 def doubled_vertices(mesh: TetMesh) -> int:
-    """Return the number of vertices that coincide with another vertex. There, the mesh is not connected."""
+    """Return the number of vertices that coincide with another vertex. At such vertices, the mesh is not connected."""
     points = np.asarray(mesh.points)
     steps = np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * float(np.ptp(points, axis=0).max())))
     return mesh.number_of_vertices - len(np.unique(steps, axis=0))
@@ -56,7 +56,7 @@ def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarra
 
 
 def around_a_point(corners: np.ndarray) -> np.ndarray:
-    """Return whether tetrahedra with corners (E, 4, 3) contain the origin, (E,)."""
+    """Return for each tetrahedron (E,) whether it contains the origin. `corners`: (E, 4, 3)."""
     a, b, c, d = np.moveaxis(corners, 1, 0)
 
     def volume(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def around_a_point(corners: np.ndarray) -> np.ndarray:
 
 
 def around_a_point_in_plane(corners: np.ndarray) -> np.ndarray:
-    """Return whether tetrahedra projected to a plane, with corners (E, 4, 2), contain the origin, (E,)."""
+    """Return for each tetrahedron (E,), projected to a plane, whether it contains the origin. `corners`: (E, 4, 2)."""
     met = np.zeros(len(corners), bool)
     for face in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]):
         a, b, c = np.moveaxis(corners[:, face], 1, 0)
@@ -104,7 +104,10 @@ def weights(mesh: TetMesh, element: np.ndarray, L: np.ndarray) -> tuple[np.ndarr
 
 
 def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
-    """Cut straight lines from `begin` to `end` (n, 3) [m] at the faces of tetrahedra. Pieces outside are removed."""
+    """Cut straight lines from `begin` to `end` (n, 3) [m] at the faces of tetrahedra.
+
+    Pieces outside the mesh are removed.
+    """
     found = []
     first, last = barycentric(mesh, begin), barycentric(mesh, end)
     for line in range(len(begin)):

@@ -26,7 +26,7 @@ def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
     """Integrate a density times the linear shape function of every vertex over the reference volume. Returns (V,).
 
     Args:
-        density: one number for each integration point, (E,) or (Q, E), or one number for each element (E,).
+        density: one number for each element (E,), or one number for each of Q integration points in it (Q, E).
     """
     if density.ndim == 1:
         return to_nodes(mesh, mesh.volumes * density / 4)
@@ -34,7 +34,10 @@ def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def gathered(mesh: TetMesh, shares: jax.Array) -> jax.Array:
-    """Return sums (V,) at the vertices of values at integration points (Q, E): the transpose of `interpolated`."""
+    """Return sums (V,) at the vertices of values at integration points (Q, E), times the linear shape functions.
+
+    This is the transpose of `interpolated`.
+    """
     if mesh.order == 1:
         return to_nodes(mesh, shares / 4)
     parts = jnp.asarray(basis(mesh.order).L, shares.dtype) @ shares
@@ -55,7 +58,7 @@ def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
     return sum((L[a][:, None] * corner[a][None] for a in range(1, 4)), L[0][:, None] * corner[0][None])
 
 
-#: Order -> fraction of an element's volume at each vertex and at each middle of an edge. `_LUMPED` is for the lumped
+#: Order -> fractions of an element's volume: at each vertex, and at each middle of an edge. `_LUMPED` is for the lumped
 #: mass (Hinton, Rock and Zienkiewicz 1976: positive, proportional to the integrals of the squared functions).
 #: `_INTEGRALS` is for the integrals of the shape functions.
 _LUMPED = {1: (1 / 4,), 2: (1 / 36, 4 / 27)}
@@ -64,7 +67,7 @@ _INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
 
 @partial(jax.jit, inline=True)
 def nodal_volumes(mesh: TetMesh) -> jax.Array:
-    """Lumped mass divided by density (V,) [m^3]. In linear elements a node gets a quarter of each adjacent element."""
+    """Lumped mass divided by density (V,) [m^3]. In linear elements each vertex gets a quarter of the volume."""
     return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)])
 
 
@@ -88,8 +91,8 @@ def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
 def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Split the consistent mass matrix of an element, divided by its mass, into a diagonal (n,) and a remainder (n, n).
 
-    The diagonal is the lumped mass. Functions of order 3 have no lumped mass, so their diagonal entries are the
-    integrals of their squares.
+    The diagonal is the lumped mass. Functions of order 3 have no lumped mass, so their diagonal entries are those
+    of the consistent mass matrix.
     """
     whole = products(order)
     parts, lumped = np.diag(whole).copy(), _LUMPED[min(order, 2)]

@@ -31,7 +31,7 @@ def quadratic(mesh: TetMesh) -> TetMesh:
     return replace(made, clusters=_all_clusters(made))
 
 
-@jax.jit  # one compiled program for all operations, not one for each
+@jax.jit  # so that all operations are one compiled program
 def _points_and_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
     low, high = edges
     return jnp.concatenate([points, 0.5 * (points[low] + points[high])])
@@ -40,7 +40,8 @@ def _points_and_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
 def middles_of_set(mesh: TetMesh, name: str) -> np.ndarray:
     """Return the node numbers (V + edge number) of the edge middles that belong to a node set of the mesh.
 
-    If the mesh has a triangle set with the same name and the same vertices, these are the edges of its triangles.
+    If the mesh has a triangle set with the same name and the same vertices, these are the middles of the edges of
+    its triangles.
     """
     V, nodes = mesh.number_of_vertices, np.asarray(mesh.node_sets[name])
     nodes = nodes[nodes < V]
@@ -62,9 +63,9 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     regions may meet at an edge of the body. A face there can have all its vertices in the two regions without belonging
     to one of them. On the surface, such a face is at an angle to the faces of the regions, and nearly parallel to a
     neighbour outside them. If the positions of the mesh are unknown (inside jit, grad or vmap), all faces on the
-    surface belong to a region. Inside the body, a face belongs to a region only if it has a vertex below the surface,
-    or next to a vertex of `nodes` below the surface. Where the body is only one element thick, there are no such
-    vertices, and all faces belong to a region.
+    surface belong to a region. Inside the body, a face belongs to a region only if one of its vertices is below the
+    surface, or has an edge to a vertex of `nodes` below the surface. Where the body is only one element thick, no
+    vertex is below the surface, and all faces belong to a region.
     """
     V = mesh.number_of_vertices
     inside = np.zeros(V, bool)
@@ -151,7 +152,8 @@ def cubic(mesh: TetMesh) -> TetMesh:
 
 
 def _all_clusters(mesh: TetMesh) -> Clusters | None:
-    """Return the clusters of all functions, with each function at the middle of its edge or face.
+    """Return the clusters of all shape functions. The position of a function is its vertex, or the middle of its edge
+    or face.
 
     Returns None if the vertices have no clusters.
     """
@@ -181,9 +183,9 @@ def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:
 
 
 def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
-    """Return triangles (m, 3) with additional face numbers if the mesh has order 3; otherwise unchanged.
+    """Return triangles (m, 3). If the mesh has order 3, add a column with their face numbers.
 
-    Triangles with face numbers (m, 4) have three vertices in increasing order, and then the number of the face.
+    With this column, a triangle (m, 4) has three vertices in increasing order, followed by the number of its face.
     """
     if mesh.order < 3:
         return triangles
@@ -192,7 +194,10 @@ def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
 
 
 def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Return nodes (n,) of quadratic elements, then the functions of order 3 on the edges and faces between them."""
+    """Return nodes (n,) of quadratic elements, followed by functions of order 3.
+
+    These are the functions on all edges and faces whose nodes are in `nodes`.
+    """
     inside = np.zeros(mesh.number_of_nodes, bool)
     inside[nodes] = True
     V, N = mesh.number_of_vertices, mesh.pattern.edges.shape[1]

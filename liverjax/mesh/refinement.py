@@ -80,7 +80,8 @@ def places_in(mesh: TetMesh, fine: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 def _triangles_in(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) -> jax.Array:
     """Return the triangles of the new surface that lie in old triangles (m, 3).
 
-    `ends` (2, V) contains the ends of the old edge on whose middle each new vertex lies; an old vertex occurs twice.
+    `ends` (2, V): for each new vertex, the two ends of the old edge with this vertex at its middle. For an old vertex,
+    both entries are the vertex itself.
     """
     old = {tuple(corners) for corners in np.sort(triangles, axis=1).tolist()}
     of_each = np.moveaxis(ends[:, surface], 0, 1).reshape(len(surface), -1).tolist()
@@ -88,7 +89,7 @@ def _triangles_in(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) 
 
 
 def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
-    """Return the nodes (m,) at the border of the surface region that nodes (n,) cover. Strain is largest there."""
+    """Return the nodes (m,) at the border of the surface region of nodes (n,). At this border, strain is largest."""
     held = np.asarray(nodes)[np.asarray(nodes) < mesh.number_of_vertices]
     triangles = boundary_triangles(mesh, held)
     sides = np.sort(np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)
@@ -128,7 +129,7 @@ def _by_length(mesh: TetMesh) -> np.ndarray:
 def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
     """Return which edges (N,) are halved.
 
-    These are first the edges at the nodes `near`. Then the longest edge of each element and each face that has a halved
+    First, edges at the nodes `near` are halved. Then the longest edge of each element and each face that has a halved
     edge is halved too, until no edge is added.
     """
     edges, place = np.asarray(mesh.pattern.element_edges), _by_length(mesh)
@@ -150,7 +151,7 @@ def _bisected(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
     """
     V, place = mesh.number_of_vertices, _by_length(mesh)
     low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
-    code = low * V + high  # in ascending order
+    code = low * V + high  # the codes are in ascending order
     tets, done = np.asarray(mesh.tetrahedra).astype(np.int64), []
     while len(tets):
         ends = np.stack([np.sort(tets[:, pair], axis=1) for pair in map(list, PAIRS)])

@@ -33,10 +33,12 @@ def select(
     if set is not None:
         if as_word(set, f"{name}: set") not in mesh.node_sets:
             there = ", ".join(mesh.node_sets) or "none"
-            raise InputError(f"{name}: the mesh has no node set {set!r} (it has: {there}); use one of them or where")
+            raise InputError(
+                f"{name}: the mesh has no node set {set!r} (its node sets: {there}); use one of these sets, or where"
+            )
         nodes = np.asarray(mesh.node_sets[set])
         if not len(nodes):
-            raise InputError(f"{name}: the node set {set!r} of the mesh holds no node: correct the mesh, or use where")
+            raise InputError(f"{name}: the node set {set!r} of the mesh contains no node: use another set or where")
         return nodes
     if not isinstance(where, Mapping):
         raise InputError(f"{name} = {where!r} is not a table of bounds: write where = {{z_max = 0.0}}")
@@ -65,14 +67,14 @@ def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> No
     idle = bound > high if key.endswith("max") else bound < low
     if idle and abs(bound) > 1 and low < 1e-3 * bound < high:
         warnings.warn(
-            f"{name}: {key} = {bound:g} m excludes no node, since the mesh spans {low:.4g} to {high:.4g} m: bounds are "
-            f"in metres, so write {1e-3 * bound:g} if you meant mm",
+            f"{name}: {key} = {bound:g} m excludes no node, since the mesh spans {low:.4g} to {high:.4g} m. Bounds are "
+            f"in metres: write {1e-3 * bound:g} if you meant mm",
             stacklevel=3,
         )
 
 
 def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:
-    """Return outer triangles (m, 3) with outward normals. If `nodes` is given, all their vertices are in `nodes`."""
+    """Return outer triangles (m, 3) with outward normals. Given `nodes`: only those with all vertices in `nodes`."""
     tets = np.asarray(mesh.tetrahedra)
     faces = np.concatenate([tets[:, f] for f in FACES])
     codes = face_codes(np.sort(faces.astype(np.int64), axis=1), mesh.number_of_vertices)
@@ -82,7 +84,7 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
 
 
 def face_codes(triples: np.ndarray, V: int) -> np.ndarray:
-    """Return a unique number for each sorted triple of vertices. It is below 2^63 for up to two million vertices."""
+    """Return a different integer for each sorted triple of V vertices. For V up to two million, it is below 2^63."""
     return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
 
 
@@ -109,27 +111,31 @@ def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> 
 
 
 def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
-    """Raise `InputError` if a value is not a list (n,) of node numbers below `count`.
+    """Raise `InputError` if `nodes` is not a list (n,) of node numbers below `count`, with `least` or more numbers.
 
     Raises:
-        InputError: the message begins with `name`.
+        InputError: `nodes` is not such a list. The message begins with `name`.
     """
     numbers = np.asarray(nodes)
     if numbers.ndim != 1 or (numbers.size and numbers.dtype.kind not in "iu"):
         found = f"shape {numbers.shape}" if numbers.ndim != 1 else f"numbers of type {numbers.dtype}"
-        raise InputError(f"{name} has {found}: give whole node numbers (n,)")
+        raise InputError(f"{name} has {found}: give a list (n,) of whole node numbers")
     if numbers.size < least:
         raise InputError(f"{name} contains no node: give node numbers from 0 to {count - 1}")
     wrong = numbers[(numbers < 0) | (numbers >= count)]
     if wrong.size:
-        raise InputError(f"{name} names node {wrong[0]}, but the nodes are 0 to {count - 1}: renumber them")
+        raise InputError(
+            f"{name} contains node {wrong[0]}, but the mesh has only the nodes 0 to {count - 1}: give node numbers in "
+            "this range (node numbers start at 0)"
+        )
 
 
 def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
     """Raise `InputError` if triangles (m, 3) are not faces of elements.
 
     Raises:
-        InputError: the message begins with `name`.
+        InputError: `triangles` has another shape, a node does not exist, or a triangle is not a face. The message
+            begins with `name`.
     """
     numbers = np.asarray(triangles)
     if numbers.ndim != 2 or numbers.shape[1] != 3:

@@ -27,10 +27,10 @@ FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 class Basis(NamedTuple):
     """Shape functions at the integration points of an element. The NumPy arrays are the same for all elements."""
 
-    weights: np.ndarray  # (Q,) with the sum 1
-    L: np.ndarray  # (4, Q) linear functions
-    N: np.ndarray  # (n, Q) all functions
-    c: np.ndarray  # (n, 4, Q) derivatives of N with respect to L
+    weights: np.ndarray  # weights of the Q points (Q,), with the sum 1
+    L: np.ndarray  # the 4 linear functions (4, Q)
+    N: np.ndarray  # all n functions (n, Q)
+    c: np.ndarray  # derivatives of N with respect to L (n, 4, Q)
 
 
 @cache

@@ -54,7 +54,7 @@ def cylinder(
     rings: Sequence[float] = (),
     match_area: bool = False,
 ) -> TetMesh:
-    """Mesh a cylinder about the z axis that stands on z = 0. Ring k has 6 k nodes.
+    """Mesh a cylinder about the z axis that stands on z = 0.
 
     Args:
         radius, height: radius and height [m].
@@ -63,8 +63,8 @@ def cylinder(
         rings: radii [m] at which there is a ring of nodes, for example the radius of a punch.
         match_area: whether each polygon has the area of its circle.
 
-    Without `match_area` the mantle is a polygon of 6 n corners on the circle. The volume is then smaller than pi r^2 h
-    by O(cell_size^2).
+    Without `rim_cell`, `rings` and `match_area`, ring k has 6 k nodes. Without `match_area`, the corners of a ring lie
+    on its circle. The volume is then smaller than that of the cylinder by O(cell_size^2).
 
     Raises:
         InputError: a length is not positive, or a ring is outside the cylinder.
@@ -91,12 +91,12 @@ def cylinder(
 def _graded(
     radius: float, height: float, cells: tuple[float, float], rings: Sequence[float], match_area: bool
 ) -> TetMesh:
-    """Mesh a cylinder with two cell lengths `cells` [m]: the second at its rims and rings, the first elsewhere."""
+    """Mesh a cylinder with two cell lengths `cells` [m]: the second at its rims and at `rings`, the first elsewhere."""
     cell_size, rim_cell = cells
     _positive("rim_cell", [rim_cell])
     for ring in rings:
         if not (np.isfinite(ring) and 0 < ring < radius):
-            raise InputError(f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: correct them")
+            raise InputError(f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: correct rings")
     largest = min(cell_size, radius / 2)
     # A ring of radius r has at least 2 pi r / largest cells. This gives a lower bound of the number of prisms.
     _not_too_many(18 * math.ceil(radius / largest) ** 2 * math.ceil(height / cell_size), "radius, height and cell_size")
@@ -127,11 +127,11 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _not_too_many(tetrahedra: int, names: str) -> None:
-    """Raise `InputError` before a mesh is made that is too large for the memory."""
+    """Raise `InputError` if a mesh would have more than `MOST_TETRAHEDRA` elements, before the mesh is made."""
     if tetrahedra > MOST_TETRAHEDRA:
         raise InputError(
-            f"shape {names} would give about {tetrahedra:.2g} tetrahedra, more than {MOST_TETRAHEDRA:.0e}: are the "
-            "lengths in metres, or is the unit missing?"
+            f"shape {names} would give about {tetrahedra:.2g} tetrahedra, more than {MOST_TETRAHEDRA:.0e}: give "
+            "lengths in metres, or add the unit"
         )
 
 

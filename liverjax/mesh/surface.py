@@ -13,7 +13,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 #: Edges of a triangle, in the order of the middles of its edges.
 _EDGES = ((0, 1), (1, 2), (2, 0))
-#: The same edges in the direction of their functions of order 3. The vertices must be in increasing order.
+#: The same edges in the direction of their functions of order 3, if the triangle's vertices are in increasing order.
 _THIRD = ((0, 1), (1, 2), (0, 2))
 
 
@@ -52,7 +52,7 @@ def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float
 
     In a linear element, each vertex carries a third. In a quadratic element, the integrals of the vertices' functions
     are 0, and the middle of each edge carries a third. Triangles (m, 4) of a mesh of order 3 have the number of their
-    face in the last column.
+    face in the last column; the function of this face gets 9/20 of the load.
     """
     nodes = triangle_nodes(mesh, triangles)
     if mesh.order == 1:
@@ -72,7 +72,7 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
         nodes, own = triangles.T, jnp.broadcast_to(-1 / 6 * twice, (3, *twice.shape))
     else:
         nodes = jnp.stack(triangle_nodes(mesh, triangles))
-        # The rule is exact for quadratic positions. The derivative in the reference shape is also exact.
+        # The integrals are exact for quadratic positions. Their derivatives at the reference shape are also exact.
         weights, l = triangle_rule(4 if mesh.order == 2 else 5)
         N, along = (_quadratic if mesh.order == 2 else _ten_functions)(l)
         signs = None if mesh.order == 2 else _signs_of_functions(triangles, x.dtype)
@@ -96,7 +96,7 @@ def _signs_of_functions(triangles: Indices, dtype: DTypeLike) -> jax.Array:
 
 
 def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (Q,) of points on a triangle, and derivatives (2, Q, n) of its functions at these points.
+    """Return weights (Q,) of Q points on a triangle, and derivatives (2, Q, n) of its n functions at these points.
 
     The directions of the derivatives are from the first vertex to the second and to the third vertex.
     """

@@ -47,7 +47,7 @@ class TetMesh:
 
     @property
     def number_of_nodes(self) -> int:
-        """Number of nodes V: vertices, middles of edges, and functions of order 3."""
+        """Number V of nodes: vertices, in order 2 also middles of edges, in order 3 also the additional functions."""
         return self.points.shape[0]
 
     @property
@@ -62,18 +62,22 @@ class TetMesh:
 
     @property
     def weights(self) -> jax.Array:
-        """Reference volume [m^3] of every integration point: (E,) for linear elements, otherwise (Q, E)."""
+        """Reference volume [m^3] of every integration point: (E,) for linear elements, otherwise (Q, E) with Q points
+        per element."""
         if self.order == 1:
             return self.volumes
         return jnp.asarray(basis(self.order).weights, self.volumes.dtype)[:, None] * self.volumes[None]
 
     @property
     def gradients(self) -> jax.Array:
-        """`shape_vectors` in a shape that broadcasts over the integration points: (3, 3, E), or (3, 3, 1, E)."""
+        """`shape_vectors` with an axis for the integration points: (3, 3, 1, E). In linear elements: (3, 3, E)."""
         return self.shape_vectors if self.order == 1 else self.shape_vectors[:, :, None]
 
     def at_points(self, numbers: T) -> T:
-        """Return a pytree, for example a law, whose arrays (E,) or (E, 3) get an axis for the integration points."""
+        """Return the pytree `numbers`, for example a law, for use at the integration points.
+
+        If the order is above 1, arrays (E,) and (E, 3) get a new first axis of length 1.
+        """
         if self.order == 1:
             return numbers
         by_element = ((self.number_of_elements,), (self.number_of_elements, 3))
@@ -81,12 +85,13 @@ class TetMesh:
 
     @property
     def element_nodes(self) -> list[jax.Array]:
-        """Node numbers of every element: 4 arrays (E,), or 10 with the middles of edges `PAIRS`; more in order 3."""
+        """Node numbers of every element, as a list of arrays (E,): 4 vertices; in quadratic meshes also the middles of
+        the 6 edges `PAIRS`; in order 3 also the additional functions."""
         return self._nodes(self.tetrahedra, self.pattern.element_edges, self.faces)
 
     @property
     def element_nodes_on_host(self) -> np.ndarray:
-        """Return `element_nodes` as a NumPy array (n, E). JAX would compile a program for each of the n arrays."""
+        """Return the n arrays of `element_nodes` as one NumPy array (n, E). JAX would compile a program for each."""
         faces = None if self.faces is None else np.asarray(self.faces)
         return np.stack(self._nodes(np.asarray(self.tetrahedra), np.asarray(self.pattern.element_edges), faces))
 
@@ -102,9 +107,10 @@ class TetMesh:
         return vertices + middles + [N + m for m in middles] + [V + 2 * N + face for face in more]
 
     def edges(self, columns: Sequence[jax.Array]) -> list[tuple[jax.Array, ...]]:
-        """Return y_k - y_0 (k = 1, 2, 3) of a nodal field with columns (V,): one array per column, (E,) or (Q, E).
+        """Return the differences y_k - y_0 (k = 1, 2, 3) of the corner values of a nodal field with `columns` (V,).
 
-        y_k are the corner values defined in `liverjax.mesh.shape_functions`. The gradient of the field is the sum of
+        There is one array for each k and each column: (E,), or (Q, E) with Q integration points per element. The corner
+        values y_k are defined in `liverjax.mesh.shape_functions`. The gradient of the field is the sum of
         (y_k - y_0) D_k with the shape vectors D_k.
         """
         if self.order == 1:
@@ -116,9 +122,10 @@ class TetMesh:
         return [tuple(y[k, :, i] for i in range(len(columns))) for k in range(3)]
 
     def spread(self, forces: Sequence[Sequence[jax.Array]]) -> list[jax.Array]:
-        """Return nodal columns (V,) from forces at corners 1, 2, 3 of the elements. This is the transpose of `edges`.
+        """Return nodal forces, one column (V,) per component, from `forces` at corners 1, 2, 3 of the elements.
 
-        The force at corner 0 is minus the sum of the forces at the other corners.
+        The force at corner 0 is minus the sum of the forces at the other corners. This function is the transpose of
+        `edges`.
         """
         count = len(forces[0])
         if self.order == 1:
@@ -137,14 +144,18 @@ class TetMesh:
         return columns
 
     def _slopes(self) -> jax.Array:
-        """Return c_ak - c_a0 as a matrix (3 Q, n) for `edges`. One matrix product keeps the compiled program small."""
+        """Return c_ak - c_a0 of `liverjax.mesh.shape_functions` as a matrix (3 Q, n), for n nodes and Q points.
+
+        With one matrix product, the compiled program of `edges` is small.
+        """
         c = basis(self.order).c
         return jnp.asarray((c[:, 1:] - c[:, :1]).reshape(len(c), -1).T, self.volumes.dtype)
 
     def oriented(self, values: jax.Array) -> jax.Array:
-        """Multiply values (n, C, E) by the signs of the functions.
+        """Multiply values (n, C, E) of n functions and C components by the signs of the functions.
 
-        Functions of order 3 on edges point to the vertex with the higher number.
+        A function of order 3 on an edge has a direction, towards the vertex with the higher number. In an element that
+        has this vertex first, its sign is -1.
         """
         if self.order < 3:
             return values
@@ -165,7 +176,7 @@ def tet_mesh(
     """
     if isinstance(tetrahedra, jax.core.Tracer):
         raise InputError("tet_mesh: the node numbers are unknown inside jit, grad or vmap: make the mesh outside")
-    # `asarray` may share memory with the caller's arrays, so copies are made. NumPy compiles nothing for this.
+    # `asarray` may share memory with the caller's arrays, so copies are made. NumPy copies without a compiled program.
     points = jnp.array(points, float) if isinstance(points, jax.core.Tracer) else _float_copy(points)
     neighbours = pattern(tetrahedra, points)
     tetrahedra = node_numbers(tetrahedra)
@@ -187,7 +198,7 @@ def _float_copy(points: Numbers) -> jax.Array:
 
 
 def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:
-    """Return the mesh with other reference positions (V, 3) [m]. The patches do not change.
+    """Return the mesh with other reference positions (V, 3) [m]. Its patches of nodes do not change.
 
     The positions may be unknown (inside jit, grad or vmap). Edges stay straight: in a quadratic mesh the middles of
     edges are computed from the vertices.
@@ -223,7 +234,10 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
     if tets.size == 0:
         raise InputError(f"{name}: there are no tetrahedra; export a volume mesh, not a surface")
     if tets.min() < 0 or tets.max() >= len(points):
-        raise InputError(f"{name}: tetrahedra name node {tets.max()}, but there are {len(points)} nodes; renumber them")
+        raise InputError(
+            f"{name}: tetrahedra contain node numbers that do not exist (largest number {tets.max()}, number of nodes "
+            f"{len(points)}): number the nodes from 0"
+        )
     if not np.all(np.isfinite(points)):
         bad = int(np.argwhere(~np.isfinite(points).all(axis=1))[0, 0])
         raise InputError(f"{name}: the position of node {bad} is {points[bad]}; give finite coordinates")
@@ -233,7 +247,7 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
     if len(flat):
         raise InputError(
             f"{name}: {len(flat)} of {len(tets)} tetrahedra are flat or inverted (first: {flat[0]}, volume "
-            f"{volumes[flat[0]]:.3g} m^3); swap two of their nodes or remesh"
+            f"{volumes[flat[0]]:.3g} m^3); swap two nodes of each inverted tetrahedron, or remesh the body"
         )
     _, first, copies = np.unique(np.sort(tets, axis=1), axis=0, return_index=True, return_counts=True)
     if np.any(copies > 1):
@@ -245,15 +259,17 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
     _refuse_overlaps(tets, name)
     unused = np.setdiff1d(np.arange(mesh.number_of_vertices), tets)
     if len(unused):
-        raise InputError(f"{name}: {len(unused)} nodes belong to no tetrahedron (first: {unused[0]}); remove them")
+        raise InputError(
+            f"{name}: {len(unused)} nodes belong to no tetrahedron (first: {unused[0]}); remove these nodes"
+        )
 
 
-#: The faces of a tetrahedron, counterclockwise from outside.
+#: The faces of a tetrahedron, counterclockwise if seen from outside.
 FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 
 
 def _refuse_overlaps(tets: np.ndarray, name: str) -> None:
-    """Raise `InputError` if two elements are on the same side of a face, because they overlap then."""
+    """Raise `InputError` if two elements lie on the same side of a common face: such elements overlap."""
     faces = tets[:, FACES].reshape(-1, 3)
     first = faces.argmin(axis=1)[:, None]
     turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1).astype(np.int64)
@@ -263,6 +279,7 @@ def _refuse_overlaps(tets: np.ndarray, name: str) -> None:
     if np.any(copies > 1):
         own = int(place[copies > 1].min())
         raise InputError(
-            f"{name}: tetrahedra overlap: {int((copies > 1).sum())} faces have two tetrahedra on the same side (first: "
-            f"nodes {faces[own].tolist()}, of element {own // 4}); remesh, or remove one of the two"
+            f"{name}: tetrahedra overlap, since {int((copies > 1).sum())} faces have two tetrahedra on the same side "
+            f"(first face: nodes {faces[own].tolist()} of element {own // 4}); remesh the body, or remove one "
+            "tetrahedron of each pair"
         )

@@ -1,25 +1,25 @@
 """The base class of all physics, and the base classes of the force terms of a step.
 
-A physics is one object that adds forces or constraints to a body: a law, viscosity, loads, contact or a support. It is
-a frozen struct of numbers. A scene has a tuple of physics. A physics may have internal variables, which it passes from
-step to step; the argument `memory` contains them. In a step, a physics acts through a force term, which stores
-everything that is constant during the step. The main methods are:
+In this project, "a physics" is one object that adds forces or constraints to a body: a law, viscosity, loads, contact
+or a support. It is a frozen struct of numbers. A scene has a tuple of such objects. A physics may have internal
+variables, which it passes from step to step in the argument `memory`. In each step, a physics gives a force term, which
+stores everything that is constant during the step. The main methods are:
 
-* `begin(start)` -> memory: return the internal variables at the beginning of a run, any pytree;
+* `begin(start)` -> memory: return the internal variables at the beginning of a run (any pytree);
 * `freeze(memory, step)`: return the force term of the step;
 * `advance(memory, acting, end)` -> memory: return the internal variables after an accepted step with the force term
   `acting`;
-* `check(...)`: raise InputError for numbers that no step can use.
+* `check(...)`: raise InputError if a number cannot be used in any step.
 
 Loads and prescribed motions change during a step. Methods evaluate them at a fraction s of the step (0 at its
 beginning, 1 at its end).
 
-There are three kinds of force terms. The forces, the tangent and the energy of a step are sums over these terms.
+There are three classes of force terms. The forces, the tangent and the energy of a step are sums over all force terms.
 
 * `Solid` and `VolumeStress` act in the elements, before assembly. They return stresses and blocks of the stiffness.
-* `NodalForce` acts at the nodes, after assembly. It returns forces and diagonal blocks of the stiffness.
+* `NodalForce` acts at the nodes, after assembly. It returns nodal forces and their stiffness.
 
-A `VolumeStress` has pressures at the nodes. Positions and pressures are solved together as a mixed system
+A `VolumeStress` has pressures at the nodes. A mixed system of equations determines positions and pressures together
 (`liverjax.simulation.mixed_system`). V is the number of nodes (for pressures the number of vertices), E the number of
 elements.
 """
@@ -40,53 +40,54 @@ from liverjax.solvers.attached import definite as without_negative
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.tensors.matrices import Matrix, Vector
 
-#: Which blocks of the stiffness to compute: pairs of indices into a list of shape vectors.
+#: Pairs (i, j) of nodes of an element, for which stiffness blocks are computed. i and j are indices in a list of the
+#: gradients of the shape functions.
 Pairs = tuple[tuple[int, int], ...]
 
 
 class Tied(Protocol):
     """Nodes that move together in a step, for example as a rigid body.
 
-    A few unknowns define their motion. These unknowns are stored in a nodal field (V, 3), in the rows of these nodes.
+    A few unknowns define their motion. These unknowns are stored in the rows of these nodes in a nodal field (V, 3).
     """
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """Project a field (V, 3) onto the free motions of the nodes. For forces, x (V, 3) are the positions."""
+        """Project a nodal field (V, 3) onto the free motions of the nodes. For forces, x (V, 3) are the positions."""
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Write the unknowns of the motion to positions x (V, 3) into a field (V, 3).
+        """Return `field` (V, 3) with the unknowns of the motion that moves the nodes to the positions x (V, 3).
 
         `placed` is the inverse of this method.
         """
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Positions (V, 3) from a field with these unknowns, at fraction s of the step."""
+        """Return the positions (V, 3) for a field with these unknowns, at fraction s of the step."""
 
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
-        """Set the mask (V, 3) to 0 at nodes with a given motion, and return the free directions (V, 3) of these nodes.
+        """Return the mask (V, 3), set to 0 at nodes with a given motion, and the free directions (V, 3) of these nodes.
 
         A node with a given motion has at most one free direction. The directions are 0 at other nodes, and None if no
         node has such a direction.
         """
 
     def rigid(self, x: jax.Array, velocity: jax.Array, acceleration: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Replace velocity and acceleration (V, 3) of the nodes at positions x (V, 3) by those of a rigid motion.
+        """Return velocity and acceleration (V, 3), with the values of a rigid motion at these nodes.
 
-        The given values were computed for each node separately.
+        The given values were computed for each node separately. x (V, 3) are the positions of the nodes.
         """
 
 
 class Free(NamedTuple):
-    """The directions in which the nodes can move. `vectors` projects nodal vectors onto these directions."""
+    """The directions in which the nodes can move. The method `vectors` projects nodal vectors onto these directions."""
 
-    mask: jax.Array  # (V, 3) 0 along fixed or prescribed axes, else 1
+    mask: jax.Array  # (V, 3): 0 along fixed or prescribed axes, else 1
     normals: jax.Array | None = None  # (V, 3) unit normals along which nodes cannot move; 0 at other nodes
     tied: tuple[Tied, ...] = ()  # nodes that move together
 
     def vectors(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
         """Project a nodal field (V, 3) onto the free directions.
 
-        For forces the positions x (V, 3) are needed if nodes move together.
+        For forces, positions x are needed if nodes move together.
         """
         field = self.mask * field
         if self.normals is not None:
@@ -96,7 +97,7 @@ class Free(NamedTuple):
         return field
 
     def columns(self, columns: Sequence[jax.Array]) -> list[jax.Array]:
-        """Project a nodal field, given by its three columns (V,) of x, y and z, onto the free directions."""
+        """Project a nodal field, given as its three columns (V,) of x, y and z components, onto the free directions."""
         if self.tied:
             return list(self.vectors(jnp.stack(columns, axis=-1)).T)
         masked = [m * c for m, c in zip(self.mask.T, columns, strict=True)]
@@ -114,7 +115,7 @@ class Start(NamedTuple):
     x: jax.Array  # (V, 3) [m]
     free: Free
     force: Callable[[], jax.Array]  # (V, 3) [N] nodal forces at x, without inertia
-    moved: bool = False  # True: the body was just moved to x. False: the body rests at x, or x is only a guess
+    moved: bool = False  # True: the body was just moved to x. False: it is at rest at x, or x is only a guess
 
 
 class Step(NamedTuple):
@@ -122,22 +123,22 @@ class Step(NamedTuple):
 
     mesh: TetMesh
     x: jax.Array  # (V, 3) [m] positions at the beginning of the step
-    k: Number  # number of the step, from 1
+    k: Number  # number of the step; the first step is 1
     steps: int  # number of steps of the run
     dt: Any  # [s]; None for load steps without time
-    inertia: bool  # whether there is inertia; then the full loads act from the first step on
-    tolerance: Any  # tolerance of the residual, not differentiated
+    inertia: bool  # whether the run has inertia; if true, the full loads act from the first step on
+    tolerance: Any  # tolerance of the residual; derivatives do not depend on it
     free: Free
-    averaged: bool = False  # True for Newmark's method: the step uses the mean of the forces at its beginning and end
+    averaged: bool = False  # True (Newmark): the step uses the mean of the forces at its beginning and end
 
 
 class End(NamedTuple):
     """The state at the end of an accepted step."""
 
     x: jax.Array  # (V, 3) [m]
-    F: Matrix  # deformation gradients (E,), or (Q, E) if elements have Q points
+    F: Matrix  # deformation gradients (E,), or (Q, E) with Q integration points per element
     pressure: Any  # (V,) [Pa] at the nodes, or None
-    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] minus the acceleration due to `NodalForce.at_end` terms
+    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] acceleration due to `NodalForce.at_end` terms, times -1
 
 
 class Solid:
@@ -148,7 +149,7 @@ class Solid:
         raise TypeError(f"{type(self).__name__} lacks stress(F)")
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
-        """Stiffness blocks d2W/dx_i dx_j per reference volume, for pairs (i, j) of nodes.
+        """Return the stiffness blocks d2W/dx_i dx_j of the energy W per reference volume, for pairs (i, j) of nodes.
 
         D [1/m] are the gradients of the shape functions.
         """
@@ -159,20 +160,28 @@ class Solid:
         raise TypeError(f"{type(self).__name__} lacks energy(F)")
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix | None]:
-        """Pairs (weight, law), and a constant second Piola-Kirchhoff stress [Pa] or None. Their sum is the stress."""
+        """Return pairs (weight, law), and a constant second Piola-Kirchhoff stress [Pa] or None.
+
+        The stress of this term is the weighted sum of the stresses of the laws, plus the constant stress.
+        """
         raise TypeError(f"{type(self).__name__} lacks parts()")
 
 
 class VolumeStress:
     """A force term of one step. Its stress depends on the volume ratio of elements and on pressures at nodes."""
 
-    #: Whether the pressures depend on the positions at the end of the step. Then the mixed system contains them.
+    #: Whether the pressures depend on the positions at the end of the step. If true, the mixed system contains the
+    #: pressures.
     coupled: ClassVar[bool] = True
-    #: Whether the pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`) and not eliminated.
+    #: Whether the pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`). If false, they are
+    #: eliminated or known.
     unknown: ClassVar[bool] = False
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: Guess | None = None) -> jax.Array:
-        """Pressures (V,) [Pa] at the end of a step with volume ratios J (E,). An iterative solve starts at `guess`."""
+        """Return the pressures (V,) [Pa] at the end of a step with volume ratios J (E,).
+
+        If the pressures are found by iterations, the iterations start at `guess`.
+        """
         raise TypeError(f"{type(self).__name__} lacks pressure(mesh, J)")
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
@@ -180,32 +189,33 @@ class VolumeStress:
         raise TypeError(f"{type(self).__name__} lacks stress(mesh, pressure, F)")
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """First and second derivative of the energy density with respect to J, at given pressures (V,) [Pa]."""
+        """Return the first and second derivative of the energy density with respect to J, the volume ratio."""
         raise TypeError(f"{type(self).__name__} lacks scalars(mesh, pressure, F)")
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Energy [J] at volume ratios J (E,), with the pressures that these volume ratios cause."""
+        """Return the energy [J] at volume ratios J (E,), with the pressures that belong to these volume ratios."""
         raise TypeError(f"{type(self).__name__} lacks energy(mesh, J)")
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """Matrix [m^3/Pa] of the pressure equation. If `positive` is true, the matrix has no negative eigenvalues."""
+        """Return the matrix [m^3/Pa] of the pressure equation, without negative eigenvalues if `positive` is true."""
         raise TypeError(f"{type(self).__name__} lacks matrix(mesh, J, positive)")
 
-    #: The pressure equation of a flowing fluid (`liverjax.physics.darcy.Flow`). None: nothing flows between nodes.
+    #: The pressure equation of a flowing fluid (`liverjax.physics.darcy.Flow`). None: no fluid flows between nodes.
     flow: Any = None
 
 
 class NodalForce:
     """A force term of one step with forces at nodes."""
 
-    #: Whether the term has a stiffness at every node. Then long waves do not slow down the linear solver.
+    #: Whether the term has a stiffness at every node. Then the linear solver also reduces errors of long wavelength
+    #: quickly.
     everywhere: ClassVar[bool] = False
-    #: Whether the force has an energy. A follower force has none, and its stiffness is not symmetric.
+    #: Whether the force has an energy. A follower force has no energy, and its stiffness is not symmetric.
     conservative: bool = True
     #: Whether the derivative of the force jumps, for example where contact begins.
     kinked: ClassVar[bool] = False
-    #: Whether Newmark's method uses only the force at the end of the step. This force is doubled, since the other
-    #: forces enter as half of the sum at both ends.
+    #: Whether Newmark's method uses only the force at the end of the step. This force is doubled, since Newmark's
+    #: method multiplies the sum of the forces at the beginning and at the end of the step by 1/2.
     at_end: bool = False
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
@@ -217,66 +227,72 @@ class NodalForce:
         raise TypeError(f"{type(self).__name__} lacks energy(mesh, x)")
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """Energy [J] at x for a minimisation that begins at `start` (V, 3). Its gradient at `start` is the force there.
+        """Return an energy [J] at positions x, for a minimisation that begins at the positions `start` (V, 3).
 
-        If the force has an energy, this energy is returned. Otherwise the non-conservative part of the force keeps its
-        value at `start`.
+        The gradient of this energy at `start` is the force at `start`. If the force has an energy, this energy is
+        returned. Otherwise the non-conservative part of the force keeps its value at `start`.
         """
         return self.energy(mesh, x)
 
     def stiffness(self) -> Block | None:
-        """Diagonal blocks of the stiffness: 3 x 3 entries (V,) [N/m], or None for an entry that is 0.
+        """Return the stiffness of each node: 3 x 3 entries (V,) [N/m], with None for entries that are 0.
 
-        Returns None if the term has no such blocks.
+        Returns None if the term has no such stiffness.
         """
         return None
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
-        """Stiffness at x of elements that connect nodes, in addition to `stiffness`; None if there are no elements."""
+        """Return the stiffness at x of elements that connect nodes. Returns None if the term has no such elements.
+
+        The result does not contain the blocks of `stiffness`.
+        """
         return None
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
-        """The stiffness of `attached` without its negative eigenvalues."""
+        """Return the same stiffness as `attached`, with negative eigenvalues removed."""
         own = self.attached(mesh, x, s)
         return without_negative(own) if isinstance(own, Attached) else own
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
-        """Loss of stiffness due to the elimination of an unknown, for example the displacement of an obstacle.
+        """Return the loss of stiffness due to an eliminated unknown, for example the displacement of an obstacle.
 
-        If `definite` is true, the loss belongs to the stiffness of the method `definite`. Returns None if there is no
-        such unknown.
+        If `definite` is true, the loss is that of the stiffness from the method `definite`, otherwise from `attached`.
+        Returns None if there is no such unknown.
         """
         return None
 
     def predicted(self) -> jax.Array | None:
-        """Positions (V, 3) [m] that the body would reach without forces, to start Newton's method; None if unknown."""
+        """Return positions (V, 3) [m] of the body without forces, where Newton's method can start; None if unknown."""
         return None
 
     def accelerations(self, force: jax.Array, x: jax.Array) -> jax.Array | None:
-        """Accelerations (V, 3) [m/s^2] of free nodes at x (V, 3) due to forces (V, 3) [N]; None if there is no mass."""
+        """Return accelerations (V, 3) [m/s^2] of free nodes at x due to forces (V, 3) [N]; None without a mass."""
         return None
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:
-        """Inertia forces (V, 3) [N], for a term with mass."""
+        """Return the inertia forces (V, 3) [N] for accelerations (V, 3) [m/s^2], if the term has mass."""
         raise TypeError(f"{type(self).__name__} lacks inertial(acceleration)")
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
-        """Change (V, 3) [N] of a non-conservative force for a displacement dx (V, 3) [m]."""
+        """Return the change (V, 3) [N] of a non-conservative force due to a small displacement dx (V, 3) [m]."""
         return jax.jvp(lambda x: self.force(mesh, x, s), (x,), (dx,))[1]
 
 
 class Physics:
-    """Base class of a physics: a struct of numbers. The docstring of the module explains the methods."""
+    """Base class of all physics objects (supports, loads, contact, …), which are structs of numbers.
 
-    #: Every physics is a struct, so `dataclasses.replace` works with it.
+    The docstring of the module explains the methods.
+    """
+
+    #: All subclasses are structs, so `dataclasses.replace` can be used with their objects.
     __dataclass_fields__: ClassVar[Content]
-    #: Name of the table in scene files; `keys` are the keys of this table.
+    #: Name of the table in scene files. `keys` are the keys of this table.
     section: ClassVar[str] = ""
-    #: Whether the physics makes nodes move together. The factorisation cannot treat such nodes.
+    #: Whether nodes move together because of this physics. Then linear_solver = 'direct' cannot be used.
     ties: ClassVar[bool] = False
     #: Whether the physics needs the time step `step.dt`. Then a scene without a time step raises InputError.
     in_time: ClassVar[bool] = False
-    #: Whether the forces have an energy. Friction forces have none.
+    #: Whether the forces have an energy. Friction forces have no energy.
     conservative: ClassVar[bool] = True
     keys: ClassVar[tuple[str, ...]] = ()
 
@@ -285,7 +301,7 @@ class Physics:
         """Read the physics from a table of a scene file.
 
         Raises:
-            InputError: values that cannot be used.
+            InputError: the table contains values that cannot be used.
         """
         raise TypeError(f"{cls.__name__} has no table in scene files")
 
@@ -293,18 +309,18 @@ class Physics:
         """Check the numbers of this physics.
 
         Raises:
-            InputError: numbers that no step can use. The message begins with `name`.
+            InputError: a number cannot be used in any step. The message begins with `name`.
         """
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Check that a run can begin with this mesh. The mesh of a loaded shape is not checked.
+        """Check that a run can begin with this mesh in its reference shape. Not called for a mesh in its loaded shape.
 
         Raises:
-            InputError: the run cannot begin. The message begins with `name`.
+            InputError: the run cannot begin (e.g. an obstacle is inside the body). The message begins with `name`.
         """
 
     def in_body(self, mesh: TetMesh, law: Any) -> "Physics":
-        """Return the same physics, with default numbers computed from the law of the body."""
+        """Return the same physics. Numbers that the user did not give are computed from the law of the body."""
         return self
 
     def at_beginning(self) -> "Physics":
@@ -312,54 +328,54 @@ class Physics:
         return self
 
     def begin(self, start: Start) -> Any:
-        """Internal variables at the beginning of a run, or None if this physics has no internal variables."""
+        """Return the internal variables at the beginning of a run, or None if there are no internal variables."""
         return None
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """Whether `freeze` accepts None as `memory`, for a body at rest at the beginning of a run."""
+        """Return whether `freeze` accepts None as `memory`, for a body at rest at the beginning of a run."""
         return cls.begin is Physics.begin
 
     def freeze(self, memory: Any, step: Step) -> Any:
-        """Force term of a step, or None if this physics adds no force."""
+        """Return the force term of a step, or None if this physics adds no force."""
         return None
 
     def advance(self, memory: Any, acting: Any, end: End) -> Any:
-        """Internal variables after an accepted step."""
+        """Return the internal variables after an accepted step with the force term `acting`."""
         return memory
 
     def constrain(self, free: Free) -> Free:
-        """Remove the directions that this physics constrains from the free directions."""
+        """Return the free directions without the directions that this physics constrains."""
         return free
 
     def tied(self, step: Step) -> Tied | None:
-        """Nodes that move together during a step because of this physics, or None if there are no such nodes."""
+        """Return the nodes that move together in a step because of this physics, or None if there are no such nodes."""
         return None
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Node numbers (n,) and directions (n, 3) along which this physics prevents rigid motions of the body."""
+        """Return n node numbers (n,) and the directions (n, 3) in which this physics constrains these nodes."""
         return np.zeros(0, int), np.zeros((0, 3))
 
     def pulls_single_nodes(self) -> bool:
-        """Whether forces act at single nodes, not on an area. Then displacements there depend on the mesh."""
+        """Return whether forces act at single nodes, not on an area. Then displacements there depend on the mesh."""
         return False
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Physics":
         """Return the same physics on a mesh with elements of higher order.
 
-        `more` takes node numbers (n,) and adds the numbers of the new nodes that lie between these nodes.
+        The function `more` adds to n node numbers (n,) the numbers of the new nodes between these nodes.
         """
         return self
 
     def bulk_modulus(self) -> Any:
-        """Bulk modulus [Pa] that replaces the bulk modulus of the law, or None if it is not replaced."""
+        """Return a bulk modulus [Pa] that replaces the bulk modulus of the law, or None if it is not replaced."""
         return None
 
     def output(self, memory: Any) -> dict[str, jax.Array]:
-        """Return more fields of the result, by name: one value per vertex (V,), for example the pressure of a fluid."""
+        """Return additional fields of the result by name, one value per vertex (V,), for example a fluid pressure."""
         return {}
 
 
 def diagonal(value: jax.Array) -> Block:
-    """Return the 3 x 3 blocks of a diagonal matrix, with the same value (V,) for every axis."""
+    """Return 3 x 3 blocks that are diagonal: `value` (V,) on the diagonal, and None (zero) elsewhere."""
     return ((value, None, None), (None, value, None), (None, None, value))

@@ -22,29 +22,29 @@ from liverjax.solvers.krylov import Known, chebyshev, differentiable_solve
 from liverjax.solvers.preconditioner import Coarse
 from liverjax.tensors.matrices import Matrix, dot
 
-#: Elements with a smaller J (flat or inverted) store and conduct fluid as if they had this J.
+#: Elements with a smaller volume ratio J (flat or inverted) store and conduct fluid as if they had this J.
 LEAST_J = 1e-3
 
 
 class Flow(NamedTuple):
-    """The pressure equation of a step at its initial positions. The matrix is storage plus dt times Darcy's Laplacian.
+    """The pressure equation of a step at its initial positions, with the pressure matrix A and its diagonal D.
 
-    D is the diagonal of the matrix A.
+    A contains the storage of fluid plus dt times the flow between nodes, both per unit of pressure.
     """
 
-    matrix: block_matrix.BlockMatrix  # A, symmetric positive definite, 1 x 1 blocks
+    matrix: block_matrix.BlockMatrix  # A: symmetric, positive definite, with 1 x 1 blocks
     store: jax.Array  # (V,) [m^3/Pa] fluid volume stored per unit of pressure
-    mask: jax.Array  # (V,) 0 where P is given, 1 elsewhere
-    slow: Coarse  # coarse space of the matrix
+    mask: jax.Array  # (V,): 0 where the pressure is given, 1 elsewhere
+    slow: Coarse  # coarse space of the preconditioner
     low: jax.Array  # estimated minimum eigenvalue of D^-1 A outside the coarse space
     high: jax.Array  # upper bound of the eigenvalues of D^-1 A
     tolerance: jax.Array  # tolerance of a solve, relative to the right-hand side
-    given: jax.Array | None = None  # (V,) [Pa] given pressures, 0 elsewhere; None: all given pressures are 0
+    given: jax.Array | None = None  # (V,) [Pa] given pressures, 0 at other nodes; None: all given pressures are 0
     enters: jax.Array | None = None  # (V,) [m^3] fluid that enters during the step; None: no fluid enters
 
 
 def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Array:
-    """Mask (V,) of the vertices: 1 if the pressure is unknown, 0 if the vertex is drained or its pressure is given."""
+    """Return a mask (V,) of the vertices: 0 if the vertex is drained or its pressure is given, otherwise 1."""
     mask = jnp.ones(mesh.number_of_vertices, dtype)
     if porosity.drained is not None:
         # Only vertices have pressures, so edge middles among these nodes are ignored.
@@ -56,14 +56,14 @@ def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Arr
 
 
 def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tolerance: jax.Array) -> Flow:
-    """Pressure equation of a step dt [s], with deformation gradient F and volume ratios J (E,) at its beginning."""
+    """Return the pressure equation of a step dt [s]. F and the volume ratios J (E,) are those at its beginning."""
     mask = unknown_pressures(porosity, mesh, J.dtype)
-    # Everything is multiplied by dt, so that the storage term does not depend on the step.
+    # The whole equation is multiplied by dt, so that the storage term does not depend on the time step.
     J = jnp.maximum(J, LEAST_J)
     by_element = jnp.ndim(porosity.limit_bulk) > 0
     store = integrals(mesh, J / porosity.limit_bulk) if by_element else integrals(mesh, J) / porosity.limit_bulk
     g = volume_gradients(mesh, F)
-    # grad N_a = cof(F) D_a / J is integrated over the current volume J V0, so one factor 1/J remains.
+    # The gradients grad N_a = cof(F) D_a / J occur twice, and the current volume is J V0. So one factor 1/J remains.
     weight = dt * porosity.permeability * mesh.weights / J
     rows = block_matrix.off_diagonal(mesh, {(a, b): ((summed(mesh, weight * dot(g[a], g[b])),),) for a, b in PAIRS})
     diagonal = ((store - block_matrix.row_sums(rows)[0][0],),)
@@ -71,7 +71,7 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tole
     A0 = jax.lax.stop_gradient(A)
     low = jax.lax.stop_gradient(_least_eigenvalue(mesh, dt * porosity.permeability, store, diagonal[0][0]))
     slow = preconditioner.coarse(mesh, A0, mask[:, None], True)
-    high = 1 + jnp.max(jnp.sum(jnp.abs(A0.rows[0][0]), axis=0) / A0.diagonal[0][0])  # Gershgorin
+    high = 1 + jnp.max(jnp.sum(jnp.abs(A0.rows[0][0]), axis=0) / A0.diagonal[0][0])  # Gershgorin's bound
     return Flow(A, store, mask, slow, low, high, tolerance)
 
 
@@ -82,24 +82,25 @@ def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: j
     """
     stored, total = jnp.sum(store), jnp.sum(diagonal)
     if jnp.ndim(rate):
-        # The minimum belongs to the elements with the fastest flow, so their rate is used for the whole body.
+        # The elements with the largest dt kappa determine the minimum eigenvalue. So this value is used for the whole
+        # body.
         fastest, mean = jnp.max(rate), jnp.sum(jnp.ravel(rate) * mesh.volumes) / jnp.sum(mesh.volumes)
         total, rate = stored + (total - stored) * fastest / jnp.where(mean > 0, mean, 1.0), fastest
-    # Storage plus Darcy flow of a pressure wave with wave number 5 / (patch width). In numerical tests the factor was
-    # 4.9 to 5.4. The coarse space treats longer waves.
+    # The numerator of the estimate is the storage plus the Darcy flow of a pressure wave with wave number 5 / (patch
+    # width). In numerical tests, this number was 4.9 to 5.4 instead of 5. The coarse space corrects longer waves.
     waves = rate * (5 / mesh.pattern.patch_width) ** 2 * jnp.sum(mesh.volumes)
     return (stored + waves) / total
 
 
 def right_side(flow: Flow, b: jax.Array) -> jax.Array:
-    """Right-hand side (V,) [m^3] for the unknown pressures: b plus inflow, minus the effect of the given pressures."""
+    """Return the right-hand side (V,) [m^3] for unknown pressures: b plus inflow, minus A times given pressures."""
     if flow.enters is not None:
         b = b + flow.enters
     return flow.mask * (b if flow.given is None else b - flow_product(flow, flow.given))
 
 
 def lack(flow: Flow, b: jax.Array, pressure: jax.Array) -> jax.Array:
-    """Residual b - A P (V,) for pressures P (V,) [Pa]; 0 at a solution.
+    """Return the residual b - A P (V,) [m^3] for pressures P (V,) [Pa]. It is 0 at a solution.
 
     At nodes with a given pressure, the residual is the given pressure minus P.
     """
@@ -111,7 +112,7 @@ def lack(flow: Flow, b: jax.Array, pressure: jax.Array) -> jax.Array:
 class Guess(NamedTuple):
     """Starting pressures of a solve, and the accuracy that this solve needs."""
 
-    pressure: jax.Array  # (V,) [Pa], not differentiated
+    pressure: jax.Array  # (V,) [Pa]; derivatives do not depend on it
     looser: Number  # tolerance of the solve, divided by `Flow.tolerance`
 
 
@@ -122,13 +123,14 @@ def with_given(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = No
 
 
 def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) -> jax.Array:
-    """Solve A p = b for b (V,), with the pressure matrix A, to the tolerance of the flow. The result is differentiable.
+    """Solve A p = b for b (V,), with the pressure matrix A, to the tolerance of `flow`. The result is differentiable.
 
-    A `guess` saves iterations. The derivatives are as accurate as without a guess.
+    A `guess` of p saves iterations. The derivatives are as accurate as without a guess.
     """
 
     def apply(p):
-        # Rows of given pressures are unit rows, because adjoint loads may be nonzero there.
+        # Rows of given pressures are rows of the identity, since the right-hand side of an adjoint solve may be nonzero
+        # there.
         return flow.mask * flow_product(flow, flow.mask * p) + (1 - flow.mask) * p
 
     diagonal = flow.mask * flow.matrix.diagonal[0][0] + (1 - flow.mask)
@@ -156,21 +158,22 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) 
 
 
 def flow_product(flow: Flow, p: jax.Array) -> jax.Array:
-    """Product A p, computed from differences between neighbours. A uniform p then causes exactly no flow."""
+    """Return the product A p, from differences of p between neighbours. So a uniform p causes exactly no flow."""
     rows, nodes = flow.matrix.rows[0][0], flow.matrix.nodes
-    # One kernel for all neighbours takes a third of the time of a loop over them, on small and on large meshes.
+    # One operation for all neighbours takes a third of the time of a loop over the neighbours, on small and large
+    # meshes.
     return flow.store * p + jnp.sum(rows * (p[nodes] - p[None]), axis=0)
 
 
-#: Error of the polynomial that approximates the inverse of the pressure matrix in Newton's direction.
+#: Relative error of the polynomial by which the inverse of the pressure matrix is approximated for Newton's direction.
 _POLYNOMIAL_ERROR = 0.1
 
 
 def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
     """Solve A p = b for b (V,) approximately, with the pressure matrix A.
 
-    The approximate inverse is linear, symmetric and positive definite. Long waves are solved exactly in the coarse
-    space. A polynomial of the matrix treats the other waves.
+    The approximate inverse is linear, symmetric and positive definite. It is exact for long waves, which the coarse
+    space represents. For the other waves it is a polynomial of the matrix.
     """
     d = flow.matrix.diagonal[0][0]
     degree = jnp.ceil(0.5 * jnp.sqrt(flow.high / flow.low) * jnp.log(2 / _POLYNOMIAL_ERROR)).astype(jnp.int32)

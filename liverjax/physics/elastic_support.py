@@ -25,13 +25,13 @@ from liverjax.physics.base import NodalForce, Physics, Step
 from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block
 
-#: Degree of the integration rule on triangles, for each order of the elements.
+#: Order of the elements -> degree of the integration rule on their triangles.
 _DEGREE = {2: 4, 3: 5}
 
 
 @struct
 class ElasticSupport(Physics):
-    """Springs on triangles of the surface (`normal`, `tangential`) or on nodes (`stiffness`)."""
+    """Springs on m triangles of the surface (`normal`, `tangential`), or on n nodes (`stiffness`)."""
 
     triangles: Any = param("1", "node numbers (m, 3)", lower=0, default=None)
     normal: Number = param("Pa/m", "stiffness per area along the normal", lower=0.0, default=0.0)
@@ -68,26 +68,26 @@ class ElasticSupport(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError for wrong or missing node numbers, and for a history that does not fit its times."""
+        """Raise InputError for wrong or missing node numbers, or a history whose shape does not match its times."""
         history.check_times(self.times, self.history, name)
         if (self.triangles is None) == (self.nodes is None):
             raise InputError(f"{name} needs either triangles or nodes: give one of them")
         if self.nodes is not None:
             selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
             bounds.check_shape(f"{name}.stiffness", self.stiffness, (), np.shape(self.nodes))
-            _refuse_idle(self, ("normal", "tangential"), name, "springs on nodes have stiffness in N/m")
+            _refuse_idle(self, ("normal", "tangential"), name, "for springs on nodes give stiffness in N/m")
         else:
             selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
             for key in ("normal", "tangential"):
                 bounds.check_shape(f"{name}.{key}", getattr(self, key), (), (len(self.triangles),))
-            _refuse_idle(self, ("stiffness",), name, "springs on a surface have normal and tangential in Pa/m")
+            _refuse_idle(self, ("stiffness",), name, "for springs on a surface give normal and tangential in Pa/m")
         if self.history is not None and np.ndim(self.history) == 1:
             bounds.check_bound(f"{name} history", {"lower": 0.0}, self.history)
 
     def freeze(self, memory: None, step: Step) -> "Springs | Foundation":
-        """Force term of the springs for one step, with one symmetric stiffness block per node.
+        """Return the force term of the springs for one step, with one symmetric stiffness block per node.
 
-        On surfaces of elements of higher order there is one block per integration point.
+        On surfaces of elements of higher order, there is one block per integration point.
         """
         kind: Any = Foundation if self.triangles is not None and step.mesh.order > 1 else Springs
         own = point_blocks(self, step.mesh) if kind is Foundation else blocks(self, step.mesh)
@@ -100,17 +100,17 @@ class ElasticSupport(Physics):
         return kind(blocks=tuple(tuple(after * entry for entry in row) for row in own), **given)
 
     def pulls_single_nodes(self) -> bool:
-        """Whether the springs are given for nodes, and not per area."""
+        """Return whether the springs are given for nodes. If not, they are given per area."""
         return self.triangles is None
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "ElasticSupport":
-        """Return the support on the same triangles or nodes of the mesh of higher order."""
+        """Return the support on the same triangles or nodes, for the mesh with elements of higher order."""
         if self.triangles is None:
             return self
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes, and the principal axes along which the springs of each node have a stiffness."""
+        """Return nodes (n,), each with a principal axis (n, 3) along which its springs have a stiffness."""
         K = np.moveaxis(np.array([[np.asarray(e) for e in row] for row in blocks(self, mesh)]), -1, 0)
         size, axes = np.linalg.eigh(K)
         node, axis = np.nonzero(size > 1e-9 * max(size.max(), 1e-300))
@@ -118,15 +118,15 @@ class ElasticSupport(Physics):
 
 
 def _refuse_idle(support: ElasticSupport, keys: tuple[str, ...], name: str, instead: str) -> None:
-    """Raise InputError for stiffnesses of the other kind of springs, since they would have no effect."""
+    """Raise InputError if a stiffness of the other kind of springs (`keys`) is not 0, since it would have no effect."""
     for key in keys:
         if np.any(np.asarray(getattr(support, key)) != 0):
-            raise InputError(f"{name}.{key} = {getattr(support, key)} changes nothing: {instead}")
+            raise InputError(f"{name}.{key} = {getattr(support, key)} has no effect: {instead}")
 
 
 @partial(jax.jit, inline=True)
 def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
-    """Spring stiffness of the nodes: 3 x 3 blocks of arrays (V,) [N/m]."""
+    """Return the spring stiffness of the nodes: 3 x 3 blocks of arrays (V,) [N/m]."""
     zero = jnp.zeros(mesh.points.shape[0], mesh.points.dtype)
     if support.triangles is None:
         own = zero.at[support.nodes].add(support.stiffness)
@@ -142,13 +142,16 @@ def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
 
 
 def point_blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
-    """Spring stiffness at the Q integration points of m triangles: 3 x 3 blocks of arrays (Q, m) [N/m]."""
+    """Return the spring stiffness at Q integration points of m triangles: 3 x 3 blocks of arrays (Q, m) [N/m]."""
     weights = triangle_rule(_DEGREE[mesh.order])[0]
     return _each(support, mesh, lambda whole: jnp.asarray(weights, whole.dtype)[:, None] * whole[None])
 
 
 def _each(support: ElasticSupport, mesh: TetMesh, shared: Callable[[jax.Array], jax.Array]) -> Block:
-    """Spring stiffness as 3 x 3 blocks. `shared` distributes stiffnesses (m,) [N/m] of triangles to nodes or points."""
+    """Return the spring stiffness as 3 x 3 blocks of arrays.
+
+    The function `shared` distributes stiffnesses (m,) [N/m] of m triangles to nodes or integration points.
+    """
     normal = surface.areas(mesh.points, support.triangles)
     area = jnp.sqrt(jnp.sum(normal * normal, axis=1))
     n = normal / area[:, None]
@@ -171,28 +174,28 @@ class Springs(NodalForce):
     )
 
     def _stretch(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Stretch of the springs (V, 3) [m]."""
+        """Return the elongation (V, 3) [m] of the springs, as a vector for each node."""
         if self.wall is None:
             return x - mesh.points
         return x - mesh.points - (self.wall[0] + s * (self.wall[1] - self.wall[0]))[None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Nodal forces (V, 3) [N]: blocks times stretch."""
+        """Return the nodal forces (V, 3) [N] (gradient of the energy): stiffness blocks times elongation."""
         u = self._stretch(mesh, x, s).T
         return jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks], axis=-1)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy [J] of the springs: half of stretch times force."""
+        """Return the energy [J] of the springs: half of elongation times force."""
         return 0.5 * jnp.sum(self._stretch(mesh, x, 1.0) * self.force(mesh, x, 1.0))
 
     def stiffness(self) -> Block:
-        """Stiffness blocks (V,) [N/m] of the springs. They are constant during the step."""
+        """Return the stiffness blocks (V,) [N/m] of the springs. They are constant during the step."""
         return self.blocks
 
 
 @struct
 class Foundation(NodalForce):
-    """Force term of springs on a surface, integrated over its triangles, for one step."""
+    """Force term of springs on m triangles, integrated with Q points per triangle, for one step."""
 
     triangles: Indices = param(
         "1", "node numbers (m, 3), or (m, 4) for elements of order 3 (`liverjax.mesh.promotion.with_faces`)"
@@ -203,7 +206,10 @@ class Foundation(NodalForce):
     )
 
     def _at_points(self, mesh: TetMesh, x: jax.Array, s: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Node numbers (n, m), their shape functions (n, Q), and the stretch of the springs (3, Q, m) [m]."""
+        """Return node numbers (n, m), shape functions (n, Q), and the elongation (3, Q, m) [m] of the springs.
+
+        There are m triangles with n nodes and Q integration points each.
+        """
         nodes = jnp.stack(surface.triangle_nodes(mesh, self.triangles))
         N = jnp.asarray(surface.triangle_functions(mesh, triangle_rule(_DEGREE[mesh.order])[1]), x.dtype)
         u = jnp.einsum("aq,ami->iqm", N, (x - mesh.points)[nodes])
@@ -212,18 +218,18 @@ class Foundation(NodalForce):
         return nodes, N, u
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Nodal forces (V, 3) [N]: forces at the integration points, distributed by the shape functions."""
+        """Return the nodal forces (V, 3) [N] (gradient of the energy), from the forces at the integration points."""
         nodes, N, u = self._at_points(mesh, x, s)
         own = jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks])
         return jnp.zeros_like(x).at[nodes].add(jnp.einsum("aq,iqm->ami", N, own))
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy [J] of the springs: half of stretch times force."""
+        """Return the energy [J] of the springs: half of elongation times force."""
         u = self._at_points(mesh, x, 1.0)[2]
         return 0.5 * jnp.einsum("iqm,ijqm,jqm->", u, jnp.stack([jnp.stack(row) for row in self.blocks]), u)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Stiffness: second derivative of the energy."""
+        """Return the stiffness between the nodes: the second derivative of the energy."""
         nodes, N, _ = self._at_points(mesh, x, s)
         H = jnp.stack([jnp.stack(row) for row in self.blocks])
         return Attached(nodes, jnp.einsum("aq,bq,ijqm->aibjm", N, N, H))

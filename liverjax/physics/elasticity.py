@@ -1,4 +1,4 @@
-"""A hyperelastic solid: the law gives the stress in every element from the current deformation alone."""
+"""A hyperelastic solid. In every element, the law gives the stress as a function of the current deformation only."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ class Elasticity(Physics):
     law: Law = param("1", "the law")
 
     def freeze(self, memory: None, step: Step) -> "Elastic":
-        """Force term of the law, for one step."""
+        """Return the force term of the law for one step."""
         return Elastic(law=self.law)
 
 
@@ -29,17 +29,20 @@ class Elastic(Solid):
     law: Law = param("1", "the law")
 
     def stress(self, F: Matrix) -> Matrix:
-        """First Piola-Kirchhoff stress [Pa], from hand-derived formulas."""
+        """Return the first Piola-Kirchhoff stress [Pa].
+
+        Its formulas were derived by hand (no automatic differentiation).
+        """
         return invariant_terms.first_piola(self.law, F)
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
-        """Blocks of the stiffness, from hand-derived formulas."""
+        """Return the stiffness blocks for `pairs` of nodes, with gradients D of the shape functions."""
         return invariant_terms.blocks(invariant_terms.state(self.law, F), D, pairs)
 
     def energy(self, F: Matrix) -> jax.Array:
-        """Strain energy density [Pa]."""
+        """Return the strain energy density [Pa]."""
         return self.law.strain_energy(self.law.measures(F))
 
     def parts(self) -> tuple[list[tuple[Any, Any]], None]:
-        """The law with weight 1, and None because there is no constant stress."""
+        """Return the law with weight 1, and None because there is no constant stress."""
         return [(1.0, self.law)], None

@@ -2,8 +2,8 @@
 
 Newmark's method uses the mean of the forces at both ends of a step. The forces of an obstacle with a given position are
 an exception: only their value at the end of the step is used (Kane et al. 1999, Comput. Methods Appl. Mech. Eng. 180,
-1). An obstacle at rest then never adds energy to the body. With the mean it would add energy where contact begins or
-ends within a step. The stored acceleration (`Motion`) is the part due to all other forces.
+1). Then an obstacle at rest never adds energy to the body. With the mean of the forces, it would add energy if contact
+begins or ends within a step. The stored acceleration (`Motion`) does not contain the part due to these obstacle forces.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -20,9 +20,10 @@ from liverjax.solvers.attached import Masses, masses
 from liverjax.solvers.block_matrix import Block
 from liverjax.tensors.places import given
 
-#: Factor k in the acceleration k (x - ...)/dt^2 at the end of a step, with positions x and time step dt.
+#: Factor k for each method. The acceleration at the end of a step is k x/dt^2 plus terms that are known at its
+#: beginning, with positions x at the end and time step dt.
 FACTOR = {"euler": 1.0, "newmark": 4.0}
-#: Relative tolerance of the solves for accelerations.
+#: Relative tolerance of the linear solves for the accelerations.
 _EXACT = 1e-12
 
 
@@ -42,10 +43,10 @@ class Inertia(Physics):
     mass: str = static(default="lumped", about="lumped (at the nodes) or consistent")
 
     def begin(self, start: Start) -> Motion:
-        """Internal variables of a body at rest.
+        """Return velocity and acceleration of a body that is at rest at the beginning.
 
-        For Newmark's method the initial acceleration a solves m a = f, with masses m and forces f. The first step then
-        has the full order of accuracy.
+        For Newmark's method, the initial acceleration a is the solution of m a = f, with masses m and forces f. So the
+        first step also has second-order accuracy.
         """
         acceleration = None
         if self.integrator == "newmark":
@@ -72,7 +73,10 @@ class Inertia(Physics):
         return Moving(mass=mass, shared=shared, axes=axes, **own)
 
     def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
-        """Masses (V,) [kg] of the nodes, and the remaining part of the consistent mass matrix (None if lumped)."""
+        """Return the diagonal masses (V,) [kg] of the nodes, and the remaining part of the consistent mass matrix.
+
+        The remaining part is the consistent mass matrix minus the diagonal masses. It is None if the mass is lumped.
+        """
         if self.mass == "lumped":
             return self.density * nodal_volumes(mesh), None
         density, (parts, matrix) = jnp.asarray(self.density), mass_parts(mesh.order)
@@ -82,7 +86,7 @@ class Inertia(Physics):
         return mass, masses(mesh, matrix, size)
 
     def advance(self, memory: Motion, acting: "Moving", end: End) -> Motion:
-        """Velocity and acceleration at the end of the step."""
+        """Return velocity and acceleration at the end of the step."""
         velocity, acceleration = acting.kinematics(end.x)
         if end.by_end_forces is not None:
             acceleration = acceleration + end.by_end_forces
@@ -94,12 +98,13 @@ class Inertia(Physics):
 def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: jax.Array) -> jax.Array:
     """Solve m a = f in the free directions, with masses m and forces f (V, 3) [N].
 
-    Return the accelerations a (V, 3) [m/s^2], which are 0 in other directions.
+    Returns the accelerations a (V, 3) [m/s^2]. They are 0 in directions that are not free.
     """
     if shared is None and not free.tied:
         return force / mass[:, None]
 
-    # In reverse mode a cotangent may have components in fixed directions, so the matrix is made regular there.
+    # In reverse-mode differentiation, the right-hand side may have components in fixed directions. So the matrix must
+    # be regular there too.
     mean = jnp.mean(mass)
 
     def product(a: jax.Array) -> jax.Array:
@@ -115,7 +120,7 @@ def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: ja
 
 
 def _inertia(mass: jax.Array, shared: Masses | None, a: jax.Array) -> jax.Array:
-    """Inertia forces (V, 3) [N]: mass times accelerations a (V, 3) [m/s^2]."""
+    """Return the inertia forces (V, 3) [N]: mass times accelerations a (V, 3) [m/s^2]."""
     force = mass[:, None] * a
     return force if shared is None else force + jnp.stack(attached.product(shared, tuple(a.T)), axis=1)
 
@@ -132,7 +137,7 @@ class Moving(NodalForce):
     integrator: str = static(default="euler")
     shared: Masses | None = param("kg", "remaining part of the consistent mass matrix; None: lumped", default=None)
     axes: jax.Array | None = param(
-        "1", "(V, 3) axis along which a plate with a given angle can move, 0 elsewhere", default=None
+        "1", "(V, 3) axis along which a plate with a given angle can move; 0 at other nodes", default=None
     )
 
     free: Free | None = param("1", "free directions; None for implicit Euler", default=None)
@@ -140,53 +145,60 @@ class Moving(NodalForce):
     everywhere: ClassVar[bool] = True
 
     def kinematics(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Velocity and acceleration (V, 3) at the end of the step."""
+        """Return velocity and acceleration (V, 3) at the end of the step, for positions x (V, 3)."""
         before, dt = self.motion, self.dt
         velocity = (x - self.x) / dt
         acceleration = (velocity - before.velocity) / dt
         if before.acceleration is not None:
-            # Only where the motion is free: the average acceleration of a prescribed motion would oscillate forever.
+            # Newmark's formula is used only in free directions. For a prescribed motion, its acceleration would
+            # oscillate forever.
             average = 4 * acceleration - before.acceleration
             velocity = self._where_free(before.velocity + 0.5 * dt * (before.acceleration + average), velocity)
             acceleration = self._where_free(average, acceleration)
         return velocity, acceleration
 
     def _where_free(self, own: jax.Array, given: jax.Array) -> jax.Array:
-        """A field (V, 3) with the values `own` in free directions and `given` in directions of a given motion."""
+        """Return a field (V, 3) that is `own` in free directions and `given` in directions of a given motion."""
         out = jnp.where(self.mask > 0, own, given)
         return out if self.axes is None else out + jnp.sum(self.axes * (own - given), axis=1, keepdims=True) * self.axes
 
     def predicted(self) -> jax.Array:
-        """Positions (V, 3) [m] after a motion at constant velocity."""
+        """Return the positions (V, 3) [m] at the end of the step after a motion at constant velocity."""
         return self.x + self.dt * self.motion.velocity
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Inertia forces (V, 3) [N]: mass times acceleration."""
+        """Return the inertia forces (V, 3) [N] at positions x (V, 3): mass times acceleration."""
         return _inertia(self.mass, self.shared, self.kinematics(x)[1])
 
     def accelerations(self, force: jax.Array, x: jax.Array) -> jax.Array | None:
-        """Accelerations a (V, 3) [m/s^2] in the free directions from m a = f, with masses m and forces f (V, 3) [N]."""
+        """Return the accelerations a (V, 3) [m/s^2] in the free directions due to forces (V, 3) [N].
+
+        They are the solution of m a = f, with masses m and the forces f in the free directions.
+        """
         assert self.free is not None
         return _accelerations(self.mass, self.shared, self.free, self.free.vectors(force, x))
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:
-        """Inertia forces (V, 3) [N]: mass times acceleration."""
+        """Return the inertia forces (V, 3) [N]: mass times acceleration."""
         return _inertia(self.mass, self.shared, acceleration)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Incremental energy m a . a dt^2/(2k) [J], with masses m, accelerations a, time step dt and k of `FACTOR`.
+        """Return the incremental energy m a . a dt^2/(2k) [J], whose gradient is the inertia force.
 
-        The inertia force is the gradient of this energy.
+        m are the masses, a the accelerations, dt is the time step, and k is from `FACTOR`.
         """
         a = self.kinematics(x)[1]
         return 0.5 * self.dt**2 / FACTOR[self.integrator] * jnp.sum(_inertia(self.mass, self.shared, a) * a)
 
     def stiffness(self) -> Block:
-        """Stiffness k m/dt^2 [N/m] of every node along every axis, with mass m, time step dt and k of `FACTOR`."""
+        """Return the stiffness k m/dt^2 [N/m] of every node, equal for all axes.
+
+        m is the mass of the node, dt the time step, and k is from `FACTOR`.
+        """
         return diagonal(FACTOR[self.integrator] / self.dt**2 * self.mass)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Masses | None:
-        """Return the remaining part of the consistent mass matrix times k/dt^2 (see `stiffness`), or None if lumped."""
+        """Return k/dt^2 times the remaining part of the consistent mass matrix (see `stiffness`), or None if lumped."""
         if self.shared is None:
             return None
         return self.shared._replace(size=FACTOR[self.integrator] / self.dt**2 * self.shared.size)

@@ -16,9 +16,9 @@ from liverjax.physics.base import NodalForce, Physics, Step
 
 @struct
 class Traction:
-    """A load on boundary triangles: a dead load (`value`), or a follower pressure normal to the deformed triangles."""
+    """A load on m triangles of the boundary: a dead load (`value`), or a pressure normal to the deformed triangles."""
 
-    triangles: Indices = param("1", "node numbers (m, 3), normals outwards", lower=0)
+    triangles: Indices = param("1", "node numbers (m, 3), in an order with outward normals", lower=0)
     value: Any = param("Pa", "force per reference area (3,), in a fixed direction", default=None)
     pressure: Number | None = param(
         "Pa", "force per current area, along the current normal; inwards if > 0", default=None
@@ -29,7 +29,7 @@ class Traction:
     )
 
     def at(self, time: Number) -> "Traction":
-        """Return the load at a time [s], as a load without history."""
+        """Return the load at a time [s], without its history."""
         if self.history is None:
             return self
         now = history.value_at(self.value if self.pressure is None else self.pressure, time, self.times, self.history)
@@ -39,7 +39,7 @@ class Traction:
 
 @partial(jax.jit, inline=True)
 def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
-    """Nodal forces (V, 3) [N] of the dead loads: reference area times traction, distributed to the nodes."""
+    """Return the nodal forces (V, 3) [N] of the dead loads: reference area times traction, distributed to the nodes."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for load in tractions:
         if load.value is None:
@@ -53,14 +53,15 @@ def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
 
 
 def follows(tractions: tuple) -> bool:
-    """Whether one of the loads is a follower pressure. Its tangent is not symmetric."""
+    """Return whether one of the loads is a follower pressure. The tangent of such a load is not symmetric."""
     return any(load.pressure is not None for load in tractions)
 
 
 def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
-    """Nodal forces (V, 3) [N] of the follower pressures p at positions x (V, 3) [m].
+    """Return the nodal forces (V, 3) [N] of the follower pressures p at positions x (V, 3) [m].
 
-    These are integrals of -p n da, with the normal n and the area element da. Without `mesh` the elements are linear.
+    These forces are integrals of -p n da, with the normal n and the area element da. Without `mesh`, linear elements
+    are assumed.
     """
     force = jnp.zeros_like(x)
     for load in tractions:
@@ -70,11 +71,11 @@ def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None)
 
 
 def dead_loads(mesh: TetMesh, density: Number, gravity: Numbers, tractions: tuple) -> jax.Array:
-    """Nodal forces (V, 3) [N] of the dead loads: tractions, and weight if `density` is not None."""
+    """Return the nodal forces (V, 3) [N] of the dead loads: tractions, and the weight if `density` is not None."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     if density is not None:
-        # The density of a node multiplies the node's share of volume. In quadratic elements a vertex has a negative
-        # share.
+        # The density at a node multiplies the volume that belongs to this node. In quadratic elements, this volume is
+        # negative for a vertex.
         mass = density * load_volumes(mesh)
         force = force + mass[:, None] * jnp.asarray(gravity, force.dtype)[None]
     return force + nodal_tractions(mesh, tractions) if tractions else force
@@ -93,14 +94,14 @@ class Loads(Physics):
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
 
     def freeze(self, memory: None, step: Step) -> "Loading":
-        """Return the force term of the loads. It stores the sum of all dead loads."""
+        """Return the force term of the loads for one step. It stores the sum of all dead loads."""
         if self.history is not None or any(load.history is not None for load in self.traction):
             begin, end = (self.at(n * step.dt)._loading(step, "none") for n in (step.k - 1, step.k))
             return replace(end, before=begin)
         return self._loading(step, "steps" if step.dt is None else "none" if step.inertia else "first")
 
     def at(self, time: Number) -> "Loads":
-        """Return the loads at a time [s], as loads without histories."""
+        """Return the loads at a time [s], without their histories."""
         traction = tuple(load.at(time) for load in self.traction)
         gravity = history.value_at(self.gravity, time, self.times, self.history)
         return replace(self, gravity=gravity, traction=traction, times=None, history=None)
@@ -119,24 +120,27 @@ class Loading(NodalForce):
     k: Number = param("1", "number of the step")
     steps: int = static(default=1, about="of the run")
     growth: str = static(
-        default="none", about="the loads grow with the load steps (steps), in the first step (first), or not (none)"
+        default="none", about="the loads grow with the load steps (steps), in the first step (first), or never (none)"
     )
     before: "Loading | None" = param("1", "loads at the beginning of the step, if there is a history", default=None)
 
     @property
     def conservative(self) -> bool:  # type: ignore[override]
-        """Whether the loads have an energy: true if there are no follower pressures."""
+        """Return whether the loads have an energy. This is true if there are no follower pressures."""
         return not follows(self.traction)
 
     def fraction(self, s: Number) -> Any:
-        """The fraction of the loads that acts at fraction s of the step (0: its beginning, 1: its end)."""
+        """Return the fraction of the loads that acts at fraction s of the step (0: beginning, 1: end of the step)."""
         if self.growth == "steps":
             return (self.k - 1 + s) / self.steps
         dtype = self.dead.dtype
         return jnp.ones((), dtype) if self.growth == "none" else jnp.where(self.k == 1, s, 1.0).astype(dtype)
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
-        """Minus the loads (V, 3) [N]. With a history they change linearly from the beginning to the end of the step."""
+        """Return the loads (V, 3) [N], times -1, at positions x (V, 3) and fraction s of the step.
+
+        If there is a history, the loads change linearly from the beginning to the end of the step.
+        """
         if self.before is not None:
             end = replace(self, before=None)
             return s * end.force(mesh, x, s) + (1 - s) * self.before.force(mesh, x, s)
@@ -146,17 +150,17 @@ class Loading(NodalForce):
         return -outer
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy [J]: minus the work of the dead loads."""
+        """Return the energy [J] of the dead loads: their work, times -1."""
         return -jnp.vdot(self.fraction(jnp.ones((), x.dtype)) * self.dead, x - mesh.points)
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """Energy [J] of the loads. Follower pressures keep the nodal forces that they have at `start`."""
+        """Return the energy [J] of the loads. The nodal forces of follower pressures keep their values at `start`."""
         if self.conservative:
             return self.energy(mesh, x)
         return jnp.vdot(self.force(mesh, start, jnp.ones((), x.dtype)), x - start)
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
-        """Change (V, 3) [N] of the forces of the follower pressures. Dead loads do not change."""
+        """Return the change (V, 3) [N] of `force` due to the follower pressures for a displacement dx (V, 3) [m]."""
         if self.before is not None:
             end = replace(self, before=None)
             return s * end.product(mesh, x, s, dx) + (1 - s) * self.before.product(mesh, x, s, dx)

@@ -21,7 +21,10 @@ class Fixed:
 
 @struct
 class Displaced:
-    """Nodes with a prescribed displacement. It grows linearly to `by` at the last step, or follows a history."""
+    """Nodes with a prescribed displacement.
+
+    It grows linearly and reaches `by` at the last step, or follows a history.
+    """
 
     nodes: Indices = param("1", "node numbers (n,)", lower=0)
     by: Numbers | None = param("m", "displacement (3,), or one per node (n, 3), reached at the last step", default=None)
@@ -33,19 +36,19 @@ class Displaced:
 
 
 def check_axes(axes: object, name: str) -> None:
-    """Check that a value names axes.
+    """Check that a value names coordinate axes, for example "xy".
 
     Raises:
-        InputError: the value names no axes. The message begins with `name`.
+        InputError: the value is not a string of different letters x, y and z. The message begins with `name`.
     """
     if not isinstance(axes, str) or not axes or set(axes) - set(AXES) or len(set(axes)) != len(axes):
         raise InputError(f"{name} axes = {axes!r} is not known: give some of the letters xyz")
 
 
 def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
-    """Mask (V, 3) of the degrees of freedom: 1 if unknown, 0 if fixed or prescribed."""
+    """Return a mask (V, 3) of the degrees of freedom: 1 if unknown, 0 if fixed or prescribed."""
     if not any(isinstance(condition.nodes, jax.core.Tracer) for condition in (*fixed, *displaced)):
-        return jnp.asarray(free_places(mesh, fixed, displaced), mesh.points.dtype)  # compiles no small programs
+        return jnp.asarray(free_places(mesh, fixed, displaced), mesh.points.dtype)  # with NumPy, JAX compiles nothing
     mask = jnp.ones(mesh.points.shape, mesh.points.dtype)
     for condition in (*fixed, *displaced):
         axes = np.array([AXES.index(axis) for axis in condition.axes])
@@ -54,7 +57,7 @@ def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
 
 
 def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
-    """Mask (V, 3) of the degrees of freedom as a NumPy array: True if unknown, False if fixed or prescribed."""
+    """Return a mask (V, 3) of the degrees of freedom (NumPy array): True if unknown, False if fixed or prescribed."""
     free = np.ones(mesh.points.shape, bool)
     for condition in (*fixed, *displaced):
         for axis in condition.axes:
@@ -63,11 +66,11 @@ def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
 
 
 def prescribed(mesh: TetMesh, displaced: tuple, time: Number, fraction: Number) -> jax.Array:
-    """Displacements (V, 3) [m] of prescribed degrees of freedom; 0 for other degrees.
+    """Return the displacements (V, 3) [m] of prescribed degrees of freedom, and 0 for the other degrees of freedom.
 
     Args:
-        time: time [s], for histories.
-        fraction: completed fraction of the run, for `by`.
+        time: time [s], for motions with a history.
+        fraction: completed fraction of the run, for motions without a history.
     """
     u = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for condition in displaced:

@@ -1,4 +1,4 @@
-"""All physics that act in a scene, in their order, and the physics that scene files can add."""
+"""All physics objects (laws, loads, supports, …) that act in a scene, and the kinds that scene files can contain."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.physics.volumes.averaged import AveragedVolume
 from liverjax.physics.volumes.mixed import MixedVolume
 
-#: Physics with a table in scene files. Add every new physics of this kind here.
+#: Classes of physics that have a table in scene files. Add every new class of this kind here.
 NAMED: tuple[type[Physics], ...] = (
     ElasticSupport,
     SlidingSupport,
@@ -34,12 +34,15 @@ NAMED: tuple[type[Physics], ...] = (
 
 
 def law_at_rest(scene: Any) -> Law:
-    """Return the law without viscosity. With porosity, its volumetric energy is removed, unless `keep_bulk` is true."""
+    """Return the law of a `Scene`, without viscosity.
+
+    With porosity, the volumetric energy of the law is removed, unless `keep_bulk` is true.
+    """
     return porosity.law_in_force(scene.porosity, scene.law)
 
 
 def physics_of(scene: Any) -> tuple[Physics, ...]:
-    """Return all physics that act in a `liverjax.scenes.scene.Scene`."""
+    """Return all physics objects (law, viscosity, loads, supports, …) that act in a `liverjax.scenes.scene.Scene`."""
     law, averaged, mixed = law_at_rest(scene), scene.solve.volumetric == "nodal", scene.solve.volumetric == "mixed"
     if averaged or mixed:
         law = isochoric_part(scene.law)

@@ -1,10 +1,10 @@
 """A rigid plate: nodes that rotate about an axis as one body. The angle or the torque is given as a function of time.
 
-The nodes of the plate have only two motions: the rotation, and the displacement along the axis if this is free. The
-unknowns of the solver are still nodal vectors. The nodal field b = e x (x - c) / R represents the rotation. Here e is
-the direction of the axis and c a point of the axis. x are the positions of the plate's nodes at the beginning of a
-step, and R^2 is the sum of their squared distances from the axis. The nodal field a b, with a number a, represents a
-rotation by the angle a / R. The nodes move exactly on circles, so angles may be large.
+The plate has only two motions: the rotation, and the displacement along the axis if it is free. The unknowns of the
+solver are still nodal vectors. The nodal field b = e x (x - c) / R represents the rotation. Here e is the direction of
+the axis and c a point of the axis. x are the positions of the plate's nodes at the beginning of a step, and R^2 is the
+sum of their squared distances from the axis. The nodal field a b, with a number a, represents a rotation by the angle a
+/ R. The nodes move exactly on circles, so angles may be large.
 """
 
 from collections.abc import Callable
@@ -28,15 +28,15 @@ class RigidPlate(Physics):
     turn: Number = param("rad or N m", "angle or torque: one number, or values (T,) of a history, linear in between")
     times: Numbers | None = param(
         "s",
-        "increasing times of the history (T,); None: the turn is constant, but a torque grows with load steps",
+        "increasing times of the history (T,); None: `turn` is constant (but a torque grows with load steps)",
         default=None,
     )
     axis: jax.Array = param("1", "direction of the axis (3,), of length 1", default=(0.0, 0.0, 1.0))
     centre: jax.Array = param("m", "a point of the axis (3,)", default=(0.0, 0.0, 0.0))
     by: str = static(default="angle", about="what is given: angle or torque", words=("angle", "torque"))
-    lifts: bool = static(default=False, about="free to move along the axis, without axial force")
+    lifts: bool = static(default=False, about="whether the plate can move freely along the axis")
     still: Indices | None = param(
-        "1", "numbers (m,) of cubic functions between the nodes; the plate keeps them at 0", default=None
+        "1", "numbers (m,) of cubic shape functions between the nodes; their unknowns stay 0", default=None
     )
 
     section: ClassVar[str] = "plate"
@@ -59,12 +59,12 @@ class RigidPlate(Physics):
             raise InputError(f"{name} has all its nodes on its axis: add nodes, or move the centre")
 
     def at_rest(self, mesh: TetMesh) -> "Plate":
-        """The nodes of the plate in their reference positions."""
+        """Return the nodes of the plate in their reference positions."""
         X, zero = mesh.points[self.nodes], jnp.zeros((), mesh.points.dtype)
         return Plate(self, X, X, zero, zero)
 
     def tied(self, step: Step) -> "Plate":
-        """The nodes of the plate during a step."""
+        """Return the nodes of the plate during a step, with the given angle or torque at both ends of the step."""
         before = after = jnp.asarray(self.turn)
         if self.times is None and self.by == "torque" and step.dt is None:
             # A torque grows with the load steps like other loads.
@@ -74,7 +74,7 @@ class RigidPlate(Physics):
         return Plate(self, step.mesh.points[self.nodes], step.x[self.nodes], before, after)
 
     def freeze(self, memory: None, step: Step) -> "Torque | None":
-        """Force term of the torque, for one step. Returns None if the angle is given, since an angle adds no force."""
+        """Return the force term of the torque for one step, or None if the angle is given (which adds no force)."""
         if self.by == "angle":
             return None
         return Torque(plate=self.tied(step))
@@ -82,20 +82,20 @@ class RigidPlate(Physics):
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "RigidPlate":
         """Return the plate with the nodes that the mesh of higher order adds between the nodes of the plate.
 
-        Cubic functions are not nodes and have no position. A rigid motion of the plate does not contain them.
+        Cubic shape functions are not nodes and have no position. In a rigid motion of the plate, their unknowns are 0.
         """
         nodes = more(self.nodes)
         return replace(self, nodes=nodes) if mesh.order < 3 else replace(self, still=nodes[len(self.nodes) :])
 
     def constrain(self, free: Free) -> Free:
-        """Fix the cubic functions of the plate."""
+        """Set the unknowns of the cubic shape functions on the plate to 0 (remove them from the free directions)."""
         return free if self.still is None else free._replace(mask=free.mask.at[self.still].set(0.0))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes and the directions in which the plate constrains them.
+        """Return nodes (n,) and the directions (n, 3) in which the plate constrains them.
 
-        These are two directions perpendicular to the axis. The direction of the axis is added if `lifts` is false, and
-        the direction of rotation is added if the angle is given.
+        Two directions are perpendicular to the axis. If `lifts` is false, the direction of the axis is added. If the
+        angle is given, the direction of the rotation is added.
         """
         nodes, arms = np.asarray(self.nodes), np.asarray(self.at_rest(mesh).arms(mesh.points))
         across = np.linalg.svd(np.asarray(self.axis)[None], full_matrices=True)[2][1:]
@@ -108,7 +108,7 @@ class RigidPlate(Physics):
 
 
 class Plate(NamedTuple):
-    """The nodes of a plate during a step."""
+    """The n nodes of a plate during a step. Symbols: docstring of the module."""
 
     plate: RigidPlate
     reference: jax.Array  # (n, 3) [m] reference positions
@@ -117,7 +117,7 @@ class Plate(NamedTuple):
     after: jax.Array  # angle or torque at the end of the step
 
     def arms(self, x: jax.Array) -> jax.Array:
-        """Vectors e x (x - c) (n, 3) [m] of the plate's nodes at positions x (V, 3)."""
+        """Return the vectors e x (x - c) (n, 3) [m] of the plate's n nodes at positions x (V, 3) (axis e, centre c)."""
         return self._arms(x[self.plate.nodes])
 
     def _arms(self, x: jax.Array) -> jax.Array:
@@ -128,27 +128,27 @@ class Plate(NamedTuple):
 
     @property
     def radius(self) -> jax.Array:
-        """Radius R [m]: the square root of the sum of the squared distances from the axis."""
+        """Return R [m]: the square root of the sum of the squared distances of the nodes from the axis."""
         return jnp.linalg.norm(self._arms(self.reference))
 
     def angle(self, x: jax.Array) -> jax.Array:
-        """Angle [rad] of the plate at positions x (V, 3), between -pi and pi."""
+        """Return the angle [rad] of the plate at positions x (V, 3), between -pi and pi."""
         e, (old, new) = self._axis(x), (self._arms(self.reference), self.arms(x))
         return jnp.arctan2(jnp.sum(jnp.cross(old, new) @ e), jnp.sum(old * new))
 
     def lift(self, x: jax.Array) -> jax.Array:
-        """Displacement [m] of the plate along the axis at positions x (V, 3)."""
+        """Return the displacement [m] of the plate along the axis at positions x (V, 3)."""
         return jnp.mean((x[self.plate.nodes] - self.reference) @ self._axis(x))
 
     def torque(self, x: jax.Array, f: jax.Array) -> jax.Array:
-        """Moment [N m], about the plate's axis, of the forces f (V, 3) [N] on the plate's nodes. x (V, 3): positions of
-        the nodes."""
+        """Return the moment [N m], about the axis, of the forces f (V, 3) [N] on the plate's nodes at x (V, 3)."""
         return jnp.sum(self.arms(x) * f[self.plate.nodes])
 
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
-        """If the angle is given, set the mask (V, 3) to 0 at the plate's nodes.
+        """Return the mask and the free directions `axes` (both (V, 3)), changed if the angle of the plate is given.
 
-        If the plate can also move along its axis, this axis is written into `axes` (V, 3) at these nodes.
+        The mask is then 0 at the plate's nodes. If the plate can move along its axis, `axes` is this axis at these
+        nodes.
         """
         if self.plate.by == "torque":
             return mask, axes
@@ -158,10 +158,10 @@ class Plate(NamedTuple):
         return mask.at[nodes].set(0.0), axes
 
     def rigid(self, x: jax.Array, velocity: jax.Array, acceleration: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Replace velocity and acceleration (V, 3) of the plate's nodes by those of a rigid motion.
+        """Return velocity and acceleration (V, 3), with the values of a rigid motion at the plate's nodes.
 
-        Newmark's method applied to each node separately would not find the acceleration towards the axis. The error
-        would change sign in every step, and grow.
+        If Newmark's method were applied to each node separately, the acceleration towards the axis would be missing.
+        The error would change sign in every step, and grow.
         """
         if self.plate.by == "angle":
             return velocity, acceleration
@@ -177,45 +177,45 @@ class Plate(NamedTuple):
         return velocity, acceleration.at[nodes].set(growth * arms + towards + up)
 
     def spread(self, field: jax.Array, turn: Number, lift: Number) -> jax.Array:
-        """Write the rows of the plate's nodes, from the amplitudes of the plate's two motions, into a field (V, 3)."""
+        """Return `field` with new rows of the plate's nodes: its two motions with the amplitudes `turn` and `lift`."""
         rows = turn * self._arms(self.carrier) / self.radius
         if self.plate.lifts:
             rows = rows + lift * self._axis(field)[None] / len(self.reference) ** 0.5
         return field.at[self.plate.nodes].set(rows)
 
     def amplitudes(self, field: jax.Array, arms: jax.Array) -> tuple[Number, Number]:
-        """Return R times the rotation, and sqrt(n) times the axial displacement, of a field (V, 3) on n nodes.
+        """Return R times the rotation, and sqrt(n) times the axial displacement, of n plate nodes in a field (V, 3).
 
-        `arms` (n, 3) are the vectors e x (x - c) of the nodes.
+        `arms` (n, 3) are the vectors e x (x - c) of the nodes. R, e and c: docstring of the module.
         """
         rows = field[self.plate.nodes]
         turn = jnp.sum(arms * rows) / self.radius if self.plate.by == "torque" else 0.0
         return turn, jnp.sum(rows @ self._axis(field)) / len(self.reference) ** 0.5
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """Project a field (V, 3) onto the plate's free motions. For forces this depends on the positions x (V, 3)."""
+        """Project a field (V, 3) onto the plate's free motions. For a field of forces, x (V, 3) are the positions."""
         return self.spread(field, *self.amplitudes(field, self._arms(self.carrier) if x is None else self.arms(x)))
 
     def given(self, s: Number) -> jax.Array:
-        """Given angle [rad] or torque [N m] at fraction s of the step."""
+        """Return the given angle [rad] or torque [N m] at fraction s of the step."""
         return self.before + s * (self.after - self.before)
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Write the plate's unknowns at positions x (V, 3) into the field (V, 3)."""
+        """Return `field` (V, 3) with the plate's unknowns for positions x (V, 3) in the rows of its nodes."""
         turn = self.radius * self.angle(x) if self.plate.by == "torque" else 0.0
         return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Positions (V, 3) [m] from a field with the plate's unknowns, at fraction s of the step."""
+        """Return the positions (V, 3) [m] for a field with the plate's unknowns, at fraction s of the step."""
         turn, lift = self.amplitudes(field, self._arms(self.carrier))
         angle = turn / self.radius if self.plate.by == "torque" else self.given(s)
         return self.moved(field, angle, lift / len(self.reference) ** 0.5)
 
     def moved(self, field: jax.Array, angle: Number, lift: Number) -> jax.Array:
-        """Write the positions of the plate's nodes, at an angle [rad] and an axial displacement [m], into a field."""
+        """Return `field` with the positions of the plate's nodes at an angle [rad] and an axial displacement [m]."""
         axis, arms = self._axis(field)[None], self._arms(self.reference)
-        # Rotation by the angle a (Rodrigues): r = x - c changes by sin(a) e x r, plus cos(a) - 1 times the part of r
-        # perpendicular to the axis e.
+        # Rodrigues' formula for a rotation by the angle a about the axis e: r = x - c changes by sin(a) e x r, plus
+        # (cos(a) - 1) times the component of r perpendicular to e.
         rows = self.reference + jnp.sin(angle) * arms + (jnp.cos(angle) - 1) * jnp.cross(arms, axis)
         if self.plate.lifts:
             rows = rows + lift * axis
@@ -224,15 +224,18 @@ class Plate(NamedTuple):
 
 @struct
 class Torque(NodalForce):
-    """Force term of the torque, for one step: forces on the plate's nodes, tangential to their circles."""
+    """Force term of the torque, for one step: forces on the plate's nodes, tangential to their circular paths."""
 
     plate: Plate = param("1", "its nodes")
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Minus the forces (V, 3) [N] on the nodes. The moment of the forces about the axis is the torque."""
+        """Return the forces (V, 3) [N] on the nodes, times -1.
+
+        The moment of the forces about the axis is the torque.
+        """
         rows = -self.plate.given(s) * self.plate.arms(x) / self.plate.radius**2
         return jnp.zeros_like(x).at[self.plate.plate.nodes].set(rows)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy [J]: minus torque times angle."""
+        """Return the energy [J]: torque times angle, times -1."""
         return -self.plate.after * self.plate.angle(x)

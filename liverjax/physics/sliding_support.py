@@ -13,7 +13,8 @@ from liverjax.mesh import selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Physics
 
-#: Nodes count as coplanar if their distance from the plane, divided by the extent of the nodes, is at most this.
+#: Nodes count as coplanar if their distances from the plane, divided by the extent of the nodes, are at most this
+#: value.
 _FLAT = 1e-6
 
 
@@ -30,7 +31,7 @@ class SlidingSupport(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "SlidingSupport":
-        """Read [[support]] with `sliding = true`: the nodes define the plane."""
+        """Read [[support]] with `sliding = true`. The selected nodes define the plane."""
         if table["sliding"] is not True:
             raise InputError(
                 f"{name} sliding = {table['sliding']!r} is not true: write sliding = true, or remove sliding"
@@ -39,19 +40,19 @@ class SlidingSupport(Physics):
         return on_plane(mesh, nodes, name)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError for wrong node numbers or a missing direction."""
+        """Raise InputError for wrong node numbers, or for a normal that is missing or not of length 1."""
         selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
         bounds.check_shape(f"{name}.normal", self.normal, (3,))
         if not self.axis and (self.normal is None or abs(np.linalg.norm(np.asarray(self.normal)) - 1) > 1e-6):
             raise InputError(f"{name} normal = {self.normal} must be of length 1: divide it by its length")
 
     def constrain(self, free: Free) -> Free:
-        """Remove the normal direction at the nodes from the free directions."""
+        """Return the free directions without the normal of the plane at the nodes."""
         if self.axis:
             return free._replace(mask=free.mask.at[self.nodes, selection.AXES.index(self.axis)].set(0.0))
         normals = jnp.zeros_like(free.mask) if free.normals is None else free.normals
         normal = jnp.asarray(self.normal, free.mask.dtype)[None]
-        # A node that is fixed along all axes of the normal is already fixed along the normal.
+        # If a node is fixed along all axes in which the normal has a component, it is already fixed along the normal.
         loose = jnp.max(free.mask[self.nodes] * (jnp.abs(normal) > 1e-12), axis=1, keepdims=True)
         return free._replace(normals=normals.at[self.nodes].set(loose * normal))
 
@@ -60,14 +61,14 @@ class SlidingSupport(Physics):
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes, each with the normal along which it is constrained."""
+        """Return the nodes (n,), and for each node the normal (n, 3) along which it is constrained."""
         nodes = np.asarray(self.nodes)
         normal = np.eye(3)[selection.AXES.index(self.axis)] if self.axis else np.asarray(self.normal)
         return nodes, np.tile(normal, (len(nodes), 1))
 
 
 def on_plane(mesh: TetMesh, nodes: np.ndarray, name: str = "support") -> SlidingSupport:
-    """Create a sliding support of nodes (n,) that lie in one plane. The normal is computed from the nodes.
+    """Create a sliding support of n nodes (n,) that lie in one plane. The normal is computed from the nodes.
 
     Raises:
         InputError: the nodes do not span a plane, or do not lie in one plane.

@@ -1,10 +1,10 @@
 """Prony viscohyperelasticity (book chapter, section 4.2): S_v = S_h - sum_k gamma_k.
 
 S_v is the second Piola-Kirchhoff stress of the viscoelastic body, and S_h is the stress of the law. Each mode k has one
-internal (history) variable, the symmetric tensor gamma_k. It is the stress that this mode has relaxed. The recursion is
-the update of the history variables from step n-1 to step n: gamma^n = a S^n + c S^(n-1) + b gamma^(n-1), with the
-stress S that relaxes. There are two schemes, with the time step dt, and with the ratio g and the relaxation time tau of
-the mode:
+internal (history) variable, the symmetric tensor gamma_k. It is the stress that this mode has relaxed. The history
+variables are updated from step n-1 to step n by a recursion: gamma^n = a S^n + c S^(n-1) + b gamma^(n-1). S is the
+stress that relaxes (S_h or its isochoric part), dt the time step, and g and tau are ratio and relaxation time of the
+mode. There are two schemes:
 
 * ``"exponential"``: exact if the stress changes linearly during the step. e = exp(-dt/tau), q = (1 - e) tau/dt,
   a = g (1 - q), c = g (q - e), b = e. This scheme is of second order in dt.
@@ -48,7 +48,10 @@ PARTS = ("all", "isochoric")
 
 @struct
 class Prony:
-    """Prony series alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): the stress relaxes to its fraction 1 - sum_k g_k."""
+    """Prony series alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): stress at time t, divided by the initial stress.
+
+    There are N modes k. After a long time, the fraction 1 - sum_k g_k of the stress remains.
+    """
 
     ratios: Any = param("1", "g_k, fraction that relaxes in mode k (N,), or per element (N, E)", lower=0.0, upper=1.0)
     relaxation_times: Any = param("s", "tau_k (N,), or one per element (N, E)", above=0.0)
@@ -62,30 +65,33 @@ class Prony:
     )
 
     def __post_init__(self) -> None:
-        """Replace the old name of a scheme by the new one."""
+        """Replace the old name "chapter" of a scheme by its new name "backward_euler"."""
         if self.scheme == "chapter":
             object.__setattr__(self, "scheme", "backward_euler")
 
 
 class History(NamedTuple):
-    """History variables at the end of a step. Arrays are (…, Q, E) if elements have Q integration points."""
+    """History variables of N modes at the end of a step.
+
+    The last axes are (Q, E), not (E,), if elements have Q integration points.
+    """
 
     gamma: jax.Array  # (N, 6, E) [Pa]
     stress: jax.Array | None  # S^n (6, E) [Pa]; backward Euler does not need it
 
 
 class Recall(NamedTuple):
-    """Contribution of the history variables to the stress in a step, constant during Newton's iterations."""
+    """Contribution of the history variables to the stress in a step. It is constant during Newton's iterations."""
 
     past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
     now: jax.Array  # 1 - sum_k a_k: one number (), or an array that broadcasts over the integration points
 
 
 def check_viscosity(prony: Prony, law: Law) -> None:
-    """Check that a step can use this viscosity.
+    """Check that this viscosity can be used in a step, together with this law.
 
     Raises:
-        InputError: the scheme or part is unknown; the numbers of ratios and relaxation times differ; a value is out of
+        InputError: the scheme or part is unknown; there are not as many ratios as relaxation times; a value is out of
             bounds; the ratios add up to 1 or more; or part is "isochoric" and the law has no isochoric part.
     """
     check_series(prony)
@@ -93,23 +99,23 @@ def check_viscosity(prony: Prony, law: Law) -> None:
 
 
 def check_part(part: str, law: Law, section: str) -> None:
-    """Check that the law has the part that relaxes. The values of the numbers are not checked.
+    """Check that the law has the part that relaxes. The parameters of the law are not checked.
 
     Raises:
         InputError: part is "isochoric" and the law has no isochoric part.
     """
     if part == "isochoric" and isochoric_part(law) is None:
         raise InputError(
-            f"{section} part = 'isochoric' needs a law with an isochoric part, which {type(law).__name__} has not: "
+            f"{section} part = 'isochoric' needs a law with an isochoric part, unlike {type(law).__name__}: "
             "use part = 'all' or a law with bulk"
         )
 
 
 def check_series(prony: Prony) -> None:
-    """Check that ratios and times form a Prony series. Inside jit, grad or vmap, only their number is checked.
+    """Check that ratios and times form a Prony series. If they are unknown inside jit, only their number is checked.
 
     Raises:
-        InputError: the numbers of ratios and relaxation times differ, a value is out of bounds, or the ratios add up to
+        InputError: there are not as many ratios as relaxation times, a value is out of bounds, or the ratios add up to
             1 or more.
     """
     bounds.check_fields(prony, "viscosity")
@@ -118,7 +124,7 @@ def check_series(prony: Prony) -> None:
         if not isinstance(values, (tuple, list)) and not np.ndim(values):
             raise InputError(f"viscosity.{key} = {values} is one number: give one per mode, e.g. [{values}]")
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(both)):
-        # NumPy cannot find the shape of a tuple of numbers without known values.
+        # NumPy cannot find the shape of a tuple of JAX tracers (numbers that are unknown inside jit).
         ratios, times = (len(v) if isinstance(v, (tuple, list)) else (*np.shape(v), 1)[0] for v in both)
         if ratios != times:
             raise InputError(
@@ -134,11 +140,14 @@ def check_series(prony: Prony) -> None:
         )
     if not np.all(g.sum(axis=0) < 1):
         shown = g if g.ndim == 1 else g[:, int(np.argmax(g.sum(axis=0)))]
-        raise InputError(f"viscosity.ratios = {shown.tolist()} must add up to less than 1: lower them")
+        raise InputError(f"viscosity.ratios = {shown.tolist()} must add up to less than 1: give smaller ratios")
 
 
 def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Coefficients a, b, c of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1), in the shape of the ratios, for dt [s]."""
+    """Return the coefficients a, b, c of the recursion gamma^n = a S^n + c S^(n-1) + b gamma^(n-1), for dt [s].
+
+    Each has the shape of the ratios: (N,) for N modes, or (N, E).
+    """
     g, tau = jnp.asarray(prony.ratios), jnp.asarray(prony.relaxation_times)
     r = dt / tau
     if prony.scheme == "backward_euler":
@@ -148,9 +157,10 @@ def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array
 
 
 def lasting(prony: Prony, order: int = 1) -> jax.Array:
-    """Fraction of the stress that never relaxes: one number (), or one per element (E,).
+    """Return the fraction of the stress that never relaxes: one number (), or one per element (E,).
 
-    For elements of an `order` above 1 the shape is (1, E), so that it broadcasts over the integration points.
+    For elements of an `order` above 1 the shape is (1, E) instead of (E,), so that it broadcasts over integration
+    points.
     """
     left = 1 - jnp.sum(jnp.asarray(prony.ratios), axis=0)
     return left[None] if left.ndim and order > 1 else left
@@ -164,11 +174,11 @@ def _beside(numbers: jax.Array, ndim: int) -> jax.Array:
 
 
 def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Weights 1 - q and q - e of the exponential scheme, for r = dt/tau, without cancellation.
+    """Return 1 - q and q - e of the exponential scheme (docstring of the module) for r = dt/tau, without cancellation.
 
-    Below r = 1 the Taylor series of 1 - q is used (truncated at 1/20!).
+    Below r = 1, the Taylor series of 1 - q is used (truncated at 1/20!).
     """
-    # `minimum` and `maximum` would halve the derivative at r = 1 (time step equal to a relaxation time).
+    # `minimum` and `maximum` would give half of the derivative at r = 1 (time step equal to a relaxation time).
     small, large = jnp.where(r < 1, r, 1.0), jnp.where(r < 1, 1.0, r)
     series = jnp.zeros_like(r)
     for k in range(18, 0, -1):
@@ -179,10 +189,11 @@ def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax.Array:
-    """Complex ratios gamma_k / S_h (N, ...) in steady vibration at the angular frequency omega [rad/s].
+    """Return the complex ratios gamma_k / S_h (N, ...) of N modes in steady vibration.
 
-    With `dt` [s] the ratios are exact for the discrete recursion. Without `dt` they are the ratios in continuous time,
-    g/(1 + i omega tau). The complex modulus is G*/G0 = 1 minus the sum of the ratios over the modes.
+    `omega` [rad/s] are angular frequencies. With `dt` [s] the ratios are exact for the time-discrete recursion. Without
+    `dt` they are the ratios in continuous time, g/(1 + i omega tau). The complex modulus G*, divided by the
+    instantaneous modulus G0, is 1 minus the sum of the ratios over the modes.
     """
     omega = jnp.asarray(omega)[None]
     column = (-1,) + (1,) * (omega.ndim - 1)
@@ -196,20 +207,26 @@ def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax
 
 
 def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: DTypeLike = float) -> History:
-    """History variables of a body at rest: zeros, for E integration points or for points of the shape (Q, E)."""
+    """Return the history variables (zeros) of a body at rest.
+
+    `points` is the number of integration points, or their shape (Q, E) with Q points in each of E elements.
+    """
     shape = (points,) if isinstance(points, int) else points
     gamma = jnp.zeros((jnp.asarray(prony.ratios).shape[0], 6, *shape), dtype)
     return History(gamma, None if prony.scheme == "backward_euler" else jnp.zeros((6, *shape), dtype))
 
 
 def relaxed_history(prony: Prony, stress: jax.Array) -> History:
-    """History variables after complete relaxation. `stress` (6, …) [Pa] is the relaxing part of the law's stress."""
+    """Return the history variables after complete relaxation.
+
+    `stress` (6, …) [Pa] is the part of the stress that relaxes.
+    """
     gamma = _beside(jnp.asarray(prony.ratios), 1 + stress.ndim) * stress[None]
     return History(gamma, None if prony.scheme == "backward_euler" else stress)
 
 
 def recall(prony: Prony, history: History, dt: Array) -> Recall:
-    """Contribution of the history variables to the stress in the next step, from their values at its beginning."""
+    """Return the contribution to the stress in the next step, from the history variables at its beginning."""
     a, b, c = coefficients(prony, dt)
     if a.ndim == 2:
         return _recall_by_element(a, b, c, history)
@@ -220,7 +237,7 @@ def recall(prony: Prony, history: History, dt: Array) -> Recall:
 
 
 def _recall_by_element(a: jax.Array, b: jax.Array, c: jax.Array, history: History) -> Recall:
-    """Do the same as `recall`, for coefficients with one value per element (N, E)."""
+    """Return the same as `recall`, for coefficients a, b, c (N, E) with one value per mode and element."""
     ndim = history.gamma.ndim
     past = jnp.sum(_beside(b, ndim) * history.gamma, axis=0)
     if history.stress is not None:
@@ -230,7 +247,10 @@ def _recall_by_element(a: jax.Array, b: jax.Array, c: jax.Array, history: Histor
 
 
 def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Number) -> History:
-    """History variables at the end of an accepted step, with the deformation gradient F at the end of the step."""
+    """Return the history variables at the end of an accepted step, from those at its beginning.
+
+    F is the deformation gradient at the end of the step.
+    """
     a, b, c = coefficients(prony, dt)
     S = relaxing_stress(prony, law, F)
     a, b, c = (_beside(each, 1 + S.ndim) for each in (a, b, c))
@@ -241,17 +261,17 @@ def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Number) -> 
 
 
 def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
-    """Second Piola-Kirchhoff stress (6, E) [Pa] that relaxes: S_h, or its isochoric part."""
+    """Return the second Piola-Kirchhoff stress (6, E) [Pa] that relaxes: S_h of the law, or its isochoric part."""
     s = invariant_terms.state(relaxing(prony, law), F)
     S = invariant_terms.second_piola(F, invariant_terms.stress(s))
     return jnp.stack([S[i][j] for i, j in SIX])
 
 
 def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
-    """First Piola-Kirchhoff stress P_v = (1 - sum a) P_h - F past [Pa], with the stress P_h of the law.
+    """Return the first Piola-Kirchhoff stress P_v = (1 - sum a) P_h - F past [Pa], with the stress P_h of the law.
 
-    1 - sum a and `past` are the fields `now` and `past` of the argument `memory`.
-    With part = "isochoric", P_h is the isochoric stress of the law, and the complete volumetric stress is added.
+    `memory.now` is 1 - sum a, and `memory.past` is `past`. If part is "isochoric", P_h is the isochoric stress of the
+    law, and the complete volumetric stress is added.
     """
     P = invariant_terms.first_piola(relaxing(prony, law), F)
     remembered = matmul(F, memory.past)
@@ -266,9 +286,10 @@ def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
 def blocks(
     prony: Prony, memory: Recall, law: Law, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
 ) -> list[Matrix]:
-    """Stiffness blocks (1 - sum a) K_h - (D_i . past D_j) I of the stress `first_piola`.
+    """Return the stiffness blocks (1 - sum a) K_h - (D_i . past D_j) I of the stress `first_piola`, for pairs (i, j).
 
-    K_h are the blocks of the law (`invariant_terms.blocks`), D the gradients of the shape functions, I the identity.
+    i and j are nodes of an element. K_h are the blocks of the law (`invariant_terms.blocks`), D the gradients of the
+    shape functions, I the identity.
     """
     K = invariant_terms.blocks(invariant_terms.state(relaxing(prony, law), F), D, pairs)
     K = [scale_matrix(memory.now, block) for block in K]
@@ -292,13 +313,13 @@ def relaxing(prony: Prony, law: Law) -> Law:
 
 @struct
 class Viscoelasticity(Physics):
-    """A solid with a law that relaxes (Prony series)."""
+    """A solid with a hyperelastic law, whose stress relaxes according to a Prony series."""
 
     law: Law = param("1", "the instantaneous law")
     prony: Prony = param("1", "how it relaxes")
 
     def begin(self, start: Start) -> History:
-        """History variables at the beginning of a run: zeros.
+        """Return the history variables at the beginning of a run, which are zeros.
 
         If the body was just moved to its positions, the stored stress S^n is the stress at these positions.
         """
@@ -306,13 +327,13 @@ class Viscoelasticity(Physics):
         if memory.stress is None or not start.moved:
             return memory
         F = deformation_gradient(start.mesh, start.x)
-        # Inverted elements begin with the stress 0.
+        # The stress in inverted elements is set to 0 (F = I).
         whole = determinant(F) > 0
         F = tuple(tuple(jnp.where(whole, F[i][j], float(i == j)) for j in range(3)) for i in range(3))
         return memory._replace(stress=relaxing_stress(self.prony, self.law, F))
 
     def freeze(self, memory: History, step: Step) -> "Viscoelastic":
-        """Force term of the relaxing law, for one step."""
+        """Return the force term of the relaxing law for one step."""
         return Viscoelastic(law=self.law, prony=self.prony, recall=recall(self.prony, memory, step.dt), dt=step.dt)
 
     def advance(self, memory: History, acting: "Viscoelastic", end: End) -> History:
@@ -326,21 +347,22 @@ class Viscoelastic(Solid):
 
     law: Law = param("1", "the instantaneous law")
     prony: Prony = param("1", "how it relaxes")
-    recall: Recall = param("1", "contribution of the history variables")
+    recall: Recall = param("1", "contribution of the history variables to the stress")
     dt: jax.Array = param("s", "time step")
 
     def stress(self, F: Matrix) -> Matrix:
-        """First Piola-Kirchhoff stress [Pa], computed by `first_piola`."""
+        """Return the first Piola-Kirchhoff stress [Pa] from the function `first_piola`."""
         return first_piola(self.prony, self.recall, self.law, F)
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
-        """Blocks of the stiffness, computed by the function `blocks` of this module."""
+        """Return the stiffness blocks from the function `blocks` of this module."""
         return blocks(self.prony, self.recall, self.law, F, D, pairs)
 
     def energy(self, F: Matrix) -> jax.Array:
-        """Incremental potential (1 - sum a) W - past : C/2 [Pa], with the strain energy W and C = F^T F.
+        """Return the incremental potential (1 - sum a) W - past : C/2 [Pa], with the strain energy W and C = F^T F.
 
-        If the volumetric energy U does not relax, the complete U is added.
+        1 - sum a and `past` are the fields of `Recall`. If the volumetric energy U does not relax, the complete U is
+        added.
         """
         law, past = relaxing(self.prony, self.law), self.recall.past
         C = right_cauchy_green(F)
@@ -350,7 +372,7 @@ class Viscoelastic(Solid):
         return W if rest is None else W + rest.strain_energy(rest.measures(F))
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix]:
-        """Pairs (weight, law) of the relaxing part and of the part that does not relax, and the stress -`past` [Pa]."""
+        """Return the pairs (weight, law) of the relaxing and the other part of the law, and the stress -`past` [Pa]."""
         rest = volumetric_part(self.law) if self.prony.part == "isochoric" else None
         weighted = [(self.recall.now, relaxing(self.prony, self.law))]
         return weighted if rest is None else [*weighted, (1.0, rest)], scale_matrix(-1.0, self.recall.past)

@@ -1,7 +1,7 @@
 """Run a scene step by step, while a spring pulls on one of the nodes.
 
-The spring is a `Ligament`. Only the numbers of the spring change from step to step, so the program is compiled only
-once.
+The spring is a `Ligament`. Only the numbers of this spring change from step to step, so one compiled program is used
+for all steps.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import State, initial_state
 from liverjax.simulation.run import prepared, simulate_part
 
-#: Number of steps, so large that the run never ends.
+#: Number of steps of the scene. It is so large that the run never ends.
 STEPS = 10**9
 #: Rest length of the spring, divided by the size of the body. A spring of length 0 would have no direction.
 SLACK = 1e-3
@@ -40,7 +40,7 @@ class Playing(NamedTuple):
     size: float  # diagonal of the body's box [m]
     nodes: np.ndarray  # (n,) node numbers of the surface
     triangles: np.ndarray  # (m, 3) triangles of the surface, as indices into `nodes`
-    positions: np.ndarray  # (V, 3) [m]
+    positions: np.ndarray  # positions of all nodes (V, 3) [m]
     code: int = status.CONVERGED  # status of the last step
 
     @property
@@ -60,7 +60,7 @@ def at_rest(scene: Scene) -> Playing:
     its initial state. A scene without dt starts at the end of its load steps.
 
     Raises:
-        InputError: the scene is harmonic, or `simulate` cannot run it.
+        InputError: the scene is harmonic, `simulate` cannot run the scene, or one of its load steps fails.
     """
     if scene.solve.kind == "harmonic":
         raise InputError("[solve] kind = 'harmonic' cannot be used here: give a static or a dynamic scene")
@@ -134,7 +134,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
     # The compiled program needs arrays with the precision for which it was compiled.
     spring = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), spring, playing.scene.physics[-1])
     scene = replace(playing.scene, physics=(*others, spring))
-    first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # STEPS means the full load
+    first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # step STEPS has the full load
     result, state = jax.block_until_ready(playing.program(scene, playing.state, float(first)))
     code = int(result.status[0])
     if code not in (status.CONVERGED, status.ONE_STEP):
@@ -146,7 +146,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
 def _end_of_spring(playing: Playing, node: int, to: Any, stiffness: float) -> np.ndarray:
     """Check the arguments, and return the position (3,) [m] of the free end of the spring."""
     if not isinstance(node, int) or not 0 <= node < len(playing.positions):
-        raise InputError(f"node = {node!r} is not in the mesh: give 0 to {len(playing.positions) - 1}")
+        raise InputError(f"node = {node!r} is not in the mesh: give a number from 0 to {len(playing.positions) - 1}")
     try:
         end = np.asarray(to, float)
     except (TypeError, ValueError):

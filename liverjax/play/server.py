@@ -1,5 +1,5 @@
 """A local web server that shows the body in a browser. The server sends a page and the surface of the body, and
-computes one step for each picture. Other computers cannot connect to it."""
+computes one step for each picture. Other computers cannot connect to this server."""
 
 import json
 import threading
@@ -32,9 +32,9 @@ class PlayServer(ThreadingHTTPServer):
 
 
 class Answer(BaseHTTPRequestHandler):
-    """Handler of the requests GET / and /surface, and POST /step {node, to, stiffness} and /rest."""
+    """Handler of four requests: GET / and GET /surface, POST /step with {node, to, stiffness}, and POST /rest."""
 
-    protocol_version = "HTTP/1.1"  # keeps one connection for all steps
+    protocol_version = "HTTP/1.1"  # in this version, one connection serves all steps
     server: PlayServer
 
     def do_GET(self) -> None:
@@ -74,7 +74,7 @@ class Answer(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Print nothing: the standard method would print thirty lines per second."""
+        """Print nothing. The method of the base class would print thirty lines per second."""
 
 
 def stepped(playing: Playing, asked: Content) -> Playing:

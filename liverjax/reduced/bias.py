@@ -1,9 +1,9 @@
 """Bias of parameters that were identified with a reduced model instead of the full model.
 
-Let p be the parameters for which the result u(p) of the reduced model is closest to the data. For p, the result of the
-full model is u(p) + d. The difference d is known from one full run. The full model fits the same data best at p - b. To
-first order, b is the least-squares solution of J b = d, with the derivative J of u with respect to p. So b is the bias
-that the reduced model causes, and p - b has no such bias to first order.
+Let p be the parameters for which the result u(p) of the reduced model is closest to the data. For the same parameters,
+the result of the full model is u(p) + d. The difference d is known from one full run. The full model fits the same data
+best at p - b. To first order, b is the least-squares solution of J b = d, with the derivative J of u with respect to p.
+So b is the bias that the reduced model causes, and p - b has no such bias to first order.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,7 +36,7 @@ def reduced_bias(
 
     Raises:
         InputError: `simulate_reduced` cannot run this scene.
-        RuntimeError: the full run fails.
+        RuntimeError: the full run does not converge.
     """
     flat, shaped = ravel_pytree({name: jnp.asarray(value, float) for name, value in values.items()})
 

@@ -9,10 +9,10 @@ squares with a small ridge penalty (closures of reduced models: Ahmed, Pawar, Sa
 Fluids 33, 091301). The differences of each run are divided by the largest displacement of this run.
 
 In a cross-validation, one group of runs after another is left out of the fit. The errors of the left-out runs determine
-how many coordinates have quadratic terms. These errors also give a model of the error of the corrected motion. In this
-model, the logarithm of the error is linear in the logarithms of three numbers, which are known without a full run: the
-size of the correction, the largest displacement, and the leverage of the terms. The leverage is the variance of the
-least-squares prediction, divided by the variance of the data (Hoaglin, Welsch 1978).
+how many coordinates have quadratic terms. These errors also give a model of the error of the corrected motion (the
+stated error). In this model, the logarithm of the error is linear in the logarithms of three numbers, which are known
+without a full run: the size of the correction, the largest displacement, and the leverage of the terms. The leverage is
+the variance of the least-squares prediction, divided by the variance of the data (Hoaglin, Welsch 1978).
 """
 
 from functools import partial
@@ -35,21 +35,22 @@ PRODUCTS, RATES = (0, 6, 12, 20), 8
 RIDGE, OUTSIDE, MOST_FIELDS = 1e-6, 0.02, 150
 #: Maximum number of states whose differences are used to compute the fields.
 FIELD_STATES = 1500
-#: Prior values of the three exponents of the stated error, used if there are too few runs. With these exponents, the
-#: stated error of the motion is a constant times the square root of the leverage.
+#: Prior values of the three exponents of the stated error. With few runs, the exponents stay close to these values.
+#: With the prior values, the stated error of the motion is a constant times the square root of the leverage.
 FEW_RUNS_EXPONENTS = np.array([0.0, -1.0, 0.5])
-#: Weight of these prior values, expressed as a number of runs.
+#: Weight of `FEW_RUNS_EXPONENTS`, expressed as a number of runs.
 FEW_RUNS = 10.0
 
 
 @struct
 class Correction:
-    """Polynomials with k terms for the coefficients of m fields, and numbers that determine the stated error."""
+    """Polynomials with k terms for the coefficients of m fields, and numbers that determine the stated error (module
+    docstring). They are learnt from R training runs."""
 
     fields: jax.Array = param("1", "(m, V, 3), orthonormal with the lumped volumes of the nodes")
     factors: jax.Array = param("m^2.5", "factor of each term in the coefficient of each field (k, m)")
     inverse: jax.Array = param("1", "inverse of the normal matrix of the terms (k, k)")
-    scale: jax.Array = param("m", "size of the first coordinate")
+    scale: jax.Array = param("m", "standard deviation of the first coordinate in the training")
     statement: jax.Array = param("1", "constant and 3 exponents (4,) of the stated error, see `_logarithms`")
     left: jax.Array = param("1", "error of each left-out run, divided by its largest displacement (R,)")
     ratios: jax.Array = param("1", "stated error divided by true error of each left-out run (R,)")
@@ -57,13 +58,13 @@ class Correction:
 
 
 class Learnt(NamedTuple):
-    """Training runs from which a correction is learnt."""
+    """R training runs with T steps, from which a correction is learnt. n is the number of reduced coordinates."""
 
     q: np.ndarray  # coordinates of the reduced runs (R, T, n) [m]
     missing: np.ndarray  # full minus reduced motion (R, T, V, 3) [m]
     moved: np.ndarray  # largest displacement of each run (R,) [m]
     volumes: np.ndarray  # lumped volumes of the nodes (V,) [m^3]
-    dt: Number | None  # time step [s], None without time
+    dt: Number | None  # time step [s]; None if the scene has no time
 
 
 def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.Array:
@@ -71,9 +72,9 @@ def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.
 
     Args:
         q: coordinates (T, n) [m].
-        scale: size of the first coordinate [m].
+        scale: standard deviation of the first coordinate in the training [m].
         products: number of coordinates with quadratic terms.
-        dt: time step [s], None without time.
+        dt: time step [s]; None if the scene has no time.
     """
     x = q / scale
     i, j = np.triu_indices(min(products, x.shape[-1]))
@@ -104,7 +105,7 @@ def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None
         own: `Correction`.
         q: coordinates (T, n) [m].
         moved: corrected displacements of the nodes (T, V, 3) [m].
-        dt: time step [s], None without time.
+        dt: time step [s]; None if the scene has no time.
     """
     a = terms(q, own.scale, own.products, dt)
     numbers = (
@@ -132,14 +133,14 @@ def _leverage(a: jax.Array, inverse: jax.Array) -> jax.Array:
 
 
 def _logarithms(corrected: jax.Array, moved: jax.Array, leverage: jax.Array) -> jax.Array:
-    """Return three logarithms (R, 3), from which the stated error is computed: of the correction divided by the
-    displacement, of the displacement `moved` [m], and of the leverage."""
+    """Return three logarithms (R, 3) for R runs or steps: of the correction divided by the displacement, of the
+    displacement `moved` [m], and of the leverage. The stated error is computed from these."""
     tiny = jnp.finfo(moved.dtype).tiny
     return jnp.log(jnp.maximum(jnp.stack([corrected / moved, moved, leverage], axis=1), tiny))
 
 
 class _LeftOut(NamedTuple):
-    """Errors of every run (R,), with a correction that was learnt without the group of this run."""
+    """Maxima over each run (R,), with a correction that was learnt without the group of this run."""
 
     off: np.ndarray  # maximum error [m]
     corrected: np.ndarray  # maximum correction [m]
@@ -236,10 +237,11 @@ def _error_fields(weighted: np.ndarray) -> np.ndarray:
 
 
 class _LeastSquares(NamedTuple):
-    """Normal equations for the factors of the terms. There is one set of equations for each of g groups of runs."""
+    """Normal equations for the factors of k terms in the coefficients of m fields. There is one set of equations for
+    each of g groups of runs."""
 
     squares: np.ndarray  # normal matrices (g, k, k)
-    products: np.ndarray  # right sides (g, k, m)
+    products: np.ndarray  # right-hand sides (g, k, m)
     size: np.ndarray  # root mean square of each term (k,)
     states: int  # number of states in all runs
 

@@ -12,10 +12,10 @@ of the left-hand side is factorised once per run. So a step needs the forces of 
 no Newton iterations. In statics the energy norm of e is the dual norm of r. The estimate neglects terms of second order
 in e and the change of the stiffness with the deformation.
 
-In a porous scene, the fluid pressures on the full mesh are computed from the reduced motion. Then the volume balance of
-the fluid is fulfilled, and only the forces are out of balance. These forces cause the errors of motion and pressure
-(`liverjax.reduced.physics.fluid_error`). The error of the reduced pressure is the reduced pressure minus the computed
-pressure, minus the change of pressure due to e.
+In a scene with a porous body, the fluid pressures on the full mesh are computed from the reduced motion. Then the
+volume balance of the fluid is fulfilled, and only the forces are out of balance. These forces cause the errors of
+motion and pressure (`liverjax.reduced.physics.fluid_error`). The error of the reduced pressure is the reduced pressure
+minus the computed pressure, minus the change of pressure due to e.
 """
 
 from collections.abc import Callable
@@ -55,18 +55,18 @@ if TYPE_CHECKING:
 
 
 class _Body(NamedTuple):
-    """Sparse matrices (f, f) of the linear equations for the error; f is the number of free degrees of freedom."""
+    """Matrices (f, f) of the linear equations for the error, where f is the number of free degrees of freedom."""
 
     relaxing: jax.Array  # stiffness of the part that relaxes [N/m]
-    rest: Any  # stiffness of the part that does not relax, or None
-    mass: Any  # diagonal (f,) [kg], or None
+    rest: Any  # stiffness of the part that does not relax; None if there is no such part
+    mass: Any  # diagonal of the mass matrix (f,) [kg]; None without inertia
 
 
 def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ReducedResult:
     """Add to the result the estimated errors (T,) of motion [m] and pressure [Pa], and the reactions (T, V, 3) [N].
     Return the new result.
 
-    The function is for one run. It cannot be used inside jit, grad or vmap.
+    `result` must be the result of one run. The function cannot be used inside jit, grad or vmap.
 
     Args:
         model, scene, result: arguments and result of `simulate_reduced`.
@@ -86,7 +86,7 @@ def _out_of_balance(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, j
     """Return out-of-balance forces (T, V, 3) [N], reactions (T, V, 3) [N] and fluid pressure (T, V) [Pa] of the full
     model for given positions x (T, V, 3) [m].
 
-    The pressure is None without a fluid.
+    The pressure is None if the scene has no fluid.
     """
     sizes = force_sizes(scene)
 
@@ -124,7 +124,7 @@ def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
 
 def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the errors of displacement (T, V, 3) [m] and pressure (T, V) [Pa]: the response of the linear body to the
-    forces -residuals (T, V, 3) [N]. The pressures are None without a fluid."""
+    forces -residuals (T, V, 3) [N]. The pressures are None if the scene has no fluid."""
     import scipy.sparse
 
     free = np.flatnonzero(np.asarray(free_directions(scene).mask).ravel())
@@ -161,8 +161,8 @@ def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid | None
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """Return the function of `coupled_solver` for one step. Without a fluid, return a function that solves with the
-    matrix K alone."""
+    """Return a function that solves the linear equations of one step. With a fluid, this is the function of
+    `coupled_solver`. Without a fluid, the matrix of the equations is K."""
     from scipy.sparse.linalg import splu
 
     if fluid is not None:
@@ -172,8 +172,11 @@ def _solver(
 
 
 def _recursion(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the coefficients a, b, c (N,) [1] of the recursion gamma_new = a S + b gamma + c S_before, for N Prony
-    terms. The arrays are empty without viscosity."""
+    """Return the coefficients a, b, c (N,) [1] of the recursion gamma_new = a S + b gamma + c S_before for the history
+    variables gamma of N Prony terms.
+
+    S is the stress at the end of the step. The arrays are empty if the scene has no viscosity.
+    """
     if scene.viscosity is None:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     a, b, c = coefficients(scene.viscosity, scene.solve.dt)

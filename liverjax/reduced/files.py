@@ -63,7 +63,7 @@ def load_reduced(file: str | Path) -> ReducedModel:
     import h5py
 
     if not Path(file).is_file():
-        raise InputError(f"{file}: this file does not exist: make a reduced model with python -m liverjax reduce")
+        raise InputError(f"{file} does not exist: make a reduced model with python -m liverjax reduce")
     try:
         with h5py.File(file, "r") as stored:
             arrays = {name: stored[name][()] for name in _UNITS}
@@ -77,9 +77,9 @@ def load_reduced(file: str | Path) -> ReducedModel:
         )
         wrong = _wrong(model)
     except (OSError, KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{file} is not a reduced model ({error}): make one with python -m liverjax reduce") from None
+        raise InputError(f"{file} is not a reduced model ({error}): make it with python -m liverjax reduce") from None
     if wrong:
-        raise InputError(f"{file} is damaged: {wrong}; make it again with python -m liverjax reduce")
+        raise InputError(f"{file} is damaged: {wrong}; make the model again with python -m liverjax reduce")
     return model
 
 
@@ -103,7 +103,7 @@ def _wrong(model: ReducedModel) -> str:
         if jnp.shape(array) != shapes[name]:
             return f"{name} has shape {jnp.shape(array)}, not {shapes[name]}"
         if not np.all(np.isfinite(np.asarray(array))):
-            return f"{name} has values that are not numbers"
+            return f"{name} has values that are not finite"
     return ""
 
 

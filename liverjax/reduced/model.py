@@ -39,7 +39,7 @@ from liverjax.tensors.places import taken
 
 #: A parameter may be outside of its training range by this fraction of the width of the range.
 BEYOND = 0.5
-#: Entries of a scene with numbers that change the motion.
+#: Entries of a scene that contain numbers on which the motion depends.
 _PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction", "physics")
 #: Names of numbers that may differ from the training runs, because a load with another history can lead to the same
 #: states.
@@ -48,12 +48,12 @@ _FREE = ("times", "history")
 
 @struct
 class PressureModes:
-    """The m modes of the fluid pressure, with their values at the S points. The modes are 0 where the body is
-    drained."""
+    """The m modes of the fluid pressure, with their values at the S points of the reduced model. The modes are 0 where
+    the body is drained."""
 
     modes: jax.Array = param("1", "(m, V), orthonormal with the lumped volumes of the vertices")
     values: jax.Array = param("1", "values at the points (S, m)")
-    parts: jax.Array = param("1", "(m, 4, S) vertex values of each point's element, times roots of shape functions")
+    parts: jax.Array = param("1", "(m, 4, S) vertex values in each point's element, times roots of shape functions")
     slopes: jax.Array = param("1/m", "gradients at the points (m, 3, S)")
 
 
@@ -68,7 +68,7 @@ class ReducedModel:
     points: jax.Array = param("1", "number q E + e of integration point q in element e of E (S,)")
     ranges: dict[str, Any] = param("1", "name of each training parameter -> its lowest and highest value")
     correction: Correction | None = param("1", "correction of the motion (`Correction`), or None", default=None)
-    pressures: PressureModes | None = param("1", "pressure modes of a porous scene", default=None)
+    pressures: PressureModes | None = param("1", "pressure modes; None if the scene has no porous body", default=None)
     identity: str = static(default="", about="digest of the scene for which the model is made")
     others: str = static(default="", about="digests of the numbers that are equal in all training runs, as JSON")
 
@@ -140,10 +140,10 @@ def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
 
 
 def reduced_identity(scene: Scene) -> str:
-    """Return a digest of the mesh, the fixed, displaced and drained nodes, and the kinds of law, viscosity, porosity,
-    supports and solution (static or dynamic).
+    """Return a digest of the mesh, of the fixed, displaced and drained nodes, and of the kinds of law, viscosity,
+    porosity, supports and solution (static or dynamic).
 
-    The digest does not depend on the parameters.
+    The digest does not depend on the values of parameters.
     """
     whole = hashlib.sha256()
     for array in (scene.mesh.points, scene.mesh.tetrahedra):
@@ -166,9 +166,9 @@ def refuse_unknown_physics(scene: Scene) -> None:
 
     Raises:
         InputError: the scene has regions with a separate viscosity or another kind of law, inlets of a fluid, physics
-            objects other than supports, a loaded mesh, or pressures that follow the surface. Other reasons are averaged
-            or mixed volumes, a consistent mass matrix, viscosity without a time step, a precision other than "float64",
-            or a setting of newton other than "converged".
+            objects other than supports, a mesh of the loaded body, or pressures that follow the surface. Other reasons
+            are averaged or mixed volumes, a consistent mass matrix, viscosity without a time step, a precision other
+            than "float64", or a setting of newton other than "converged".
     """
     if any(region.viscosity for region in scene.region):
         raise InputError("a reduced model has one viscosity: remove the viscosity of regions, or run the full model")
@@ -177,7 +177,7 @@ def refuse_unknown_physics(scene: Scene) -> None:
             "a reduced model has only one kind of law: use the same law in all regions, or run the full model"
         )
     if scene.porosity is not None and scene.porosity.inlet:
-        raise InputError("a reduced model cannot have [[porosity.inlet]]: remove it, or run the full model")
+        raise InputError("a reduced model cannot have [[porosity.inlet]]: remove the inlet, or run the full model")
     if scene.points_are == "loaded":
         raise InputError('[mesh] is = "loaded" cannot be used with reduced models: use the scene of lj.unloaded(scene)')
     refuse_other_physics(scene)
@@ -214,7 +214,7 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
     own = reduced_identity(scene)
     if own != model.identity:
         raise InputError(
-            f"the reduced model was made for scene {model.identity}, but this is {own} (mesh, fixed nodes, law, "
+            f"the reduced model was made for scene {model.identity}, but this is scene {own} (mesh, fixed nodes, law, "
             "viscosity, supports or kind differ): run python -m liverjax reduce for this scene"
         )
 
@@ -232,7 +232,7 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
     for part in _PARTS:
         for path, leaf in jax.tree_util.tree_flatten_with_path(getattr(scene, part))[0]:
             words = [str(getattr(key, "name", getattr(key, "idx", key))) for key in path]
-            if part == "physics":  # the names are those of a scene file, for example support.0
+            if part == "physics":  # names as in a scene file, for example support.0
                 part_of = scene.physics[: int(words[0]) + 1]
                 section = part_of[-1].section
                 words = [str(sum(own.section == section for own in part_of) - 1), *words[1:]]
@@ -240,14 +240,14 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
             else:
                 name = ".".join([part, *words])
             if name.rsplit(".", 1)[-1] not in _FREE:
-                # Rounding, because equal numbers may differ in their last digits and in the sign of 0.
+                # The numbers are rounded, because equal numbers may differ in their last digits and in the sign of 0.
                 rounded = np.asarray(leaf, np.float32) + np.float32(0)
                 found[name] = hashlib.sha256(rounded.tobytes()).hexdigest()[:8]
     return json.dumps(found | _course(scene))
 
 
 def _course(scene: Scene) -> Content:
-    """Return the time integrator and the duration [s] of the run (None without time), with their names."""
+    """Return {name: value} of the time integrator and of the duration [s] of the run (None without time)."""
     solve = scene.solve
     duration = None if solve.dt is None else float(solve.dt) * solve.steps
     return {"solve.integrator": solve.integrator, "solve.dt x solve.steps": duration}

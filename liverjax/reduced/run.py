@@ -52,8 +52,8 @@ from liverjax.tensors.matrices import determinant
 
 @struct
 class ReducedResult:
-    """Result of a reduced run: arrays over the T steps. The function `reduced_positions` returns the motion of the
-    nodes."""
+    """Result of a reduced run: arrays over the T steps, for n modes of the motion and m modes of the pressure. The
+    function `reduced_positions` returns the motion of the nodes."""
 
     times: jax.Array = param("s", "end of each step (T,); in a scene without time: number of the load step")
     coordinates: jax.Array = param("m", "reduced coordinates (T, n): coordinates of the modes")
@@ -64,7 +64,7 @@ class ReducedResult:
     error: jax.Array | None = param(
         "m", "(T,) estimated maximum distance of a node from the full model; None if unknown", default=None
     )
-    reactions: jax.Array | None = param("N", "(T, V, 3) in the full model; None if error is None", default=None)
+    reactions: jax.Array | None = param("N", "(T, V, 3), as in the full model; None if error is None", default=None)
     pressure_error: jax.Array | None = param(
         "Pa",
         "(T,) estimated maximum error of the fluid pressure; None if error is None, or without a fluid",
@@ -73,7 +73,7 @@ class ReducedResult:
 
 
 class _Given(NamedTuple):
-    """Reduced loads and prescribed motion at the end of every step."""
+    """Reduced loads and prescribed motion at the end of each of T steps, for n modes and S points."""
 
     load: jax.Array  # forces on the modes (T, n) [N]
     gradient: jax.Array  # deformation gradient of the prescribed motion (T, 9, S), or (1, 9, S) without motion
@@ -130,8 +130,8 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     """Return the initial state: reduced coordinates, history variables of viscosity, state of the fluid, velocity and
-    acceleration, and a zero matrix instead of the inverse tangent. The last result is the reduced mass matrix (n, n)
-    [kg].
+    acceleration, and a zero matrix for the inverse tangent, which is not yet known. The last result is the reduced mass
+    matrix (n, n) [kg].
 
     Velocity, acceleration and mass are None without inertia. `load` (n,) [N]: reduced load at the beginning.
     """
@@ -143,7 +143,7 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     if scene.solve.kind != "dynamic" or scene.body is None:
         return q, memory, fluid, None, inverse, None
     density = jnp.asarray(scene.body.density)
-    if density.ndim == 0:  # the modes are orthonormal with the lumped volumes
+    if density.ndim == 0:  # then the mass is a multiple of Id: the modes are orthonormal with the volumes
         mass = density * jnp.eye(n, dtype=q.dtype)
     else:
         nodal = density * nodal_volumes(scene.mesh)
@@ -247,7 +247,7 @@ def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult, 
 
 
 def reduced_pressure(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
-    """Return the pressure (T, V) [Pa] of the fluid at the nodes of a porous scene.
+    """Return the fluid pressure (T, V) [Pa] at the nodes of a porous body.
 
     Raises:
         InputError: the scene has no porosity.

@@ -1,10 +1,10 @@
 """Select a few integration points, with non-negative weights, that give the reduced forces of the training runs.
 
 The contributions of all P integration points to the reduced forces form a matrix G. It has one row for each reduced
-force in each training state, and the sum of a row is this force. G is replaced by its most important singular vectors.
-Then the factors xi >= 0 of the points are the least-squares solution of G xi = G 1, where 1 is the vector of ones
-(method of Lawson and Hanson). The number of positive factors is at most the number of singular vectors (Hernandez,
-Caicedo, Ferrer 2017).
+force in each training state, and the sum of a row is this force. The rows of G are replaced by the most important
+singular vectors of G. Then the factors xi >= 0 of the points are the least-squares solution of G xi = G 1, where 1 is
+the vector of ones (method of Lawson and Hanson). One more equation keeps the total volume. The number of positive
+factors is at most the number of equations (Hernandez, Caicedo, Ferrer 2017).
 """
 
 from collections.abc import Callable, Mapping
@@ -43,7 +43,7 @@ LEAST_MOTION = 1e-9
 
 
 class Coordinates(NamedTuple):
-    """Reduced coordinates of R runs with T steps each."""
+    """Reduced coordinates of R runs with T steps each, for n modes of the motion and m modes of the pressure."""
 
     q: np.ndarray | jax.Array  # coordinates of the modes (R, T, n) [m]
     p: np.ndarray | jax.Array | None  # coordinates of the pressure modes (R, T, m) [Pa]
@@ -73,7 +73,7 @@ def sampled(
         # Forces are converted to motions, because forces on stiff modes are large but cause little motion.
         G = compliance @ np.asarray(forces)
         size = np.linalg.norm(G.sum(axis=2), axis=1)
-        # In an inverted element, some laws have no finite stress. A state at rest has no forces.
+        # States are not used if some stress is not finite (inverted elements) or if the body is at rest (no forces).
         good = np.isfinite(G).all(axis=(1, 2)) & (size > LEAST_MOTION * np.abs(q).max())
         rows.append((G[good] / size[good, None, None]).reshape(-1, whole.weights.size))
         if volumes is not None:
@@ -85,7 +85,7 @@ def sampled(
 
 def _balances(volumes: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Return rows (2 K m, P) of the matrix G, from both sides `volumes` (2, K, m, P) [Pa] of the fluid's volume balance
-    (see `_balance`).
+    (see `_balance`), for K states, m pressure modes and P points.
 
     Each row is divided by the scale of its state. The scale is the norm of the pressures due to the change of volume,
     plus the norm of the pressure coordinates p (K, m) [Pa].
@@ -107,8 +107,8 @@ def _at(whole: ReducedModel, points: np.ndarray, weights: jax.Array) -> ReducedM
 def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
     """Return (number of a run, numbers of its steps) for all training states whose forces are used.
 
-    The steps of a run are evenly spaced, and each run begins with a different step. So all times occur, even if only
-    few steps of each run are used. The first steps alone would contain no large motion.
+    The chosen steps of a run are evenly spaced, and the first chosen step differs from run to run. So all times occur,
+    even if only few steps of each run are used. The first steps of the runs alone would contain no large motion.
     """
     chosen = np.unique(np.linspace(0, runs - 1, min(runs, MOST_STATES)).round().astype(int))
     each = min(steps, max(1, MOST_STATES // len(chosen)))
@@ -131,7 +131,7 @@ def _contributions(
     whole: ReducedModel, scene: Scene, run: tuple[jax.Array, jax.Array | None], times: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
     """Return (forces, balance): forces (K, n, P) [N] are the contributions of each point to the reduced forces at the K
-    steps `times` of a run; balance is the result of `_balance`, or None without a fluid.
+    steps `times` of a run; balance is the result of `_balance`, or None if the scene has no fluid.
 
     `run` contains the coordinates of motion (T, n) [m] and pressure (T, m) [Pa] of the run.
     """
@@ -204,9 +204,9 @@ def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) ->
 
     if not len(G):
         raise InputError(
-            "the runs contain no forces for a selection of points: give at least two parameter sets that differ"
+            "the training runs contain no forces, so no points can be selected: give two or more different rows"
         )
-    # The rows of V have length 1, so singular vectors with small singular values have the same weight as the others.
+    # The rows of V have length 1, so singular vectors with small singular values have the same weight as others.
     V = principal_fields(G, tolerance)
     V = np.concatenate([V, volumes[None] / np.linalg.norm(volumes)])
     return nnls(V, V.sum(axis=1), maxiter=20 * V.shape[1])[0]

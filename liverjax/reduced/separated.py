@@ -28,7 +28,7 @@ from liverjax.simulation.batch import simulate_batch
 #: Maximum number of parameters, and maximum number of runs of the grid.
 MOST_PARAMETERS, MOST_RUNS = 4, 2000
 #: SWEEPS: maximum number of iterations of alternating least squares for a term. SETTLED: the iterations end if the
-#: relative change is at most this.
+#: relative change of the term's norm is at most this value.
 SWEEPS, SETTLED = 50, 1e-6
 
 
@@ -36,13 +36,15 @@ SWEEPS, SETTLED = 50, 1e-6
 class SeparatedModel:
     """The M terms of a static displacement that depends on n parameters."""
 
-    fields: jax.Array = param("m", "w (M, V, 3)")
-    functions: tuple[jax.Array, ...] = param("1", "for each parameter, coefficients of Chebyshev polynomials (M, k)")
+    fields: jax.Array = param("m", "fields w_m of the M terms (M, V, 3)")
+    functions: tuple[jax.Array, ...] = param("1", "for each parameter, coefficients of k Chebyshev polynomials (M, k)")
     ranges: jax.Array = param("1", "lowest and highest value of each parameter (n, 2)")
     left_out: jax.Array = param(
-        "1", "fraction of the displacements at the grid that the terms do not describe (root mean square)"
+        "1",
+        "displacements that the terms do not describe, divided by all displacements (root mean square over nodes, "
+        "weighted by volume, and over all runs of the grid)",
     )
-    error: jax.Array = param("1", "(c,) maximum error of a node in c other runs, divided by the largest displacement")
+    error: jax.Array = param("1", "(c,) maximum error of a node, divided by the largest displacement, in c other runs")
     names: tuple[str, ...] = static(default=(), about="dotted names of the parameters")
 
 
@@ -123,7 +125,7 @@ def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> 
 
 
 def _chebyshev(t: jax.Array, number: int) -> jax.Array:
-    """Return the values of the first Chebyshev polynomials at t. `number`: how many polynomials."""
+    """Return the values (number,) of the first `number` Chebyshev polynomials at t."""
     out = [jnp.ones_like(t), t]
     for _ in range(number - 2):
         out.append(2 * t * out[-1] - out[-2])
@@ -137,7 +139,7 @@ def _names_and_limits(
     if scene.solve.kind != "static" or scene.solve.dt is not None:
         raise InputError("a separated form needs a static solution: give a scene of kind 'static' without dt")
     if scene.points_are == "loaded":
-        raise InputError('[mesh] is = "loaded" has no separated form: use the scene of lj.unloaded(scene)')
+        raise InputError('[mesh] is = "loaded" cannot have a separated form: use the scene of lj.unloaded(scene)')
     if not 1 <= len(ranges) <= MOST_PARAMETERS:
         raise InputError(f"ranges has {len(ranges)} parameters: give 1 to {MOST_PARAMETERS}")
     if points < 2 or points ** len(ranges) > MOST_RUNS:
@@ -184,7 +186,7 @@ def _terms(
         shape: shape of the grid.
         tolerance, most: `tolerance` and `most_terms` of `separate`.
     """
-    # Coordinates of the runs in the space that they span. So N runs have at most N coordinates each.
+    # The runs are written in a basis of the space that they span. So each of N runs has at most N coordinates.
     U, S, _ = np.linalg.svd(known, full_matrices=False)
     data = U * S
     size, left = np.linalg.norm(data), data
@@ -203,8 +205,8 @@ def _terms(
 
 
 def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
-    """Return the unit vectors, one for each axis except the last, of the product of vectors that is closest to a
-    tensor."""
+    """Find the product of vectors, one for each axis, that is closest to a tensor. Return the unit vectors of all
+    axes except the last."""
     n = tensor.ndim
     # The iteration begins with the first singular vector of each axis.
     factors = [np.linalg.svd(np.moveaxis(tensor, a, 0).reshape(tensor.shape[a], -1))[0][:, 0] for a in range(n - 1)]

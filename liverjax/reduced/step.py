@@ -34,29 +34,29 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 class ReducedMotion(NamedTuple):
-    """Velocity and acceleration of the reduced coordinates (n,), and the last change of the acceleration."""
+    """Velocity and acceleration of the n reduced coordinates, and the last change of the acceleration."""
 
-    velocity: jax.Array  # [m/s]
-    acceleration: jax.Array  # [m/s^2]
-    change: jax.Array  # of the acceleration in the last step [m/s^2]
+    velocity: jax.Array  # (n,) [m/s]
+    acceleration: jax.Array  # (n,) [m/s^2]
+    change: jax.Array  # change of the acceleration in the last step (n,) [m/s^2]
     steady: jax.Array  # whether `change` is closer to the change of the step before than to 0
 
 
 class ReducedEquations(NamedTuple):
-    """Quantities that are constant during a step."""
+    """Quantities that are constant during a step, for n modes and S points."""
 
     model: ReducedModel
     acting: Solid  # stress of the solid, with the history variables at the end of the last step
     load: jax.Array  # loads on the modes (n,) [N]
     gradient: jax.Array  # deformation gradients of the prescribed motion (9, S)
-    mass: jax.Array | None  # (n, n) [kg]
+    mass: jax.Array | None  # reduced mass matrix (n, n) [kg]; None without inertia
     q: jax.Array  # reduced coordinates at the beginning of the step (n,) [m]
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
     spread: jax.Array | None  # absolute values of the mode gradients (9, S, n) [1/m] if motion is prescribed
-    noise: jax.Array  # [N] forces of this size have a roundoff equal to the tolerance; scale of residuals without loads
-    fluid: Flowing | None  # fluid of a porous scene
+    noise: jax.Array  # roundoff of the forces, divided by the tolerance [N]; it is added to the scale of residuals
+    fluid: Flowing | None  # data of the fluid; None if the scene has no porous body
     light: SinglePrecision  # mode gradients in single precision
     steepest: jax.Array  # square root of the sum of squares of all mode gradients [1/m]
     springs: jax.Array | None = None  # stiffness of elastic supports (n, n) [N/m]
@@ -89,7 +89,7 @@ def _stresses(solid: Solid, F: jax.Array) -> jax.Array:
 def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
     """Return the roundoff of the reduced forces due to a unit stretch along x, divided by the tolerance [N].
 
-    Residuals without loads are divided by this force (see `liverjax.simulation.equations.Equations.noise`).
+    If there are no loads, residuals are divided by this force (see `liverjax.simulation.equations.Equations.noise`).
     """
     own = solid_at_points(model, replace(scene, viscosity=None))
     assert isinstance(own, Elasticity)
@@ -131,7 +131,7 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
     """
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:
-        # Without loads, the forces of the points cancel at the solution. So the sum of their sizes is the scale.
+        # Without loads, the forces of all points cancel at the solution. So the scale contains their absolute values.
         size = size + jnp.linalg.norm(jnp.tensordot(jnp.abs(P), e.spread, axes=2))
     if e.springs is not None:
         pull = e.springs @ q
@@ -143,8 +143,8 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
 
 
 def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
-    """Return the derivative of the out-of-balance forces with respect to q. The moduli come from the function for
-    stiffness blocks of elements, with unit vectors instead of the gradients of the shape functions."""
+    """Return the derivative of the out-of-balance forces with respect to q. The function for the
+    stiffness between two nodes gives the moduli, with unit vectors instead of the gradients of shape functions."""
     F = gradients_at(e, q)
     blocks = e.acting.blocks(as_matrix(F), list(IDENTITY), _PAIRS)
     if e.fluid is not None:
@@ -169,8 +169,8 @@ def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
 class _Found(NamedTuple):
     """State at the end of a step, and the inverse tangent with which the next step begins."""
 
-    q: jax.Array
-    residual: jax.Array
+    q: jax.Array  # reduced coordinates (n,) [m]
+    residual: jax.Array  # relative residual
     iterations: jax.Array | np.ndarray
     inverse: jax.Array
 
@@ -192,8 +192,8 @@ class _ReducedIterate(NamedTuple):
     tangents: jax.Array  # number of computed tangents
 
 
-#: If the residual after an iteration is above this fraction of the residual before, a new tangent is computed. A
-#: tangent costs as much as ten iterations.
+#: If an iteration reduces the residual to more than this fraction, a new tangent is computed. A tangent needs as much
+#: time as ten iterations.
 _LITTLE_GAIN = 0.95
 #: If the error due to single precision exceeds this fraction of the tolerance, the forces are computed again in double
 #: precision.
@@ -252,7 +252,7 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
     more = jnp.tensordot(change.astype(jnp.float32), e.light.slopes, axes=2).astype(dq.dtype)
     internal = at.internal + more
     r, size = _relative_residual(e, q, P, internal)
-    # A bound of the roundoff of the matrix products in r, relative to the size of all forces.
+    # Bound of the roundoff in r due to the matrix products, relative to the size of all forces.
     lost = float(jnp.finfo(jnp.float32).eps) * e.steepest * jnp.linalg.norm(change) * size
     rounded = at.rounded + lost / jnp.maximum(jnp.linalg.norm(r), jnp.finfo(r.dtype).tiny)
     inverse = _updated(at.inverse, -part * dq, r - at.r)
@@ -273,7 +273,7 @@ def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, i
 
     Args:
         newmark: whether the time integrator is Newmark's method.
-        most: maximum number of tangents.
+        most: maximum number of tangents that are computed.
         e: constants of the step.
         tolerance: maximum relative residual.
         inverse: inverse tangent of the previous step (n, n) [m/N]; zeros in the first step.
@@ -350,7 +350,7 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     begin = begin._replace(iterations=at.iterations)
     at = jax.tree.map(lambda old, new: jnp.where(at.size > tolerance, new, old), at, begin)
     at = jax.lax.while_loop(unfinished, lambda at: inner(refreshed(at)), at)
-    # One more correction is possible without new forces.
+    # One more correction of q needs no new forces.
     return _Found(at.q - at.inverse @ at.r, at.size, at.iterations, at.inverse)
 
 
@@ -360,8 +360,8 @@ def _derivative_of_end(newmark: bool, most: int, primals: tuple, tangents: tuple
     found = step_end(newmark, most, *primals)
     without = e._replace(newmark=None)
 
-    # Only numbers with a nonzero JAX tangent are differentiated. Derivatives with respect to the mode gradients would
-    # need most of the time.
+    # Only numbers with a nonzero JAX tangent are differentiated. Otherwise derivatives with respect to the mode
+    # gradients would need most of the time.
     numbers, tree = jax.tree.flatten(without)
     changes = jax.tree.leaves(de)
     live = [k for k, change in enumerate(changes) if not isinstance(change, SymbolicZero)]

@@ -13,18 +13,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-#: LEFT: relative residual at which the corrections end. CORRECTIONS: maximum number of corrections.
+#: LEFT: the corrections end if the relative residual is at most this. CORRECTIONS: maximum number of corrections.
 LEFT, CORRECTIONS = 1e-12, 20
 #: If the relative residual after the corrections is above this, K is assembled and factorised in double precision.
 TOO_FAR = 1e-10
 
 
 class SinglePrecision(NamedTuple):
-    """Gradients of the modes in single precision, in two array layouts. A matrix product is faster by a third if no
-    matrix has to be transposed."""
+    """Gradients of the n modes at the S points in single precision, in two array layouts. Matrix products are a third
+    faster if no matrix has to be transposed."""
 
-    slopes: jax.Array  # (9, S, n) [1/m]
-    flat: jax.Array  # (n, 9 S)
+    slopes: jax.Array  # gradients (9, S, n) [1/m]
+    flat: jax.Array  # the same gradients as a matrix (n, 9 S)
 
 
 class ReducedTangent(NamedTuple):
@@ -69,7 +69,7 @@ def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -
         def going(at: tuple) -> jax.Array:
             _, r, before, count = at
             size = jnp.linalg.norm(r)
-            # If a correction does not halve r, then r is only roundoff, or the inverse is not accurate enough.
+            # The corrections end if one does not halve r: r is then roundoff, or the inverse is not accurate enough.
             return (size > LEFT * limit) & (size < 0.5 * before) & (count < CORRECTIONS)
 
         def corrected(at: tuple) -> tuple:

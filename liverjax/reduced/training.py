@@ -23,7 +23,7 @@ from liverjax.tensors.principal_fields import principal_fields
 
 #: Displacements below this fraction of the body's size are regarded as 0.
 _ROUNDOFF = 1e-13
-#: A porous scene has at most one pressure mode for this number of displacement modes.
+#: Maximum number of displacement modes, divided by the maximum number of pressure modes.
 PRESSURES = 2
 
 
@@ -32,7 +32,7 @@ class _Runs(NamedTuple):
 
     values: dict[str, np.ndarray]  # dotted names -> parameters of these runs (R, ...)
     u: np.ndarray  # displacements (R, T, V, 3) [m]
-    P: np.ndarray | None  # pressures at the vertices (R, T, V) [Pa] in a porous scene
+    P: np.ndarray | None  # pressures at the vertices (R, T, V) [Pa]; None if the scene has no fluid
 
 
 def reduce_scene(
@@ -53,9 +53,9 @@ def reduce_scene(
         most_modes: maximum number of modes.
         point_tolerance: the reduced forces are converted to motions; the sampled points may neglect this fraction of
             the motions [1]. Default: `tolerance`.
-        runs: number of full runs. Two thirds of these runs use the first rows. A first reduced model is made from them.
-            The other runs use those of the remaining rows for which this model states the largest errors, relative to
-            the displacements. Default: all rows.
+        runs: number of full runs. Two thirds of these runs use the first rows, and a first reduced model is made from
+            these runs. The other runs use those of the remaining rows for which this model has the largest corrections,
+            relative to the displacements. Default: all rows.
 
     Raises:
         InputError: the scene has entries that reduced models do not support; a tolerance is not between 0 and 1; no run
@@ -104,7 +104,7 @@ def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
     u -= np.asarray(scene.mesh.points)
     u *= np.asarray(mask)
     if np.abs(u).max() <= _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points)):
-        raise InputError("no row moves the body: give loads or prescribed motions that are not 0")
+        raise InputError("no training run moves the body: give loads or prescribed motions that are not 0")
     P = None if result.pressure is None else np.asarray(result.pressure)[good, :, : scene.mesh.number_of_vertices]
     return _Runs(_some(values, good), u, P)
 
@@ -165,7 +165,7 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
             continue
         off = np.linalg.norm(np.asarray(correction_at(model.correction, jnp.asarray(own), scene.solve.dt)), axis=-1)
         found[k] = off.max() / max(u, 1e-300)
-    # A failed run is chosen last, because the full run would probably fail too.
+    # Parameter sets whose reduced run failed are chosen last, because the full run would probably fail too.
     return np.where(failed, -1.0, found)
 
 

@@ -1,1 +1,1 @@
-"""Scenes: their entries, scene files, and checks of scenes."""
+"""Scenes (the input of a simulation): their entries, scene files, and checks."""

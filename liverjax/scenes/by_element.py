@@ -18,7 +18,7 @@ from liverjax.tensors.subsets import subsets
 
 
 def by_element(scene: Scene) -> Scene:
-    """Return the scene without regions. Parameters that a region changes become arrays (E,)."""
+    """Return the scene without regions. A parameter that a region changes becomes an array (E,)."""
     mesh, law, prony, sponge = scene.mesh, scene.law, scene.viscosity, scene.porosity
     if scene.region:
         law = law_of_elements(law, scene.region, mesh.number_of_elements)
@@ -30,7 +30,7 @@ def by_element(scene: Scene) -> Scene:
 
 
 def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Law:
-    """Return the law of the scene with the parameters and laws of its regions.
+    """Return the law of the body: the law of the scene, with the parameters and laws of its regions.
 
     A parameter has one value per element (E,) if a region changes it. If a region has a complete law, the result is a
     `ByRegion` of all laws.
@@ -51,7 +51,10 @@ def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: i
 
 
 def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_elements: int) -> Prony:
-    """Return the Prony series. If a region changes it, ratios and times have one value per mode and element, (N, E)."""
+    """Return the Prony series of the body.
+
+    If a region changes the series, ratios and times have one value per mode and element, (N, E) with N modes.
+    """
     found: Content = {}
     for name in VISCOUS:
         own = {
@@ -73,7 +76,10 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
 
 
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
-    """Return the porosity. A parameter that a region changes gets one value per element, (E,) or (1, E)."""
+    """Return the porosity of the body. A parameter that a region changes has one value per element.
+
+    Its shape is (E,), or (1, E) if elements have several integration points.
+    """
     found: Content = {}
     for region in regions:
         for name, value in (region.porosity or {}).items():
@@ -84,5 +90,5 @@ def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: 
 
 
 def sponge_at_points(porosity: Porosity, mesh: TetMesh) -> Porosity:
-    """Return the porosity. Parameters with one value per element get an axis for the integration points."""
+    """Return the porosity. Parameters with one value per element get an additional axis for the integration points."""
     return replace(porosity, **mesh.at_points({name: getattr(porosity, name) for name in POROUS}))

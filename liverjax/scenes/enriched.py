@@ -1,6 +1,6 @@
 """Convert a scene to shape functions of the next order: linear to quadratic elements, quadratic to cubic elements.
 
-Supports, motions and loads stay the same. The position and the values of a new node follow from the nodes around it.
+Supports, motions and loads do not change. The position and the values of a new node follow from the nodes around it.
 """
 
 import jax
@@ -41,7 +41,7 @@ def _quadratic_mesh(scene: Scene) -> Scene:
 
 
 def _between(mesh: TetMesh, moved: Displaced, nodes: Indices) -> Displaced:
-    """Extend a motion to the new nodes: a midside node moves by the mean of the two edge ends."""
+    """Extend a motion to the new nodes. A midside node has the mean displacement of the two ends of its edge."""
     if moved.by is None or np.ndim(moved.by) == 1:
         return replace(moved, nodes=nodes)
     by = jnp.zeros((mesh.number_of_vertices, 3), mesh.points.dtype).at[moved.nodes].set(moved.by)
@@ -54,7 +54,8 @@ def _cubic(scene: Scene) -> Scene:
     def more(nodes: Indices) -> jax.Array:
         return node_numbers(promotion.with_functions(mesh, np.asarray(nodes)))
 
-    # The unknowns of the new functions are not positions: where a motion is prescribed, they are fixed at 0.
+    # The unknowns of the new shape functions are not positions. Where a motion is prescribed, these unknowns are fixed
+    # at 0.
     still = tuple(Fixed(nodes=more(d.nodes)[len(np.asarray(d.nodes)) :], axes=d.axes) for d in scene.displaced)
     body = scene.body
     if body is not None and jnp.ndim(body.density):
@@ -70,7 +71,7 @@ def _cubic(scene: Scene) -> Scene:
 
 
 def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Return the density for all shape functions. A new function has the mean density of the elements around it."""
+    """Return the density for all shape functions. For a new one, it is the mean density of the elements around it."""
     nodes = jnp.stack(mesh.element_nodes)
     own = jnp.broadcast_to(jnp.mean(density[mesh.tetrahedra], axis=1), nodes.shape)
     total, count = (jnp.zeros(mesh.number_of_nodes).at[nodes].add(each) for each in (own, 1.0))
@@ -78,7 +79,7 @@ def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _with_faces(mesh: TetMesh, load: Traction) -> Traction:
-    """Add the face number to each triangle of a load, because the function of the face gets a share of the load."""
+    """Add the face number to each triangle of a load, because the shape function of the face has a part of the load."""
     triangles = np.asarray(load.triangles)
     faces = promotion.face_numbers(mesh, triangles)
     return replace(load, triangles=node_numbers(np.column_stack([triangles, faces])))

@@ -3,7 +3,7 @@
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Keys of [mesh] that are valid for all meshes; additional keys for each kind of mesh.
+#: Keys of [mesh] that are valid for all meshes, and the additional keys for each kind of mesh.
 _EVERY_MESH = ("unit", "order", "is")
 _MESHES = {
     "file": ("file",),
@@ -13,10 +13,12 @@ _MESHES = {
 
 
 def refuse_idle(content: Content) -> None:
-    """Check that all settings in the content of a scene file have an effect. The values must have been checked before.
+    """Check that all settings in the content of a scene file have an effect.
+
+    The values in `content` must have been checked before.
 
     Raises:
-        InputError: this mesh, this kind of motion or this run does not use a key.
+        InputError: a key is not used, because of the kind of mesh, the kind of motion or another setting.
     """
     mesh, solve, output = (content.get(name, {}) for name in ("mesh", "solve", "output"))
     kind = "file" if "file" in mesh else mesh["shape"]
@@ -30,7 +32,9 @@ def refuse_idle(content: Content) -> None:
             f"[solve] integrator = 'newmark' needs kind = 'dynamic', but kind = {motion!r}: remove integrator"
         )
     if "reduced_tolerance" in solve and not solve.get("reduced"):
-        raise InputError('[solve] reduced_tolerance needs a reduced model: add reduced = "model.h5", or remove it')
+        raise InputError(
+            '[solve] reduced_tolerance needs a reduced model: add reduced = "model.h5", or remove reduced_tolerance'
+        )
     for key in ("fields", "reactions"):
         if motion == "harmonic" and output.get(key):
             raise InputError(f"[output] {key} cannot be used with [solve] kind = 'harmonic': remove it")

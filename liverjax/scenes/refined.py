@@ -1,6 +1,6 @@
-"""Convert a scene to a mesh with every element cut into eight, to estimate the mesh error of a run with a fluid.
+"""Convert a scene to a finer mesh, to estimate the mesh error of a run with a fluid. Every element is cut into eight.
 
-The pressures of a fluid are linear in linear and in quadratic elements, so only a finer mesh represents them better.
+The pressures of a fluid are linear in linear and in quadratic elements. So only a finer mesh represents them better.
 """
 
 from collections.abc import Callable
@@ -31,24 +31,25 @@ from liverjax.scenes.scene import Scene
 from liverjax.tensors.subsets import subsets
 
 T = TypeVar("T")
-#: Error of a run, divided by the change of its result on the refined mesh. There, a second-order error is 1/4 as large.
+#: Error of a run, divided by the change of its result on the refined mesh. For second-order convergence, the error on
+#: the refined mesh is 1/4 of the error of the run.
 REFINED = 4 / 3
 
 
 @struct
 class Within:
-    """Positions of the nodes of a refined mesh in the elements of the old mesh."""
+    """Positions of the V' nodes of a refined mesh in the elements of the old mesh, which have n nodes each."""
 
-    nodes: jax.Array = param("1", "old nodes around each new node (n, V')")
-    weights: jax.Array = param("1", "values of the shape functions of these old nodes at the new node (n, V')")
+    nodes: jax.Array = param("1", "numbers (n, V') of the old nodes around each new node")
+    weights: jax.Array = param("1", "values (n, V') of the shape functions of these old nodes at the new node")
 
     def field(self, values: jax.Array) -> jax.Array:
-        """Evaluate a field, given at the old nodes (V, …), at the new nodes (V', …)."""
+        """Return the values (V', …) at the V' new nodes of a field with the values (V, …) at the old nodes."""
         w = self.weights.reshape(*self.weights.shape, *(1,) * (values.ndim - 1))
         return jnp.sum(w * values[self.nodes], axis=0)
 
     def forces(self, values: jax.Array, number_of_nodes: int) -> jax.Array:
-        """Convert forces on the new nodes (V', …) to forces on the old nodes (V, …) that do the same work."""
+        """Convert forces on V' new nodes (V', …) to forces on the old nodes (V, …) that do the same work."""
         w = self.weights.reshape(*self.weights.shape, *(1,) * (values.ndim - 1))
         return jnp.zeros((number_of_nodes, *values.shape[1:]), values.dtype).at[self.nodes].add(w * values[None])
 
@@ -56,8 +57,8 @@ class Within:
 def can_be_refined(scene: Scene) -> bool:
     """Return whether all entries of the scene can be converted to the refined mesh.
 
-    This is not possible for a vessel, which contains element numbers. It is also not possible for a load, an inlet or a
-    physics with one number per triangle or per node.
+    A vessel cannot be converted, because it contains element numbers. A load, an inlet or an object in `scene.physics`
+    with one number per triangle or per node cannot be converted either.
     """
 
     def plain(physics: Physics) -> bool:
@@ -76,7 +77,7 @@ def can_be_refined(scene: Scene) -> bool:
 
 
 def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
-    """Return the scene with every element cut into eight of the same order, and the new nodes in the old mesh.
+    """Return the scene with every element cut into eight of the same order, and the positions of the new nodes.
 
     Numbers of the scene may be unknown (inside jit, grad or vmap), but node numbers must be known.
 
@@ -127,7 +128,7 @@ def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
 
 
 def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Return nodes (n,) of the old mesh, and the new nodes between them on the same face or edge of the body."""
+    """Return n nodes (n,) of the old mesh and the new nodes between them, on the same faces or edges of the body."""
     found = np.concatenate([nodes, np.setdiff1d(middles_of_places(old, nodes), nodes)])
     if mesh.order == 1:
         return found
@@ -135,7 +136,7 @@ def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.nd
 
 
 def _of_parts(E: int, numbers: T) -> T:
-    """Repeat the element values (…, E) or (…, E, 3) of a pytree for the eight parts of each element."""
+    """Repeat the element values (…, E) or (…, E, 3) in a pytree, for the eight parts of each element."""
 
     def one(a: Number) -> Number:
         shape = jnp.shape(a)
@@ -158,7 +159,10 @@ def _law_of_parts(E: int, law: Law) -> Law:
 
 
 def _series(E: int, prony: Prony | None) -> Prony | None:
-    """Return the Prony series for the refined mesh: values for each element (N, E) are repeated for its eight parts."""
+    """Return the Prony series for the refined mesh.
+
+    The values (N, E) of an element are repeated for its eight parts.
+    """
     if prony is None:
         return None
     by_element = {name: own for name in VISCOUS if np.ndim(own := getattr(prony, name)) == 2}
@@ -166,7 +170,7 @@ def _series(E: int, prony: Prony | None) -> Prony | None:
 
 
 def _sponge(E: int, porosity: Porosity | None, more: Callable[[Indices], Indices], parts: Callable) -> Porosity | None:
-    """Return the porosity for the refined mesh: drained nodes, inlets, and values per element."""
+    """Return the porosity for the refined mesh, with new drained nodes, inlets, and values per element."""
     if porosity is None:
         return None
     inlets = tuple(parts(own if own.nodes is None else replace(own, nodes=more(own.nodes))) for own in porosity.inlet)
@@ -176,7 +180,7 @@ def _sponge(E: int, porosity: Porosity | None, more: Callable[[Indices], Indices
 
 
 def _moved_in_between(within: Within, moved: Displaced, nodes: Indices, number_of_nodes: int) -> Displaced:
-    """Extend a motion of the old nodes to the new nodes, by the shape functions."""
+    """Extend a motion of the old nodes to the new nodes. The shape functions give the values at the new nodes."""
     if moved.by is None or np.ndim(moved.by) == 1:
         return replace(moved, nodes=nodes)
     by = jnp.zeros((number_of_nodes, 3)).at[moved.nodes].set(moved.by)

@@ -1,4 +1,4 @@
-"""Parts of a body with other parameters of law, viscosity or porosity, or with another kind of law."""
+"""Regions: parts of a body with other parameters of law, viscosity or porosity, or with another kind of law."""
 
 import warnings
 from collections.abc import Mapping
@@ -14,19 +14,19 @@ from liverjax.laws import Law
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import boundary
 
-#: Parameters of the viscosity, and of the porosity, that may differ in a region.
+#: Parameters of viscosity and porosity that may differ in a region.
 VISCOUS = ("ratios", "relaxation_times")
 POROUS = ("bulk", "limit_bulk", "fluid_fraction", "permeability")
 
 
 @struct
 class Region:
-    """Elements with other parameters or another law than the scene. Where regions overlap, the later region counts."""
+    """Elements with other parameters or another law than the scene. If regions overlap, the later region is used."""
 
     elements: Indices = param("1", "element numbers (n,)")
     law: Content | Law | None = param(
         "1",
-        "names of parameters, as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or another law",
+        "names of parameters without `law.` (`mu`, `mu.0`, or `1.mu` of several laws) -> values; or another law",
         default=None,
     )
     viscosity: Mapping[str, Numbers] | None = param("1", "`ratios` or `relaxation_times` or both -> (N,)", default=None)
@@ -36,7 +36,7 @@ class Region:
 
 
 def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | None, name: str = "region") -> np.ndarray:
-    """Return the numbers of the elements in a set, or with four vertices that satisfy `where` (see `boundary.select`).
+    """Return the numbers of the elements in a set, or of those with all vertices in `where` (see `boundary.select`).
 
     Raises:
         InputError: `where` and `set` are both given or both missing; the mesh has no such set; no element is found.
@@ -44,7 +44,9 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
     if set is not None and where is None:
         if as_word(set, f"{name}: set") not in mesh.element_sets:
             known = ", ".join(mesh.element_sets) or "none"
-            raise InputError(f"{name}: the mesh has no element set {set!r} (it has: {known}); use one of them or where")
+            raise InputError(
+                f"{name}: the mesh has no element set {set!r} (it has: {known}); use one of these sets, or where"
+            )
         elements = np.asarray(mesh.element_sets[set])
         if not len(elements):
             raise InputError(f"{name}: the element set {set!r} of the mesh is empty: correct the set, or use where")
@@ -57,12 +59,13 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
     return inside
 
 
-#: A warning is given if a bound is farther from the elements of its region than this fraction of the region's width.
+#: The program warns if the distance between a bound of `where` and the elements of its region is larger than this
+#: fraction of the width of the region.
 _APART = 0.02
 
 
 def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, float], name: str) -> None:
-    """Warn if a bound cuts elements. Cut elements are not in the region, so the region is smaller than stated."""
+    """Warn if a bound of `where` cuts elements. The region does not contain cut elements, so it is too small."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     size = np.ptp(points, axis=0).max()
     inside = {
@@ -77,7 +80,7 @@ def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, 
         end = own.min() if first else own.max()
         if np.any(cut) and abs(end - bound) > _APART * np.ptp(own):
             warnings.warn(
-                f"{name}: {key} = {bound:g} cuts elements. Cut elements are not in it, so the region "
+                f"{name}: {key} = {bound:g} cuts elements. Cut elements are not in the region, so the region "
                 f"{'begins' if first else 'ends'} at {end:.4g} m. Put a layer of nodes at this bound (cells of the "
                 "mesh), or use an element set",
                 stacklevel=3,
@@ -85,19 +88,19 @@ def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, 
 
 
 def laws_of(law: Law, regions: tuple[Region, ...]) -> tuple[Law, ...]:
-    """Return the law of a scene, and the laws that replace this law in regions."""
+    """Return the law of a scene, and the complete laws that replace this law in regions."""
     return (*law.pieces(), *(region.law for region in regions if isinstance(region.law, Law)))
 
 
 def changed_numbers(region: Region) -> dict[str, object]:
-    """Return the names and values of the parameters of the scene's law that a region changes."""
+    """Return names and values of the parameters that a region changes in the law of the scene."""
     return region.law if isinstance(region.law, dict) else {}
 
 
 def set_by_regions(regions: tuple[Region, ...], name: str, number_of_elements: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return which elements (E,) get a parameter, such as `law.mu`, from a region, and the values (E,).
+    """Return whether a region changes a parameter, such as `law.mu`, in each element (E,), and the new values (E,).
 
-    A value is NaN if the law of the region does not have the parameter, or if it is not one number.
+    A value is NaN if the law of the region does not have the parameter, or if the parameter is not one number.
     """
     table, _, rest = name.partition(".")
     own, values = np.zeros(number_of_elements, bool), np.full(number_of_elements, np.nan)
@@ -118,10 +121,10 @@ def set_by_regions(regions: tuple[Region, ...], name: str, number_of_elements: i
 
 
 def law_number(law: Law, name: str) -> jax.Array:
-    """Return the value that a parameter, which a region changes, has in the law of the scene.
+    """Return the value that the parameter `name` has in the law of the scene. A region changes this parameter.
 
     Raises:
-        InputError: the law does not have this name, or it is the name of a list of parameters.
+        InputError: the law has no parameter with this name, or the name is that of a list of parameters.
     """
     value = names.get(law, name, refused_name(name))
     if isinstance(value, tuple):

@@ -1,6 +1,6 @@
-"""A scene: mesh, material law, supports, prescribed motions, loads, and further physics.
+"""A scene: mesh, material law, supports, prescribed motions, loads, and further physics objects.
 
-A physics is one object that adds forces or constraints, for example contact.
+"A physics" is one object that adds forces or constraints, for example a support or an obstacle.
 """
 
 from collections.abc import Mapping
@@ -23,13 +23,17 @@ from liverjax.physics.viscosity import Prony
 from liverjax.scenes.regions import Region
 from liverjax.scenes.springpots import SpringpotSeries
 
-#: Highest frequency [Hz] of harmonic motion: no wave in tissue is faster, and the square must not overflow.
+#: Maximum frequency [Hz] of harmonic motion. Tissue has no waves of higher frequency, and the squared frequency must
+#: not overflow.
 HIGHEST_HZ = 1e9
 
 
 @struct
 class Body:
-    """Mass and weight. Lumped mass of a node: its density times a quarter of the volume of its linear elements."""
+    """Mass and weight of the body.
+
+    In linear elements, the lumped mass of a node is its density times a quarter of the volume of its elements.
+    """
 
     density: Number = param(
         "kg/m^3", "mass per reference volume; one number, or one per node (V,)", above=0.0, typical=1060.0
@@ -95,7 +99,7 @@ class Solve:
 
 @struct
 class Scene:
-    """Input of `simulate`. Entries that are missing are None or empty; they need no computing time."""
+    """Input of `simulate`. Entries that are missing are None or empty. They need no computing time."""
 
     mesh: TetMesh = param("1", "the body")
     law: Law = param("1", "its hyperelastic law")
@@ -114,18 +118,18 @@ class Scene:
     )
 
     def named(self, section: str) -> list[int]:
-        """Return the indices in `physics` of the objects that scene files write as [[section]]."""
+        """Return the indices in `physics` of the objects whose table in scene files is [[section]]."""
         return [k for k, physics in enumerate(self.physics) if physics.section == section]
 
 
 def named_physics(scene: Scene) -> list[tuple[str, Physics]]:
-    """Return every further physics with its name in scene files, for example support.0."""
+    """Return each object in `scene.physics` (support, obstacle, …) with its name in scene files, e.g. support.0."""
     places = {k: f"{p.section}.{n}" for p in scene.physics for n, k in enumerate(scene.named(p.section))}
     return [(places[k], physics) for k, physics in enumerate(scene.physics)]
 
 
 def histories(scene: Scene) -> dict[str, object]:
-    """Return {name: entry} for all entries with a history: body, motions, loads, inlets, further physics."""
+    """Return the entries of a scene with a history, by name: body, motions, loads, inlets, supports and obstacles."""
     inlets = () if scene.porosity is None else scene.porosity.inlet
     parts: dict[str, object] = {"body": scene.body}
     for key, several in (("displaced", scene.displaced), ("traction", scene.traction), ("porosity.inlet", inlets)):
@@ -144,14 +148,14 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
             ``mesh.points``, ``region.0.law.mu``. A parameter of a law may have one value per element (E,).
 
     Raises:
-        InputError: the scene does not have one of the names.
+        InputError: the scene has no number with one of these names.
     """
     for name, value in values.items():
         if name == "mesh.points":
             scene = replace(scene, mesh=with_points(scene.mesh, value))
             continue
         if name.startswith("mesh."):
-            raise InputError(f"{_refusal(name)}: of a mesh, only all positions together can change: use mesh.points")
+            raise InputError(f"{_refusal(name)}; of a mesh, only all positions together can change: use mesh.points")
         old = names.get(scene, name, _refusal(name))
         like = (
             tuple(value) if isinstance(old, tuple) else jnp.array(value, float) if isinstance(old, jax.Array) else value
@@ -161,15 +165,16 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
 
 
 def numbers_at(scene: Scene, name: str) -> Any:
-    """Return the value of a scene for a dotted name: one number or an array.
+    """Return the value (one number or an array) that a scene has for a dotted name, for example `law.mu`.
 
     Raises:
-        InputError: the scene does not have the name, or its value is not a floating-point number.
+        InputError: the scene has no value with this name, or the value is not a floating-point number.
     """
     if name.startswith("mesh.") and not name.startswith("mesh.points"):
-        raise InputError(f"{_refusal(name)}: of a mesh, only all positions together can change: use mesh.points")
+        raise InputError(f"{_refusal(name)}; of a mesh, only all positions together can change: use mesh.points")
     found = names.get(scene, name, _refusal(name))
-    # A single whole number is allowed (`mu = 770`). An array of whole numbers contains node or element numbers.
+    # A single whole number is allowed (`mu = 770`). Arrays of whole numbers are not allowed: they are node or element
+    # numbers.
     if not all(isinstance(v, int) or np.issubdtype(np.asarray(v).dtype, np.floating) for v in jax.tree.leaves(found)):
         raise InputError(f"{_refusal(name)}: use a number, for example law.mu")
     return found if isinstance(found, tuple) else jnp.asarray(found, float)

@@ -22,12 +22,11 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def check_before_run(scene: Scene) -> None:
-    """Check choices, bounds of numbers, and nodes. Arrays inside jit are not checked, and nothing is compiled.
+    """Check choices, bounds of numbers, and nodes. Arrays inside jit are not checked. The check compiles nothing.
 
     Raises:
-        InputError: see `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume;
-            nodes that are fixed and moved along the same axis, fixed although a plate moves them, or in two oblique
-            planes.
+        InputError: see `check_choices` and `check_bounds`; a node is not in the mesh; an element is inverted; a node is
+            fixed and moved along the same axis, is fixed although a plate moves it, or slides in two oblique planes.
     """
     check_choices(scene)
     check_bounds(scene)
@@ -38,10 +37,11 @@ def check_before_run(scene: Scene) -> None:
 
 
 def check_time_and_mass(scene: Scene) -> None:
-    """Check that the scene has a time step and a mass if it needs them. Their values are not checked.
+    """Check that the scene has a time step and a mass if they are needed. Their values are not checked.
 
     Raises:
-        InputError: `dt` is missing with viscosity, porosity, a history or in dynamics; mass is missing in dynamics.
+        InputError: `dt` is missing, but viscosity, porosity, a history or dynamics needs it; or the mass is missing in
+            dynamics.
     """
     solve = scene.solve
     loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))
@@ -62,14 +62,14 @@ def check_time_and_mass(scene: Scene) -> None:
 
 
 def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
-    """Check that a run can begin with the numbers, nodes and positions of further physics. Not for use inside jit.
+    """Check that a run can begin with the objects in `scene.physics` (supports, obstacles, …). Not for use inside jit.
 
     Args:
         scene: `Scene`.
-        only: names of the physics to check, for example ``obstacle.0``. None means all.
+        only: names of the objects to check, for example ``obstacle.0``. If None, all are checked.
 
     Raises:
-        InputError: the message begins with the name of the physics.
+        InputError: an object has wrong numbers, nodes or positions. The message begins with the name of the object.
     """
     for name, physics in named_physics(scene):
         if only is None or name in only:
@@ -82,8 +82,8 @@ def check_scene(scene: Scene) -> None:
     """Check that a scene can be simulated, before anything is compiled. Not for use inside jit.
 
     Raises:
-        InputError: the mesh or the viscosity cannot be used; time step or mass is missing; conditions contradict each
-            other; the supports do not prevent rigid motions.
+        InputError: for example, a number is out of bounds, the mesh cannot be used, time step or mass is missing,
+            conditions contradict each other, or the supports do not prevent rigid motions.
     """
     check_choices(scene)
     check_numbers(scene)

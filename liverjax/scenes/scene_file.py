@@ -1,4 +1,4 @@
-"""Read scenes from TOML files. An unknown key is an error, and every number is checked."""
+"""Read scenes from TOML files. An unknown key is an error. All numbers are checked."""
 
 import dataclasses
 import tomllib
@@ -36,7 +36,7 @@ from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.scene_checks import check_scene
 from liverjax.scenes.springpots import SpringpotSeries
 
-#: Keys of a cylinder: the required ones, then the optional ones.
+#: Keys of a cylinder. The first three are required, the others are optional.
 _CYLINDER = ("radius", "height", "cell_size", "rim_cell", "rings", "match_area")
 _KEYS = {
     "mesh": ("file", "unit", "order", "is", "shape", "size", "cells", *_CYLINDER),
@@ -65,7 +65,7 @@ _KEYS = {
     for section in dict.fromkeys(p.section for p in NAMED)
 }
 _SECTIONS = ("mesh", "law", *list(_KEYS)[1:])
-#: Keys that select nodes or faces. They do not say what acts there.
+#: Keys that select nodes or faces. The other keys of a table define what acts on these nodes or faces.
 PLACE = {"where", "set"}
 
 
@@ -73,8 +73,8 @@ def load_scene(path: str | Path) -> Scene:
     """Read a scene from a TOML file. Paths in the file are relative to the folder of the file.
 
     Raises:
-        InputError: the file cannot be read; unknown or missing keys; values that cannot be used. All checks run before
-            anything is compiled.
+        InputError: the file cannot be read, a key is unknown or missing, or a value cannot be used. All checks run
+            before anything is compiled.
     """
     path = Path(path)
     try:
@@ -94,12 +94,12 @@ def load_scene(path: str | Path) -> Scene:
 
 
 def scene_from(content: Content, folder: Path = Path()) -> Scene:
-    """Make a scene from the content of a scene file, which is given as nested dictionaries."""
+    """Make a scene from the content of a scene file: nested dictionaries, lists and values."""
     _known("scene", content, _SECTIONS)
     content = _with_paths(content, folder)
     for name in ("mesh", "law"):
         if name not in content:
-            raise InputError(f"the scene has no [{name}]: add it")
+            raise InputError(f"the scene has no [{name}]: add this table")
     output_of(content)
     mesh = _mesh(_table("mesh", content["mesh"]), folder)
     prony = _section(content, "viscosity", _prony)
@@ -124,10 +124,10 @@ def scene_from(content: Content, folder: Path = Path()) -> Scene:
 
 
 def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
-    """Return the names of the fields in [output] of a scene file, and whether a table of reactions is written.
+    """Return two entries of [output] in a scene file: the names of the fields, and whether reactions are written.
 
     Raises:
-        InputError: unknown keys, or values of a wrong type.
+        InputError: a key is unknown, or a value has a wrong type.
     """
     table = _table("output", content.get("output", {}))
     names, reactions = table.get("fields", []), table.get("reactions", False)
@@ -139,9 +139,9 @@ def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
 
 
 def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
-    """Read the physics of all tables with a section in `liverjax.physics.registry`.
+    """Read the tables of all sections in `liverjax.physics.registry`, for example [[support]] and [[obstacle]].
 
-    Each table becomes the first kind of physics that has all its keys.
+    From each table, an object of the first class that has all keys of the table is made.
     """
     for section in dict.fromkeys(p.section for p in NAMED):
         for k, table in enumerate(_tables(content, section)):
@@ -156,14 +156,14 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
 
 
 def _of_two_kinds(name: str, given: set[str], kinds: list[set[str]]) -> str:
-    """Return the message for keys that are known but cannot be used together."""
+    """Return an error message for keys of a table that are known, but cannot be used together."""
     first = min((given - keys for keys in kinds), key=len)
     other = min((given - keys for keys in kinds if first <= keys), key=len, default=given)
-    return f"{name} has {', '.join(sorted(first))} together with {', '.join(sorted(other))}: remove one"
+    return f"{name} has {', '.join(sorted(first))} together with {', '.join(sorted(other))}: remove one of them"
 
 
 def _with_paths(content: object, folder: Path) -> Any:
-    """Add `folder` to all paths in the content: histories, surfaces and a reduced model."""
+    """Put `folder` before all paths in the content: histories, surfaces and a reduced model."""
     if isinstance(content, list):
         return [_with_paths(value, folder) for value in content]
     if not isinstance(content, dict):
@@ -206,7 +206,7 @@ def _number(name: str, value: object) -> float:
 
 def _numbers(name: str, value: object, length: int | None = None) -> np.ndarray:
     if not isinstance(value, list) or (length is not None and len(value) != length):
-        raise InputError(f"{name} = {value!r} must be a list of {length or 'some'} numbers: give one")
+        raise InputError(f"{name} = {value!r} must be a list of {length or 'some'} numbers: give such a list")
     return np.array([_number(name, v) for v in value])
 
 
@@ -241,7 +241,7 @@ def _linear_mesh(table: dict, folder: Path) -> TetMesh:
 
 
 def _cylinder(table: dict, scale: float) -> TetMesh:
-    """Make a cylinder. With optional keys the mesh is finer near its rims and rings."""
+    """Make the mesh of a cylinder. With the optional keys, the mesh is finer near its rims and rings."""
     for key in ("radius", "height", "cell_size"):
         if key not in table:
             raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")
@@ -259,7 +259,7 @@ def _law(value: object, where: str = "[law]") -> Law:
     made = []
     for table in tables:
         if not isinstance(table, dict) or "name" not in table:
-            raise InputError(where + ' needs name = "…": python -m liverjax laws lists them')
+            raise InputError(where + ' needs name = "…": python -m liverjax laws lists the names')
         if ".py:" in str(table["name"]):
             raise InputError(
                 f"{where} name = {table['name']!r}: a scene file can use only included laws (python -m liverjax laws "
@@ -291,8 +291,10 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
 
 
 def _law_of_region(name: str, given: Any) -> dict[str, object] | Law:
-    """Return a complete law if `given` has a name or is a list of laws. Otherwise return the parameters (dotted name ->
-    value) that differ from the law of the body."""
+    """Return a complete law if `given` has a name or is a list of laws.
+
+    Otherwise return the parameters that differ from the law of the body, by dotted name.
+    """
     if isinstance(given, list) or "name" in given:
         return _law(given, f"{name}: law")
     return dict(_dotted(f"{name} law", given))
@@ -361,13 +363,13 @@ def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
         return Inlet(nodes=nodes, pressure=_number(f"{name} pressure", table["pressure"]), **times)
     triangles = boundary.surface_of(mesh, nodes, table.get("set"))
     if not len(triangles):
-        raise InputError(f"{name} where contains nodes but no boundary triangle: enlarge it to a whole face")
+        raise InputError(f"{name} where contains nodes but no boundary triangle: enlarge the region to a whole face")
     flux = _number(f"{name} flux", table["flux"])
     return Inlet(triangles=node_numbers(triangles), flux=flux, **times)
 
 
 def _drained(mesh: TetMesh, given: Any) -> jax.Array:
-    """Return the nodes of one region of the boundary, or of all regions in a list."""
+    """Return the nodes of one region of the boundary, or those of all regions in a list."""
     if given == []:
         raise InputError("porosity.drained = [] selects no nodes: give [{z_max = 0.0}], or remove drained (sealed)")
     name = "porosity.drained"
@@ -392,7 +394,7 @@ def _read_body(table: dict) -> Body:
 
 
 def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, jax.Array]:
-    """Return times and values of the history of a table. They are empty if the table has no history."""
+    """Return times and values of the history in a table, by name, or an empty dictionary if there is no history."""
     if "history" not in table:
         return {}
     times, numbers = history.read_history(table["history"], name, forms)
@@ -435,7 +437,7 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
         raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
     triangles: Indices = boundary.surface_of(mesh, _nodes(mesh, name, table), table.get("set"))
     if len(triangles) == 0:
-        raise InputError(f"{name} where contains nodes but no boundary triangle: enlarge it to a whole face")
+        raise InputError(f"{name} where contains nodes but no boundary triangle: enlarge the region to a whole face")
     triangles = node_numbers(triangles)
     if "pressure" in table:
         return Traction(triangles=triangles, pressure=_number(f"{name} pressure", table["pressure"]), **given)

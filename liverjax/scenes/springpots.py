@@ -1,13 +1,13 @@
 """Springpots for harmonic motion: fractional models of soft tissue, relative to the stiffness of the law.
 
-A springpot has the complex modulus V (i omega)^alpha with a constant V. It lies between a spring (alpha = 0) and a
-dashpot (alpha = 1). With the stiffness G0 of the law, the model (see `SpringpotSeries`) is
+A springpot has the complex modulus V (i omega)^alpha, with a constant V, the angular frequency omega and the exponent
+alpha. It is between a spring (alpha = 0) and a dashpot (alpha = 1). With the stiffness G0 of the law, the model is
 
     G* / G0 = spring + sum_k 1 / ((i omega tau_k)^-alpha_k + 1 / limit_k).
 
-Special cases with one springpot: spring = 0 gives the springpot alone, and spring = 1 the fractional Kelvin-Voigt
-model. With a limit, a spring of stiffness limit_k G0 is in series with springpot k; this is the fractional Zener model
-(Bagley and Torvik 1983, J. Rheol. 27, 201).
+The parameters of springpot k are explained in `SpringpotSeries`. Special cases with one springpot: spring = 0 gives the
+springpot alone, and spring = 1 the fractional Kelvin-Voigt model. With a limit, a spring of stiffness limit_k G0 is in
+series with springpot k. This is the fractional Zener model (Bagley and Torvik 1983, J. Rheol. 27, 201).
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ from liverjax.physics.viscosity import PARTS, Prony, check_part
 
 @struct
 class SpringpotSeries:
-    """Springpots: complex modulus divided by the modulus of the law. Only for harmonic motion."""
+    """K springpots: their complex modulus, divided by the modulus of the law. Only for harmonic motion."""
 
     times: Any = param("s", "tau_k (K,): at omega = 1/tau_k a springpot is as stiff as the law", above=0.0)
     exponents: Any = param("1", "alpha_k (K,): 0 is a spring, 1 a dashpot", lower=0.0, upper=1.0)
@@ -42,11 +42,11 @@ class SpringpotSeries:
 
 
 def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) -> None:
-    """Check that springpots give a modulus. Not for use inside jit.
+    """Check that the springpots define a modulus. Not for use inside jit.
 
     Raises:
-        InputError: different lengths; values out of bounds; an unknown `part`, or one that the law does not have; a
-            viscosity in the same scene.
+        InputError: the lists differ in length, a value is out of bounds, `part` is unknown, the law does not have this
+            part, or the scene also has a viscosity.
     """
     if viscosity is not None:
         raise InputError("the scene has [viscosity] and [springpots]: remove one of them")
@@ -58,12 +58,12 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
 
 
 def series_at_rest(own: SpringpotSeries) -> Prony:
-    """Return a Prony series with a completely relaxed stress that is equal to the stress of the springpots at rest."""
+    """Return a Prony series whose completely relaxed stress is equal to the stress of the springpots at rest."""
     return Prony(ratios=1 - jnp.atleast_1d(own.spring), relaxation_times=jnp.ones(1), part=own.part)
 
 
 def springpot_factors(own: SpringpotSeries, omegas: jax.Array) -> jax.Array:
-    """Return the complex ratio G*/G0 (F,) at angular frequencies (F,) [rad/s]."""
+    """Return the complex ratios G*/G0 (F,) at F angular frequencies (F,) [rad/s]."""
     times, alpha = jnp.atleast_1d(own.times)[:, None], jnp.atleast_1d(own.exponents)[:, None]
     # (i omega tau)^-alpha has the phase -alpha pi/2.
     compliance = jnp.exp(-alpha * (jnp.log(omegas[None] * times) + 0.5j * jnp.pi))

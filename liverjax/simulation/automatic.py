@@ -1,11 +1,11 @@
-"""Choice of the linear solver for `linear_solver = "auto"`: a rule on size and stiffness, measured in `experiments/`.
+"""Choice of the linear solver for `linear_solver = "auto"`, from the size and the stiffness of the body.
 
 "auto" chooses a factorisation for a static body of at most 10,000 tetrahedra (a quadratic element counts as eight) in
 two cases. In the first case the bulk modulus is more than a thousand times the shear modulus. For at most 1,500
 tetrahedra, a ratio of a hundred is enough: in Newton's method the stiffness of such bodies has negative eigenvalues,
-and a factorisation can solve with them. In the second case the worst element is a sliver. A body is never factorised if
-it has friction, nodes that move together, follower pressures, or pressures as unknowns. In all other cases "auto"
-chooses conjugate gradients.
+and a factorisation can solve such systems. In the second case the worst element is a sliver. A body is never factorised
+if it has friction, nodes that move together, follower pressures, or pressures as unknowns. In all other cases "auto"
+chooses conjugate gradients. These limits were measured in `experiments/`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -26,7 +26,7 @@ SMALL, STIFFEST_OF_SMALL = 1500, 1e2
 
 
 def chosen(scene: Scene) -> Scene:
-    """Replace each "auto" of a scene by a choice: first the form of volume changes, then the linear solver."""
+    """Replace each "auto" in `scene.solve` by a choice: first the form of volume changes, then the linear solver."""
     solve = _with_form(scene).solve
     if solve.newton_iterations == 1:
         solve = replace(solve, newton="one_step")
@@ -62,7 +62,7 @@ def _with_form(scene: Scene) -> Scene:
 
 
 def linear_solver(scene: Scene) -> str:
-    """Return the linear solver for a scene, "cg" or "direct"; inside jit, grad or vmap "cg" (numbers unknown)."""
+    """Return the linear solver for a scene, "cg" or "direct". Inside jit, grad or vmap numbers are unknown: "cg"."""
     return "direct" if _may_factorise(scene) and (_is_stiff(scene) or _is_thin(scene)) else "cg"
 
 

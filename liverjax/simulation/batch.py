@@ -1,8 +1,8 @@
-"""Many runs of one scene, each with other numbers, in one compiled program on all devices of the process.
+"""Many runs of one scene with different parameters, in one compiled program on all devices of the process.
 
-Each run of the batch has one parameter set. On a CPU each device does one run after another. A vectorised step would be
-slower there, because it would wait for the slowest run in every loop. On a GPU each device does all of its runs at
-once.
+Each run of the batch has one parameter set. On a CPU each device does one run after another. Steps of several runs at
+once (vmap) would be slower on a CPU, because every loop would wait for the slowest run. On a GPU each device does all
+of its runs at once.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ STRATEGIES = ("map", "vmap")
 
 @struct
 class Batch:
-    """Results of the N runs of a batch. `result.status` is (N, T). A failed run does not change other runs."""
+    """Results of N runs of T steps. `result.status` has the shape (N, T). A failed run does not change other runs."""
 
     result: Result = param("1", "every field with a leading axis of N runs")
     reference: jax.Array | None = param(
@@ -54,9 +54,9 @@ def simulate_batch(
         devices: devices that share the runs; None: all devices of the process.
 
     Raises:
-        InputError: no parameters, different numbers of values, a name that the scene does not have, "vmap" of robust
-            steps on a CPU. Also if `simulate` would raise InputError for a parameter set; the message then begins with
-            the number of this set.
+        InputError: there are no parameters; the numbers of values differ; the scene does not have one of the names;
+            "vmap" is used with robust steps on a CPU. Also if `simulate` would raise InputError for a parameter set;
+            the message then begins with the number of this set.
     """
     devices = jax.local_devices() if devices is None else devices
     strategy = strategy_for(devices[0].platform) if strategy is None else strategy

@@ -35,9 +35,9 @@ from liverjax.simulation.run import Result
 LONGEST = 1.0
 #: No organ and no sample is shorter than this [m]. If metres are read as millimetres, a liver is 0.2 mm long.
 SHORTEST = 1e-3
-#: A displacement smaller than this fraction of the body's size counts as zero.
+#: A displacement that is not larger than this fraction of the body's size counts as zero.
 _ROUNDOFF = 1e-13
-#: Elements of a lower quality (see `qualities`) are slivers. Gradients in them are a hundred times less accurate.
+#: Elements with a quality (see `qualities`) below this value are slivers: gradients there are 100 times less accurate.
 SLIVER = 0.01
 #: Bounds of the volume ratio J. About four fifths of a soft tissue is fluid, so below `LEAST_J` even the solid part has
 #: too little space. `MOST_J` is 1/`LEAST_J`.
@@ -88,10 +88,10 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     said = said.format(*_pressure_errors(result))
     single = next((p.section for p in scene.physics if p.pulls_single_nodes()), None)
     if single is not None:
-        said += f". Forces of [[{single}]] at single nodes depend on the mesh, and this estimate does not contain that"
+        said += f". Forces of [[{single}]] at single nodes depend on the mesh; this estimate does not include that"
     if not np.all(np.asarray(result.mesh_error.found)):
         return (
-            f"{said}; at some steps the estimate was not found, or it inverts elements: the mesh is too coarse for a "
+            f"{said}; at some steps no estimate was found, or it inverts elements: the mesh is too coarse for a "
             "reliable estimate"
         )
     if error <= _SMALL * size:
@@ -100,7 +100,7 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
 
 
 def _pressure_errors(result: Result) -> tuple[str, str]:
-    """Return two additions to the sentence about the mesh error: what this error omits, and the error of pressures."""
+    """Return two additions to the sentence about the mesh error: what it omits, and the error of the pressures."""
     if result.pressure is None or result.mesh_error is None:
         return "", ""
     if result.mesh_error.pressure is None:
@@ -122,7 +122,7 @@ def cautions_of_mesh(mesh: TetMesh) -> list[str]:
     if doubled:
         said.append(
             f"{doubled} nodes have the same coordinates as another node: the body is not connected there; merge these "
-            "nodes if it should be connected"
+            "nodes if the body should be connected"
         )
     slivers = np.flatnonzero(quality < SLIVER)
     if len(slivers):
@@ -134,13 +134,13 @@ def cautions_of_mesh(mesh: TetMesh) -> list[str]:
     return said
 
 
-#: Above this K/mu, quadratic elements without pressure unknowns have errors of 10 % or more (see
-#: `experiments/TABLES.md`).
+#: If bulk modulus / shear modulus exceeds this value, quadratic elements without pressure unknowns have errors of 10 %
+#: or more (see `experiments/TABLES.md`).
 _LOCKING = 100.0
 
 
 def of_locking(scene: Scene) -> list[str]:
-    """Warn if quadratic elements lock although another form of the volume changes would not lock."""
+    """Warn if quadratic elements are too stiff (lock) although they would not be with volumetric = "mixed"."""
     if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
         return []
     try:
@@ -156,11 +156,11 @@ def of_locking(scene: Scene) -> list[str]:
     ]
 
 
-#: The steps may miss this fraction of a history without a warning: of its largest value, or of its integral over time.
+#: The program warns if the steps miss more than this fraction of a history's largest value or of its time integral.
 MISSED = 0.05
 
 
-#: After this many relaxation times, the stress of an initially unrelaxed body is relaxed to within 1 %.
+#: After this number of relaxation times, the stress of an initially unrelaxed body is relaxed to within 1 %.
 _RESTS = 5.0
 
 
@@ -176,7 +176,7 @@ def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
         return []
     return [
         f"the run begins with unrelaxed stress and lasts {lasts:.3g} s, but a relaxation time is {slowest:.3g} s, so "
-        "the body does not end in the given shape: remove viscosity, or run for longer"
+        "the body does not end in the given shape: remove viscosity, or simulate a longer time"
     ]
 
 
@@ -210,7 +210,7 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
 
 
 def _gives_no_energy(physics: Physics) -> bool:
-    """Whether a physics without a history has no stored energy at the beginning, and adds no energy to the body."""
+    """Whether an object of `scene.physics` without a history stores no energy at the beginning, and adds no energy."""
     if isinstance(physics, Obstacle):
         return not isinstance(physics, PressedObstacle) and physics.by is None
     if isinstance(physics, RigidPlate):
@@ -251,7 +251,7 @@ BETWEEN = 0.25
 
 
 def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: jax.Array) -> list[str]:
-    """Warn if the obstacle, displaced by `moved` (T, 3), overlaps the body between the contact points."""
+    """Warn if the obstacle, displaced by `moved` (T, 3) at T steps, overlaps the body between the contact points."""
     last = len(moved) - 1
     for k in {int(jnp.argmax(jnp.linalg.norm(moved, axis=1))), last}:
         x = jnp.asarray(result.positions[k], scene.mesh.points.dtype)
@@ -268,7 +268,7 @@ def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, m
     """Warn if the obstacle, displaced by `moved` (T + 1, 3) from step 0 on, passed the surface within a step."""
     ways, radius = np.linalg.norm(np.diff(moved, axis=0), axis=1), float(np.asarray(obstacle.radius))
     centres, axis = np.asarray(obstacle.position, float) + moved, np.asarray(obstacle.axis, float)
-    if obstacle.shape == "cylinder":  # it may slide along its axis
+    if obstacle.shape == "cylinder":  # a motion along its axis does not count
         ways = np.linalg.norm(np.diff(moved - np.outer(moved @ axis, axis), axis=0), axis=1)
     for k in np.flatnonzero(ways > radius) if radius > 0 else []:
         before = scene.mesh.points if k == 0 else result.positions[k - 1]
@@ -277,9 +277,9 @@ def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, m
         what = passed_in_step(obstacle.shape, axis, scene.mesh, both, centres[k : k + 2], triangles)
         if what:
             return (
-                f"{name} {what} the body in step {k + 1}, in which it moves {ways[k]:.2g} m, with a radius of "
-                f"{radius:.2g} m: it passed the surface between two steps, so contact forces are missing or have "
-                "the wrong direction; use more steps"
+                f"{name} {what} the body in step {k + 1}. It moves {ways[k]:.2g} m in this step, and its radius is "
+                f"{radius:.2g} m, so it passed the surface between two steps. Contact forces are missing or have the "
+                "wrong direction: use more steps"
             )
     return ""
 
@@ -321,12 +321,12 @@ def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
     ]
 
 
-#: A scheme counts as unstable if the pressure changes over one step are this many times the changes over two steps.
+#: The scheme counts as unstable if the pressure changes over one step, divided by those over two, exceed this value.
 ALTERNATING = 3.0
 
 
 def _of_pressures(scene: Scene, result: Result) -> list[str]:
-    """Warn if the pressure overshoots, if elements at drained nodes are too thick, or if "lagged" is unstable."""
+    """Warn if pressures overshoot, if elements at drained nodes are too thick, or if "lagged" steps are unstable."""
     if scene.porosity is None or result.pressure is None:
         return []
     P = np.asarray(result.pressure)
@@ -358,8 +358,9 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
     """Warn if the layer that drains in `seconds` is thinner than the elements there; `when` is the time in words.
 
     In a time t, a layer of the thickness sqrt(c t) drains, with the diffusivity c = kappa / (1/K_lim + 1/M) (Biot
-    1941). kappa is the permeability. M = K0 + 4/3 mu, with the bulk modulus K0 and the shear modulus mu. The pressure
-    is linear in an element, so an element thicker than this layer loses too much fluid.
+    1941). kappa is the permeability, and 1/K_lim is the storage (see `liverjax.physics.porosity`). M = K0 + 4/3 mu,
+    with the drained bulk modulus K0 and the shear modulus mu. The pressure is linear in an element, so an element
+    thicker than this layer loses too much fluid.
     """
     sponge = scene.porosity
     assert sponge is not None
@@ -382,13 +383,13 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
         return []
     return [
         f"{when.format(seconds)} the fluid leaves a layer of about {layer:.2g} m at the drained "
-        f"nodes, but the elements there are {height:.2g} m thick. They drain too much, so pressures and "
-        "displacements are wrong there (the mesh error shows by how much). Use thinner elements there, or no drained "
-        "nodes if nothing should flow"
+        f"nodes, but the elements there are {height:.2g} m thick. These elements lose too much fluid, so pressures "
+        "and displacements are wrong there (the mesh error shows by how much). Use thinner elements there, or no "
+        "drained nodes if nothing should flow"
     ]
 
 
-#: A larger overshoot, divided by the largest pressure of the step, leads to a warning.
+#: A warning is given if the overshoot, divided by the largest pressure of the step, exceeds this value.
 OVERSHOOT = 0.05
 #: Smallest dt for which the overshoot stays below `OVERSHOOT`, in units of h^2/(kappa M), for elements of height h,
 #: permeability kappa and longitudinal modulus M.
@@ -396,12 +397,13 @@ _FOLLOWS = 0.4
 
 
 def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
-    """Warn if pressures P (T, V) are higher beside the drained nodes than further inside.
+    """Warn if pressures P (T, V) at T steps are higher beside the drained nodes than further inside.
 
     The fluid volume that leaves an element within a step is distributed to all nodes of the element. In one dimension,
-    with dt < h^2/(4 kappa M), this couples neighbouring nodes more strongly than the flow between them. In three
-    dimensions the smallest dt without overshoot is about 1.5 times this bound. Such bounds are known since Vermeer and
-    Verruijt 1981 (Int. J. Numer. Anal. Methods Geomech. 5, 1).
+    with dt < h^2/(4 kappa M), this distribution couples neighbouring nodes more strongly than the flow does (h: height
+    of the elements, kappa: permeability, M: longitudinal modulus). In three dimensions the smallest dt without
+    overshoot is about 1.5 times this bound. Such bounds are known since Vermeer and Verruijt 1981 (Int. J. Numer. Anal.
+    Methods Geomech. 5, 1).
     """
     sponge, tets, V = scene.porosity, np.asarray(scene.mesh.tetrahedra), scene.mesh.number_of_vertices
     assert sponge is not None
@@ -439,7 +441,7 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
         return [f"{said}: use a larger dt, or thinner elements there"]
     flow = float(np.median(np.asarray(sponge.permeability)) * (np.median(np.asarray(sponge.bulk)) + 4 / 3 * shear))
     enough = _FOLLOWS * height**2 / flow
-    if float(scene.solve.dt) >= enough:  # then the steps are not the cause
+    if float(scene.solve.dt) >= enough:  # then short steps are not the cause
         return []
     return [
         f"{said}: use a dt of {enough:.2g} s or more, or elements of "
@@ -448,7 +450,7 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
 
 
 def _at_times(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (n, k) of a table of k columns at other times (n,), by linear interpolation."""
+    """Values (n, k) of a table with k columns at n other times, by linear interpolation."""
     columns = values.reshape(len(times), -1).T
     return np.stack([np.interp(at, times, column) for column in columns], axis=1)
 

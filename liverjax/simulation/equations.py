@@ -25,7 +25,7 @@ class State(NamedTuple):
     """The state between two steps."""
 
     x: jax.Array  # (V, 3) [m]
-    memories: tuple  # internal variables of each physics, in order; None if the physics has no such variables
+    memories: tuple  # internal variables of each physics object, in order; None if it has no such variables
 
 
 class Sizes(NamedTuple):
@@ -40,7 +40,7 @@ class Equations(NamedTuple):
 
     scene: Scene
     physics: tuple[Physics, ...]
-    acting: tuple  # force term of each physics in this step; None if nothing acts
+    acting: tuple  # force term of each physics object in this step; None if it has no force
     state: State  # state at the beginning of the step
     k: Number  # number of the step, from 1
     free: Free
@@ -150,9 +150,13 @@ def _with_tied(physics: tuple[Physics, ...], step: Step) -> Step:
 
 
 def force_sizes(scene: Scene) -> Sizes:
-    """Norms [N] of the nodal forces due to a unit strain along x and due to rounding, for runs without loads."""
+    """Norms [N] of the nodal forces due to a unit strain along x, and due to rounding of the positions.
+
+    With these norms, a body without loads converges in spite of roundoff.
+    """
     mesh = scene.mesh
-    # Unknown pressures do not follow from the positions, so the bulk modulus does not enlarge their rounding.
+    # If pressures are unknowns, they do not follow from the positions. Then the bulk modulus does not amplify the
+    # rounding of positions.
     law = isochoric_part(scene.law) if scene.solve.volumetric == "mixed" else law_at_rest(scene)
     dtype = mesh.points.dtype
     along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], dtype)
@@ -162,7 +166,8 @@ def force_sizes(scene: Scene) -> Sizes:
     def size(motion: jax.Array) -> jax.Array:
         return jnp.linalg.norm(mjed.linear_force(mesh, law, motion))
 
-    # One loop for both: the compiled program is a third as large as with two products with a linearised force.
+    # One loop computes both norms. With two products with a linearised force, the compiled program would be three times
+    # as large.
     unit_strain, roundoff = jax.lax.map(size, jnp.stack([along, rounded]))
     return Sizes(*jax.lax.stop_gradient((unit_strain, roundoff + _roundoff_at_nodes(scene, rounded))))
 
@@ -204,8 +209,9 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
     eps = float(np.finfo(np.float64).eps)
     free, noise = step.free, 20 * eps * sizes.unit_strain
     if scene.solve.volumetric == "mixed":
-        # Inertia counts only mu/K times in the tolerance (`Mixed.counted`). In short time steps its roundoff is larger.
-        # The roundoff is that of double precision, so that runs in single precision report if they stop above it.
+        # With mixed volumes, inertia forces have a weight of only about mu/K in the tolerance (`Mixed.counted`). In
+        # short time steps the roundoff of inertia exceeds this tolerance, so it is added. In single precision too, the
+        # roundoff of double precision is used, so that a run reports if it stops at a larger residual.
         noise = noise + ROUNDINGS * sizes.roundoff * (eps / float(jnp.finfo(state.x.dtype).eps))
     return Equations(
         scene=scene,
@@ -237,8 +243,7 @@ def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
     held, free = e.mesh.points, e.free
     q = q[: 3 * e.mesh.number_of_nodes]
     if e.moved is not None:
-        # Prescribed motion is linear within a step. If a history bends within the step, only its value at the end
-        # counts.
+        # Prescribed motion is linear within a step. Of a history, only the values at the ends of steps are used.
         before, after = e.moved
         held = held + before + s * (after - before)
     x = free.mask * jnp.stack(columns(q), axis=-1) + (1 - free.mask) * held
@@ -250,7 +255,7 @@ def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
 
 
 def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> jax.Array:
-    """Return the unknowns q of a step at positions x (V, 3): positions (3 V,), then pressures / `mixed.unit`.
+    """Return the unknowns q of a step at positions x (V, 3): positions (3 V,), then pressures divided by `mixed.unit`.
 
     Args:
         pressure: pressures of the vertices (V,) [Pa] if they are unknowns; default: pressures at the beginning of the
@@ -321,7 +326,7 @@ def flowing_pressure(e: Equations, q: jax.Array, s: Number, guess: Guess) -> jax
 def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Out-of-balance forces (3 V,) [N] at the end of a step, and residual (V,) of the pressure equation.
 
-    `pressure` (V,) [Pa] are the pressures at the end of the step.
+    `pressure` (V,) [Pa] contains the pressures at the end of the step.
     """
     volume: Any = e.volume
     f = forces(e, q, jnp.ones((), q.dtype), None, volume.in_force(pressure))
@@ -333,8 +338,8 @@ def residual(
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
     """Out-of-balance forces (3 V,) [N] at fraction s of the step, sum of the norms of all forces [N], and pressures.
 
-    With unknown pressures, the norms of all forces are weighted by about mu/K, and the isochoric forces count in full
-    (see `Mixed.counted`).
+    If pressures are unknowns, the weight of the isochoric forces in this sum is 1, and the weight of the other forces
+    is about mu/K, the shear modulus divided by the bulk modulus (see `Mixed.counted`).
     """
     f = forces(e, q, s, guess)
     at_work = jnp.linalg.norm(f.internal)
@@ -357,12 +362,12 @@ def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
     F = deformation_gradient(e.mesh, x)
     total = jnp.sum(e.mesh.weights * sum(solid.energy(F) for solid in e.solids))
     if e.volume is not None:
-        total = total + e.volume.energy(e.mesh, determinant(F))  # unknown pressures have their optimal values
+        total = total + e.volume.energy(e.mesh, determinant(F))  # with optimal pressures if pressures are unknowns
     return sum((a.energy_from(e.mesh, x, begin) for a in e.nodal), total)
 
 
 def advanced(e: Equations, end: End, by_end_forces: jax.Array | None = None) -> State:
-    """Return the state after an accepted step. `by_end_forces` (V, 3) is the result a of `reported_forces`."""
+    """Return the state after an accepted step. `by_end_forces` (V, 3) is the second result of `reported_forces`."""
     end = end._replace(by_end_forces=by_end_forces)
     each = zip(e.physics, e.state.memories, e.acting, strict=True)
     return State(end.x, tuple(p.advance(memory, acting, end) for p, memory, acting in each))

@@ -1,8 +1,9 @@
-"""Checkpoints of reverse-mode differentiation: the state and the root of every step are kept, or only a few states.
+"""Checkpoints of reverse-mode differentiation: the states and roots of all steps are kept, or only a few states.
 
 The root of a step is the solution of its equations (`liverjax.solvers.step_cutting` sets its name for JAX). Since the
 root is kept, the derivative evaluates forces and tangent at the root again, but does not repeat Newton's iterations. If
-fewer states than steps are kept (Griewank and Walther 2008, 12), the steps between two kept states run a second time.
+fewer states than steps are kept (Griewank and Walther 2008, chapter 12), the steps between two kept states run a second
+time.
 """
 
 import math
@@ -35,7 +36,7 @@ def number_kept(store: str | int, steps: int) -> int:
 
 
 def lengths(steps: int, kept: int) -> tuple[int, int, int]:
-    """Number of full segments, number of steps per segment, and number of steps in a shorter last segment."""
+    """Number of full segments, steps per segment, and steps in a shorter last segment (0 if there is none)."""
     length = math.ceil(steps / kept)
     return steps // length, length, steps % length
 
@@ -47,7 +48,7 @@ def one_step(step: Callable) -> Callable:
 
 
 def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
-    """Apply `step` (carry, k) for all `numbers` (T,). Return the stacked outputs without the carry.
+    """Apply `step` (carry, k) for all `numbers` (T,). Return the outputs of all steps, stacked, without the carry.
 
     Reverse mode keeps `kept` states.
     """

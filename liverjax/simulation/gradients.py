@@ -24,7 +24,7 @@ from liverjax.simulation.run import Result, simulate
 from liverjax.simulation.step import beginning
 
 MODES = ("reverse", "forward")
-#: Name of the positions at the beginning of the run. `with_parameters` explains the other names.
+#: This name in `at` means the positions at the beginning of the run. `with_parameters` explains the other names.
 START = "start"
 
 
@@ -58,7 +58,7 @@ def value_and_gradient(
             no memory for the steps, but costs one run per parameter.
 
     Raises:
-        InputError: unknown mode or store, no parameters, a name that the scene does not have; the errors of `simulate`.
+        InputError: `mode` or `store` is unknown; `at` is empty; the scene does not have a name; or as for `simulate`.
     """
     if mode not in MODES:
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
@@ -92,7 +92,7 @@ def _program_of_gradient(loss: Callable[[Result], jax.Array], store: str | int, 
     return jax.jit(both)
 
 
-#: Measured memory for the derivative of one step, without the tangents: numbers stored per integration point.
+#: Memory for the derivative of one step, without the tangents: measured count of numbers stored per integration point.
 _WORK = 440
 
 
@@ -115,7 +115,7 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     if kept >= steps:
         return steps * (state + root) + work
     count, length, rest = gradient_checkpoints.lengths(steps, kept)
-    # The term with 3/2 is the result of the run, in addition to the states. Not all of it exists at the same time.
+    # The term with 3/2 is the memory for the result of the run. Not all arrays of the result exist at the same time.
     return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 3 * steps * root // 2 + work
 
 

@@ -1,15 +1,16 @@
 """Estimate the error of a run due to the mesh. Each step needs one linearised solve in a richer space of functions.
 
-The richer space has quadratic functions for linear elements, and cubic functions for quadratic elements. It represents
-the positions of a step exactly. In the richer space these positions have out-of-balance forces r. With the tangent K,
-the forces give du = -K^-1 r, a displacement that the elements of the run cannot represent. The reactions change by
-their derivative along du. A second run, in the richer space, accompanies the first run. The second run has separate
-internal variables of viscosity, fluid and inertia. In the richer space a surface touches an obstacle at other points.
-With contact, the solves are therefore repeated until these contact points are found. With the contact points of the
-first solve only, the estimated error of the force on a flat punch was 25 %; the true error was 1 %.
+The richer space has quadratic functions for linear elements, and cubic functions for quadratic elements. It can
+represent the positions of a step exactly. In the richer space these positions are not in equilibrium: the
+out-of-balance forces are r. With the tangent stiffness K, the estimated change of the displacements is du = -K^-1 r.
+The reactions change by their derivative along du. A second run, in the richer space, is computed step by step together
+with the first run. The second run has separate internal variables of viscosity, fluid and inertia. In the richer space
+a surface touches an obstacle at other points than in the first run. With contact, the solves are therefore repeated
+until these contact points are found. With the contact points of the first solve only, the estimated error of the force
+on a flat punch was 25 %; the true error was 1 %.
 
-The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 times the error, at small and
-moderate strain. If du is added to the result, about a tenth of the error is left. For quadratic elements the cubic
+The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 times the true error, at small
+and moderate strain. If du is added to the result, about a tenth of the error is left. For quadratic elements the cubic
 functions contain about two thirds of the error, so du is multiplied by 1.5. The estimate does not contain the errors of
 the body's shape and of the time steps.
 
@@ -17,10 +18,10 @@ The pressures of a fluid are linear both in linear and in quadratic elements. Wi
 has the same elements on a finer mesh: every element is cut into eight (`liverjax.scenes.refined`). Then du is
 multiplied by 4/3, because an error of second order is a quarter as large on the finer mesh.
 
-In dynamics the errors of the steps add up. The richer run has consistent masses, so that the added functions have the
-same acceleration under gravity as the other functions. The inertia of the richer motion acts on all functions. Each
-step of the richer run is linearised at the positions before the step, moved by the motion of the first run in this
-step.
+In dynamics the errors of the steps accumulate. The richer run has consistent masses, so that the added functions have
+the same acceleration under gravity as the other functions. The inertia forces on all functions are those of the richer
+run. Each step of the richer run is linearised at its positions before the step plus the displacement of the first run
+in this step.
 """
 
 from collections.abc import Callable
@@ -61,32 +62,35 @@ from liverjax.solvers.krylov import true_residual
 from liverjax.solvers.point_matrix import restricted
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
-#: Tolerance of the linear solve. 1e-1 would find only a fifth of the error of a slender beam of quadratic elements.
+#: Relative tolerance of the linear solve. With 1e-1, the estimate would be a fifth of the error for a slender beam of
+#: quadratic elements.
 _TOLERANCE = 1e-2
-#: For each order of the elements: the tolerance if pressures are unknowns, and the factor that multiplies du.
+#: The keys are the order of the elements. _WITH_PRESSURES: tolerance of the linear solve if pressures are unknowns.
+#: _FACTOR: factor that multiplies du.
 _WITH_PRESSURES = {1: 1e-5, 2: 1e-4}
 _FACTOR = {1: 1.0, 2: 1.5}
-#: Error bar of a quantity, divided by the correction of this quantity.
+#: Error bar of a quantity, divided by the estimated change of this quantity.
 BAR = 1.25
-#: Up to this K/mu, quadratic elements without pressure unknowns do not lock (see `experiments/TABLES.md`).
+#: If bulk modulus / shear modulus is at most this value, quadratic elements without pressure unknowns are not too stiff
+#: (do not lock; see `experiments/TABLES.md`).
 _LOCKS = 10.0
-#: With contact: maximum number of linear solves in a step. The solves end if the residual, divided by the sum of the
-#: norms of all forces, is below the second number.
+#: With contact or a flowing fluid, the linear solve of a step is repeated. _ROUNDS: maximum number of solves. _SETTLED:
+#: with contact, the solves end if the residual, divided by the sum of the norms of all forces, is below this value.
 _ROUNDS, _SETTLED = 24, 1e-3
-#: With a flowing fluid the relative residual must be below this value. One solve is not exact, because it only
-#: approximates the inverse of the pressure matrix (`liverjax.physics.darcy.nearly_solved`).
+#: With a flowing fluid the solves end if this relative residual is below this value. One solve is not exact, because it
+#: only approximates the inverse of the pressure matrix (`liverjax.physics.darcy.nearly_solved`).
 _WITH_FLUID = 1e-5
-#: Maximum number of halvings of the change from such a solve if the full change increases the residual.
+#: The change from such a solve is halved if it does not reduce the residual, at most this number of times.
 _HALVINGS = 4
 
 
 @struct
 class MeshError:
-    """Estimated mesh error of a run: the change of the result on an infinitely fine mesh."""
+    """Estimated mesh error of a run of T steps: how the result would change on an infinitely fine mesh."""
 
     positions: jax.Array = param("m", "(T, V, 3)")
     reactions: jax.Array = param("N", "(T, V, 3)")
-    found: jax.Array = param("1", "(T,) whether the linear solve of the step converged to finite numbers")
+    found: jax.Array = param("1", "(T,) whether the solves of the step converged and no element was inverted")
     pressure: jax.Array | None = param(
         "Pa", "(T, V), of a fluid; None: no fluid, or the error of its pressures is unknown", default=None
     )
@@ -107,20 +111,22 @@ class MeshError:
 def mesh_error_of(
     scene: Scene, positions: jax.Array, reactions: jax.Array, pressure: jax.Array | None = None
 ) -> MeshError:
-    """Estimate the mesh error of a run from the reference positions. Node numbers must be known (not inside jit).
+    """Estimate the mesh error of a run that began at the reference positions.
+
+    The node numbers of the scene must be known (not inside jit), and the run must contain all steps.
 
     Args:
         scene: the scene that was run (`liverjax.simulation.run.prepared`).
-        positions, reactions: positions [m] and reactions [N] of the run (T, V, 3).
+        positions, reactions: positions [m] and reactions [N] of the run (T, V, 3) with T steps.
         pressure: pressures [Pa] of the run (T, V), if it has a fluid.
 
     Raises:
-        InputError: a scene with another mesh; the one-step scheme, which has an error in addition to the mesh error.
+        InputError: the scene has another mesh than the run, or uses the one-step scheme, which has an additional error.
     """
     if positions.shape[1] != scene.mesh.number_of_nodes:
         raise InputError(
-            f"result.positions has {positions.shape[1]} nodes, the scene {scene.mesh.number_of_nodes}: give the scene "
-            "of the run"
+            f"result.positions has {positions.shape[1]} nodes, but the scene has {scene.mesh.number_of_nodes}: give "
+            "the scene of the run"
         )
     return estimated_error(scene, richer(scene), positions, reactions, pressure)
 
@@ -130,10 +136,12 @@ class Richer:
     """A scene in the next richer space of functions."""
 
     scene: Scene = param("1", "the scene with richer elements, or on the refined mesh")
-    within: Within | None = param("1", "position of refined nodes in the mesh; None: richer elements", default=None)
+    within: Within | None = param(
+        "1", "positions of the refined nodes in the mesh; None: richer elements", default=None
+    )
 
     def padded(self, x: jax.Array) -> jax.Array:
-        """Represent positions x (V, 3) of the run in the richer space, as the same field."""
+        """Convert positions x (V, 3) of the run to the coefficients of the same field in the richer space."""
         rich = self.scene.mesh
         if self.within is not None:
             return self.within.field(x)
@@ -155,7 +163,7 @@ def richer(scene: Scene) -> Richer:
     """Create the scene in the next richer space of functions, for the error estimate.
 
     Raises:
-        InputError: the one-step scheme.
+        InputError: the scene uses the one-step scheme.
     """
     refuse(scene)
     if scene.porosity is not None and can_be_refined(scene):
@@ -167,11 +175,11 @@ def richer(scene: Scene) -> Richer:
 
 def _with_richer_elements(scene: Scene) -> Scene:
     rich = enriched(scene)
-    # Linear elements lock, so they are compared with elements that do not lock. At a low bulk modulus, these are
-    # quadratic elements without pressures, because pressures would be continuous where the material changes.
+    # Linear elements lock (are too stiff), so they are compared with elements that do not lock. If the bulk modulus is
+    # low, these are quadratic elements without pressures: pressures would be continuous where the material changes.
     of_linear = "auto" if _may_lock(scene) else "element"
     volumetric = of_linear if scene.mesh.order == 1 else scene.solve.volumetric
-    # Under an indenter the iterations for mixed cubic elements do not converge, so a chosen "direct" is kept.
+    # Under an indenter, iterative solves for cubic elements with pressures do not converge, so "direct" is kept.
     mixed = scene.mesh.order == 2 and scene.solve.volumetric == "mixed"
     linear = "direct" if mixed and scene.solve.linear_solver == "direct" else "cg"
     solve = replace(rich.solve, linear_solver=linear, robust="off", volumetric=volumetric)
@@ -183,7 +191,7 @@ def _with_richer_elements(scene: Scene) -> Scene:
 
 
 def _may_lock(scene: Scene) -> bool:
-    """Whether K is more than `_LOCKS` times mu in any material. Returns True if the moduli are unknown."""
+    """Whether the bulk modulus exceeds `_LOCKS` times the shear modulus in any material; True if moduli are unknown."""
     laws = list(laws_of(scene.law, scene.region))
     for region in scene.region:
         own = scene.law
@@ -203,17 +211,22 @@ def refuse(scene: Scene) -> None:
     """Check that the mesh error of a scene can be estimated.
 
     Raises:
-        InputError: the one-step scheme.
+        InputError: the scene uses the one-step scheme.
     """
     if scene.solve.newton == "one_step":
-        raise InputError("solve.newton = 'one_step' has an additional error: use newton = 'converged' for a mesh error")
+        raise InputError(
+            "solve.newton = 'one_step' has an additional error: use 'converged' to estimate the mesh error"
+        )
 
 
 @jax.jit
 def estimated_error(
     scene: Scene, rich: Richer, x: jax.Array, reactions: jax.Array, pressure: jax.Array | None = None
 ) -> MeshError:
-    """Estimate the mesh error from positions x, reactions (T, V, 3) and pressures (T, V); `rich` is `richer(scene)`."""
+    """Estimate the mesh error from positions x, reactions (T, V, 3) and pressures (T, V) of T steps.
+
+    `rich` is `richer(scene)`.
+    """
     sizes = force_sizes(rich.scene)
     numbers = jnp.arange(1, len(x) + 1, dtype=x.dtype)
     before = jnp.concatenate([scene.mesh.points[None], x[:-1]])
@@ -230,7 +243,8 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
     q = unknowns(e, rich.padded(x))
     begin = q
     if scene.solve.kind == "dynamic":
-        # Errors of a motion add up. So the richer run continues from its positions, with the run's motion in the step.
+        # In dynamics errors accumulate. So the solve begins at the richer run's positions before the step, plus the
+        # displacement of the run in this step.
         begin = q + unknowns(e, state.x) - unknowns(e, rich.padded(before))
     near, (dq, iterations, positive) = _found_near(scene, e, begin)
     f, along = jax.linearize(lambda q: forces(e, q, one), near)
@@ -244,27 +258,27 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
     change = {
         "positions": positions(e, q + dq, one)[: len(x)] - x,
         "reactions": rich.on_nodes(reaction, len(x)) - reactions,
-        # The nodes of the run are vertices of the refined mesh.
+        # The nodes of the run are the first vertices of the refined mesh.
         "pressure": None if pressure is None else end.pressure[: len(x)] - pressure,
     }
     by_end_forces = reported_forces(e, end.total, end.x)[1]
     return advanced(e, End(end.x, end.F, end.pressure), by_end_forces), (change, found)
 
 
-#: The change dq, the number of iterations, and whether the matrix was positive.
+#: Result of a linear solve: the change dq, the number of iterations, and whether the matrix was positive definite.
 _Solved = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _Solved]:
     """Return the unknowns at which the last linear solve begins, and the result of this solve.
 
-    Without contact there is one solve, from q. With contact, more solves are needed to find the contact points in the
-    richer space. A flowing fluid also needs more solves.
+    Without contact and without a flowing fluid, there is one solve, at q. With contact, more solves are needed to find
+    the contact points in the richer space. With a flowing fluid, more solves are needed because one solve is not exact.
     """
     one = jnp.ones((), q.dtype)
     tolerance = _TOLERANCE
     if e.volume is not None and e.volume.unknown:
-        # The solve starts at the pressures of the step's beginning, so its load is much larger than the mesh error.
+        # The solve starts at the pressures before the step, so its right-hand side is much larger than the mesh error.
         tolerance = _WITH_PRESSURES[scene.mesh.order]
 
     def solved(q: jax.Array) -> _Solved:
@@ -303,7 +317,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
 
 
 def _shortened(size: Callable[[jax.Array], jax.Array], q: jax.Array, dq: jax.Array) -> jax.Array:
-    """Return a factor t for which q + t dq has a smaller residual than q: 1, halved at most `_HALVINGS` times."""
+    """Return the step length t: 1, halved until q + t dq has a smaller residual than q, at most `_HALVINGS` times."""
     before = size(q)
 
     def go_on(t: jax.Array) -> jax.Array:

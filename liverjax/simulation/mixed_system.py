@@ -1,9 +1,9 @@
 """The mixed system of positions and nodal pressures: its assembly, and the elimination of the pressures.
 
-A physics with a stress that depends on the volume ratio of the elements has pressures at the nodes, and a pressure
-matrix. In a porous body the fluid flows, so this matrix couples the pressures of neighbours. If volume changes are
-averaged at the nodes, the matrix is diagonal. Columns (V,) are the x, y and z components of a nodal vector in separate
-arrays.
+A force term with a stress that depends on the volume ratio of the elements (`liverjax.physics.base.VolumeStress`) has
+pressures at the nodes, and a pressure matrix. In a porous body the fluid flows, so this matrix couples the pressures of
+neighbouring nodes. If volume changes are averaged at the nodes, the matrix is diagonal. Columns (V,) are the x, y and z
+components of a nodal vector in separate arrays.
 """
 
 from collections.abc import Sequence
@@ -38,11 +38,11 @@ def coupled(
 
     Args:
         K: stiffness blocks (E,) [N/m] at given pressure, for pairs of nodes.
-        own: 3 x 3 blocks of entries (V,) that force terms at nodes add to the diagonal, or None. An entry that is 0 is
-            None.
+        own: 3 x 3 blocks of entries (V,) that force terms at nodes add to the diagonal, or None. Entries that are 0 may
+            be None.
         F: deformation gradient at the end of the step.
         pressures: matrix of the pressure equation.
-        slope: derivative (E,) with respect to J of the volumetric strain that the pressures multiply.
+        slope: derivative (E,) of the volumetric strain, which is multiplied by the pressures, with respect to J.
     """
     q = [scale(slope * mesh.volumes / 4, g) for g in volume_gradients(mesh, F)]
     bordered = {}
@@ -52,7 +52,7 @@ def coupled(
     rows: block_matrix.Block = block_matrix.off_diagonal(mesh, bordered)
     rows = (*rows[:3], (*rows[3][:3], -pressures.rows[0][0]))
     sums = block_matrix.row_sums(rows)
-    # A translation causes no force, so in each row the entries of x add up to zero.
+    # A translation causes no force, so in each row the entries that multiply positions add up to 0.
     corner: Any = tuple(tuple(-sums[r][c] for c in range(3)) for r in range(3))
     corner = corner if own is None else block_matrix.added(corner, own)
     border = [-sums[3][c] for c in range(3)]
@@ -63,8 +63,8 @@ def coupled(
 def balances(
     mesh: TetMesh, A: block_matrix.BlockMatrix | PointMatrix, motion: Sequence[jax.Array]
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """Forces [N], as columns (V,), and change (V,) of the volume balance, due to the displacement `motion`. The
-    pressures stay constant."""
+    """Forces [N], as columns (V,), and change (V,) of the volume balance, due to the displacement `motion` at constant
+    pressures."""
     if isinstance(A, PointMatrix):
         return point_matrix.product(mesh, A, motion), -point_matrix.volume_changes(mesh, A, motion)
     *forces, balance = block_matrix.product(A, motion)
@@ -96,13 +96,13 @@ def pressure_change(
 def with_pressures(
     mesh: TetMesh, volume: Any, A: PointMatrix | block_matrix.BlockMatrix, both: Any
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """Forces, as columns (V,), and balance (V,) of the pressures times `volume.unit`, for a change `both`.
+    """Changes, due to `both`, of the forces, as columns (V,), and of the pressure equation (V,) times `volume.unit`.
 
-    `both` consists of the displacement as columns (V,), and of the pressures (V,) divided by `volume.unit`.
+    `both` contains the changes of the unknowns: positions as columns (V,), and pressures (V,) divided by `volume.unit`.
     """
     motion, dp = both
     if isinstance(A, block_matrix.BlockMatrix):
-        # In the coupled matrix positive pressures push inwards, and the balance has a minus sign.
+        # In the coupled matrix positive pressures push inwards, and the volume balance has a minus sign.
         every = block_matrix.product(A, (*motion, -volume.unit * dp))
         return every[:3], -volume.unit * every[3]
     forces, outwards = point_matrix.product(mesh, A, motion), pulled(mesh, A, volume.unit * dp)
@@ -133,8 +133,8 @@ def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: 
 def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> jax.Array:
     """Stiffness [Pa/m^3] of each integration point against a volume change, if nothing flows between elements.
 
-    C is the pressure matrix. The diagonal of C is divided among the elements in proportion to their volumes. The sum
-    over the elements is then not softer than the true matrix.
+    C is the pressure matrix. `mask` (V,) is 0 where the pressure is given, else 1. The diagonal of C is divided among
+    the elements in proportion to their volumes. The sum over the elements is then not softer than the true matrix.
     """
     share = integrals(mesh, jnp.ones_like(mesh.volumes)) * mask / C.diagonal[0][0]
     return interpolated(mesh, share) / mesh.weights
@@ -143,7 +143,8 @@ def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> 
 def undrained_diagonal(A: block_matrix.BlockMatrix, mask: Number) -> block_matrix.Block:
     """Diagonal blocks of K + G^T D^-1 G, with the diagonal D of the pressure matrix.
 
-    K is the stiffness at given pressures, and G couples pressures and positions. If nothing flows, this is exact.
+    K is the stiffness at given pressures, and G couples pressures and positions. `mask` (V,) is 0 where the pressure is
+    given, else 1. If nothing flows, the result is exact.
     """
     soft = -mask / A.diagonal[3][3]
     near = soft[A.nodes]

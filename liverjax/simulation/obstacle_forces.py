@@ -13,7 +13,7 @@ from liverjax.tensors.matrices import deformation_gradient
 
 
 class ObstacleForces(NamedTuple):
-    """Force, depth and displacement of each obstacle of a scene at every step, in the order of the obstacles."""
+    """Force, depth and displacement of each obstacle of a scene at each of T steps, in the order of the obstacles."""
 
     force: jax.Array  # (obstacles, T, 3) [N] force of the body on the obstacle
     depth: jax.Array  # (obstacles, T) [m] maximum depth of the surface in the obstacle

@@ -31,8 +31,8 @@ class Result:
     positions: jax.Array = param("m", "(T, V, 3)")
     reactions: jax.Array = param("N", "(T, V, 3), force of the supports on the body, 0 where nothing is prescribed")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
-    pressure: jax.Array | None = param("Pa", "(T, V), fluid pressure of a porous scene", default=None)
-    statistics: StepStatistics = param("1", "for each step: Newton and CG iterations, cuts, residual")
+    pressure: jax.Array | None = param("Pa", "(T, V), fluid pressure of a porous body", default=None)
+    statistics: StepStatistics = param("1", "for each step: numbers of iterations and cuts, residual")
     mesh_error: MeshError | None = param("1", "estimated mesh error; None: not estimated", default=None)
 
     def check(self) -> "Result":
@@ -85,7 +85,7 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
     first = equations(scene, start, numbers[0], sizes)
-    # In runs of several steps, derivatives use the coarse space of the first step. Only derivatives compute this space.
+    # In runs of several steps, solves for derivatives use the coarse space of the first step.
     kept, near = beginning(first, tangent_too=steps > 1)
     advance = _step_by_step(scene, sizes, report, near)
     return _result(scene, numbers, gradient_checkpoints.scan(advance, (start, kept), numbers, store))
@@ -181,7 +181,10 @@ def simulate_part(
 
 
 def prepared(scene: Scene) -> Scene:
-    """Prepare a scene for its run: one value of each number per element, a linear solver, the scene's precision.
+    """Prepare a scene for its run.
+
+    Each number gets one value per element, a linear solver is chosen, and numbers are converted to the scene's
+    precision. If the mesh of the scene is "loaded", the reference shape is computed.
 
     `simulate` calls this function. But inside `jax.jit` the numbers are unknown, so `linear_solver = "auto"` then means
     conjugate gradients. Call this function before `jax.jit` if a factorisation may be chosen.
@@ -202,8 +205,8 @@ def unloaded(scene: Scene) -> Unloaded:
     positions. In the reference shape the edges of these elements are straight.
 
     Raises:
-        InputError: in the same cases as `simulate`; a porous scene; no reference shape was found (inside jit, grad or
-            vmap the points are NaN instead).
+        InputError: in the same cases as `simulate`; the scene has a porous body or a rigid plate; no reference shape
+            was found (inside jit, grad or vmap the points are NaN instead).
     """
     found = unload(_ready(replace(scene, points_are="loaded")))
     whole = replace(scene, mesh=with_points(scene.mesh, found.scene.mesh.points), points_are="reference")

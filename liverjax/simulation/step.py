@@ -60,7 +60,7 @@ def problem_of(e: Equations) -> Problem:
         tangent=partial(_tangent, e, "true"),
         solve=partial(tangent.solve, e),
         preconditioner=partial(tangent.preconditioner, e),
-        # If nodes move together on circles, the tangent is that of small rotations, not the exact derivative.
+        # If nodes move together on circles, the tangent is not the exact derivative: it is valid for small rotations.
         adjoint=partial(adjoint, e) if e.conservative and not e.free.tied else None,
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
@@ -73,7 +73,7 @@ def problem_of(e: Equations) -> Problem:
 
 
 def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangent.Tangent | None]:
-    """Return an empty `Kept` for a run that begins with these equations, and the first tangent if `tangent_too`."""
+    """Return an empty `Kept` for a run that begins with `first`, and the first tangent (None unless `tangent_too`)."""
     method, q = problem_of(first), unknowns(first, first.state.x)
     kept = step_cutting.nothing_kept(method, q)
     if not tangent_too:
@@ -104,8 +104,8 @@ def _definite(
 
 
 def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
-    """Return the unknowns of the reference shape, and whether this is the first step and it begins at positions that
-    differ from the reference shape."""
+    """Return the unknowns of the reference shape, and a flag. The flag is true if this is the first step and it begins
+    at positions that differ from the reference shape."""
     points = e.mesh.points
     return unknowns(e, points), (e.k == 1) & jnp.any(e.free.vectors(e.state.x - points) != 0)
 
@@ -126,7 +126,7 @@ def step(
 ) -> tuple[State, jax.Array, StepStatistics, Kept]:
     """Solve a step. Return the next state, the reactions (V, 3) [N], statistics, and the tangent for the next step.
 
-    `kept` contains the tangent of the last step. Derivatives may use the coarse space of the tangent `near`.
+    `kept` contains the tangent of the last step. Solves for derivatives may use the coarse space of the tangent `near`.
     """
     scene, x, solve = e.scene, e.state.x, e.scene.solve
     options = StepOptions(
@@ -159,12 +159,14 @@ def adjoint(
     max_iterations: int,
     earlier: Earlier | None = None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve K x = b together with the pressures, for derivatives. Return x, the load (3 V,) and the residual / |b|.
+    """Solve K x = b together with the pressures, for derivatives.
+
+    Return x, the right-hand side, and the norm of the residual divided by the norm of the right-hand side.
 
     With a flowing fluid, x also contains the pressures of the fluid, and b contains forces and minus the balance of
-    volumes. In the returned load this balance is eliminated, and the residual is divided by the norm of this load.
-    Iterations begin with a combination of `earlier` solves if this reduces the residual. Follower loads are not
-    allowed.
+    volumes. The returned right-hand side (3 V,) is then what remains of b after the elimination of the pressures.
+    Otherwise it is b. Iterations begin with a combination of `earlier` solves if this reduces the residual. Follower
+    loads are not allowed.
     """
     volume = tangent.volume_with_pressures(e)
     flows = e.mixed is None and volume is not None and volume.flow is not None
@@ -198,15 +200,15 @@ def _with_flow(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Solve the equations of `adjoint` for the mixed system with a flowing fluid, by iterative refinement.
 
-    Displacements and pressures are refined together, so the solves for pressures are only as accurate as needed.
+    Displacements and pressures are refined together, so that solves for pressures with a low accuracy are enough.
     """
     volume: Any = tangent.volume_with_pressures(e)
     n, flow, (tolerance, max_iterations) = 3 * e.mesh.number_of_nodes, volume.flow, limits
     loose = flow._replace(tolerance=_INNER_PRESSURE)
-    given = (flow.mask - 1) * b[n:]  # the entries of the solution at given pressures
+    given = (flow.mask - 1) * b[n:]  # part of the solution: the entries where the pressure is given
 
     def left(x: jax.Array, P: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Out-of-balance forces after a change of pressures that balances the volumes, and this change."""
+        """Return the out-of-balance forces for x and P + dP, and dP, the change of P that balances the volumes."""
         motion = e.free.columns(block_matrix.columns(x))
         force, balance = mixed_system.balances(e.mesh, K.matrix, motion)
         balance = balance - b[n:] - darcy.flow_product(flow, P)

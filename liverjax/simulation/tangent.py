@@ -3,9 +3,9 @@
 The physics of the scene determine the method. Conjugate gradients solve symmetric systems, after nodal pressures are
 eliminated. BiCGSTAB solves two other kinds of systems: systems with follower loads or friction, which are not
 symmetric, and systems with pressures as unknowns, which have a non-symmetric preconditioner. The preconditioner
-consists of the inverse diagonal blocks. A coarse space, with few unknowns for motions of long wavelength, is added if
-these motions would need many iterations. Columns (V,) are the x, y and z components of a nodal vector in separate
-arrays. A flat vector (3 V,) contains the columns one after the other.
+consists of the inverse diagonal blocks of the stiffness. A coarse space, with few unknowns for motions of long
+wavelength, is added if these motions would need many iterations. Columns (V,) are the x, y and z components of a nodal
+vector in separate arrays. A flat vector (3 V,) contains the columns one after the other.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,7 +45,6 @@ from liverjax.tensors.matrices import (
 
 _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
-
 #: Kinds of element stiffness: the true stiffness, a stiffness without negative eigenvalues, and the stiffness of the
 #: book chapter, section 4.1.2 iii.
 KINDS = ("true", "projected", "regularised")
@@ -64,7 +63,7 @@ def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
 
 
 def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: Kind = "true") -> dict[tuple[int, int], Matrix]:
-    """Blocks K_ab [N/m] of corners 1 <= a <= b <= 3 at every integration point, for `pressure` (V,) [Pa] or None."""
+    """Stiffness K_ab [N/m] of corners 1 <= a <= b <= 3 at every integration point, at `pressure` (V,) [Pa] or None."""
     return _of_kind(kind, partial(_own_blocks, e, pressure, F))
 
 
@@ -91,19 +90,19 @@ def _own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str) -> dict[tuple
 def element_blocks(
     e: Equations, pressure: jax.Array | None, F: Matrix, kind: Kind = "true"
 ) -> dict[tuple[int, int], Matrix]:
-    """Blocks K_ab [N/m] of every linear element for the node pairs of `PAIRS`, at `pressure` (V,) [Pa] or None."""
+    """Stiffness K_ab [N/m] of every linear element for the node pairs of `PAIRS`, at `pressure` (V,) [Pa] or None."""
     full = mjed.all_blocks(own_blocks(e, pressure, F, kind))
     return {(a, b): full[a][b] for a, b in PAIRS}
 
 
 def stiffness(e: Equations, pressure: jax.Array | None, x: jax.Array, kind: Kind = "true") -> BlockMatrix:
-    """Derivative of element and nodal forces at positions x (V, 3) [m], at `pressure` (V,) [Pa] or None."""
+    """Stiffness matrix of the elements and nodes at positions x (V, 3) [m], at `pressure` (V,) [Pa] or None."""
     K = element_blocks(e, pressure, deformation_gradient(e.mesh, x), kind)
     return block_matrix.force_matrix(e.mesh, K, node_blocks(e))
 
 
 def node_blocks(e: Equations) -> Block | None:
-    """Sum of the diagonal blocks (V,) [N/m] of all force terms at nodes, or None if there are no such blocks."""
+    """Sum of the diagonal stiffness blocks (V,) [N/m] of all force terms at nodes; None if there are none."""
     total: Block | None = None
     for a in e.nodal:
         own = a.stiffness()
@@ -113,7 +112,7 @@ def node_blocks(e: Equations) -> Block | None:
 
 
 def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Between, ...]:
-    """Stiffness of elements between nodes, and losses of stiffness (`GivesWay`), of all force terms at nodes."""
+    """Stiffness between nodes (springs, contact, …), and its reduction (`GivesWay`), of all force terms at nodes."""
 
     def of(kind: str) -> tuple[Between, ...]:
         found: list[Between | None] = []
@@ -126,7 +125,7 @@ def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Betwee
 
 
 def _symmetric(e: Equations, more: tuple[Between, ...]) -> tuple[Attached, ...]:
-    """Symmetric part of the elements between nodes, for a preconditioner. Friction has a non-symmetric stiffness."""
+    """Symmetric parts of the `Attached` matrices in `more`, for a preconditioner. Friction is not symmetric."""
     elements = tuple(own for own in more if isinstance(own, Attached))
     return elements if e.conservative else tuple(attached.symmetric_part(own) for own in elements)
 
@@ -149,7 +148,7 @@ def volume_with_pressures(e: Equations) -> VolumeStress | None:
 
 
 class Tangent(NamedTuple):
-    """A tangent with its preconditioner. It is assembled at some positions and used for iterations near them."""
+    """A tangent with its preconditioner. The tangent is assembled at some positions and used for iterates near them."""
 
     matrix: BlockMatrix | PointMatrix
     inverse: Inverses  # inverses of the diagonal blocks of the matrix
@@ -157,8 +156,8 @@ class Tangent(NamedTuple):
     slow: Coarse
     x: jax.Array | None  # (V, 3) positions of the assembly, for non-conservative forces
     s: Any  # fraction of the step at the assembly
-    follows: jax.Array | None  # 1 if K contains the tangent of these forces, 0 if K has no negative eigenvalues
-    attached: tuple[Between, ...] = ()  # elements between nodes, not in the matrix
+    follows: jax.Array | None  # 1 if K contains the tangent of non-conservative forces, else 0
+    attached: tuple[Between, ...] = ()  # stiffness between nodes that is not in the matrix
     pressures: Coarse | None = None  # coarse space of pressure unknowns in thin elements
     #: Whether `solve` eliminates pressure unknowns first; None: never.
     eliminates: jax.Array | None = None
@@ -172,7 +171,7 @@ def tangent(
     near: tuple[Any, Tangent] | None = None,
     kind: Kind = "true",
 ) -> Tangent:
-    """Derivative of the forces at positions x (V, 3) [m], at fraction s of the step. JAX does not differentiate it.
+    """Derivative of the forces at positions x (V, 3) [m], at fraction s of the step. JAX treats it as a constant.
 
     `pressure` (V,) [Pa] is the pressure at the nodes, or None. `near` is a flag and a tangent. If the flag is true, the
     coarse space of this tangent is used. `kind` is a `Kind`.
@@ -211,7 +210,7 @@ def eliminates_pressures(e: Equations) -> bool:
 
 
 def _thin(e: Equations) -> bool:
-    """Whether the pressure unknowns get a coarse space: in linear elements, if some elements are thin.
+    """Whether a coarse space of the pressure unknowns is made: true for linear elements if some elements are thin.
 
     In strongly compressed quadratic elements a coarse space would increase the number of iterations.
     """
@@ -240,7 +239,8 @@ def _true(kind: Kind, dtype: Any) -> jax.Array:
     return jnp.asarray(kind == "true" if isinstance(kind, str) else ~kind[1], dtype)
 
 
-#: Matrix, inverse and vertices of a `Tangent`, the matrix for its coarse space, and elements between nodes.
+#: The fields `matrix`, `inverse` and `vertices` of a `Tangent`, the matrix from which its coarse space is made, and the
+#: stiffness between nodes that is not in the matrix.
 _Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Between, ...]]
 
 # The functions below are called several times in a compiled program. With jit, JAX evaluates them only once.
@@ -295,7 +295,7 @@ def _coarse(e: Equations, A: BlockMatrix) -> Coarse:
 
 
 def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number, kind: Kind) -> _Assembled:
-    """Tangent of quadratic elements: blocks at the integration points, and a preconditioner with two levels."""
+    """Tangent of quadratic elements: stiffness blocks at the integration points, and a two-level preconditioner."""
     mesh, volume = e.mesh, volume_with_pressures(e)
     F = deformation_gradient(mesh, x)
     A = PointMatrix(stored(own_blocks(e, pressure, F, kind)), node_blocks(e), None, None)
@@ -374,7 +374,7 @@ def _motions(e: Equations, K: Tangent) -> Callable:
 
 def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[jax.Array], jax.Array]:
     """Preconditioner as a function of flat vectors, made from `motions`, the preconditioner of the displacements for
-    columns (V,). Pressures that are unknowns belong to the flat vectors."""
+    columns (V,). If pressures are unknowns, the flat vectors contain them."""
     if e.mixed is None:
         return lambda r: flat_free(e, motions(block_matrix.columns(r)))
     volume, n = e.mixed, 3 * e.mesh.number_of_nodes
@@ -404,7 +404,7 @@ def flat_free(e: Equations, columns: Any) -> jax.Array:
 def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Array], jax.Array]:
     """Return the product with K, as a function of flat vectors (3 V,).
 
-    If `exactly` is false, pressures that depend on the positions are approximate.
+    If `exactly` is false, pressures that depend on the positions are computed approximately.
     """
     A, volume, n = K.matrix, volume_with_pressures(e), 3 * e.mesh.number_of_nodes
 
@@ -429,7 +429,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 def with_nodal_products(
     e: Equations, K: Tangent, motion: Sequence[jax.Array], force: Sequence[jax.Array]
 ) -> tuple[jax.Array, ...]:
-    """Add to `force` the forces of elements between nodes and of follower loads due to `motion`, all as columns."""
+    """Add to `force` the forces that `motion` causes in `K.attached` and in follower loads. All are columns (V,)."""
     for own in K.attached:
         force = block_matrix.sums(force, attached.product(own, motion))
     following = [a for a in e.nodal if not a.conservative]
@@ -444,7 +444,7 @@ def with_nodal_products(
 def solve(
     e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve K dq = b. Return dq, the number of iterations (0 for a factorisation), and whether K seems positive."""
+    """Solve K dq = b. Return dq, the number of iterations (0: factorisation), and whether K seems positive definite."""
     if e.scene.solve.linear_solver == "direct":
         dq = factorised_solution(e, K, b)
         # With pressure unknowns the matrix always has negative eigenvalues.
@@ -461,7 +461,7 @@ def solve(
 def _one_of_both(
     e: Equations, K: Tangent, flag: jax.Array, b: jax.Array, limits: tuple[Number, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve K dq = b, with pressures eliminated if `flag` is true. The unused solve has the load 0 and ends at once."""
+    """Solve K dq = b, with pressures eliminated if `flag` is true. In the unused solve, b is 0 (no iterations)."""
     n, A, motions = 3 * e.mesh.number_of_nodes, K.matrix, _motions(e, K)
     assert isinstance(A, PointMatrix)
 
@@ -481,9 +481,10 @@ def _one_of_both(
 
 
 def factorised_solution(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
-    """Solve K dq = b by a factorisation. With pressures the matrix is coupled, and b may contain pressure entries."""
+    """Solve K dq = b by a factorisation. If pressures are unknowns or depend on the positions, K couples them with the
+    displacements. b may then also contain the right-hand sides of the pressure equations."""
     n, volume, nothing = 3 * e.mesh.number_of_nodes, volume_with_pressures(e), jnp.ones(0)
-    # In the factorised matrix positive pressures push inwards, and the balance has a minus sign.
+    # In the factorised matrix positive pressures push inwards, and the volume balance has a minus sign.
     unit = 1.0 if e.mixed is None else -e.mixed.unit
     free, load, balance = e.free.mask.T, b[:n].reshape(3, -1), b[n:] / unit
     if isinstance(K.matrix, PointMatrix):

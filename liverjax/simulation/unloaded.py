@@ -3,8 +3,8 @@
 The unknowns are the displacements u. The vertices of the reference shape are X = x - u, with the given positions x. In
 the reference shape quadratic elements have straight edges, so the edge middles follow from the vertices. The
 displacements of the edge middles are unknowns, too. A body with the reference shape X must be in equilibrium at X + u.
-For small u the derivative of the out-of-balance forces is the stiffness K. So Newton's method with BiCGSTAB uses the
-preconditioner of K.
+For small u the derivative of the out-of-balance forces with respect to u is the stiffness matrix K. So Newton's method
+with BiCGSTAB uses the preconditioner of K.
 
 Source: Govindjee and Mihalic 1996, "Computational methods for inverse finite elastostatics". This module solves the
 same problem with the equations of the forward run.
@@ -30,7 +30,7 @@ from liverjax.simulation.equations import Equations, Sizes, equations, force_siz
 from liverjax.solvers.block_matrix import columns, flat
 from liverjax.solvers.newton import NewtonOptions, newton_root
 
-#: A Newton step that is too long is halved. Only the last linear solve needs high accuracy.
+#: A Newton step that does not reduce the residual is halved. Only the last linear solve needs high accuracy.
 _OPTIONS = NewtonOptions(max_iterations=50, linear_tolerance=1e-2, max_halvings=12, symmetric=False)
 
 
@@ -119,8 +119,8 @@ def _reference_shape(mesh: TetMesh, given: jax.Array, e: Equations, z: jax.Array
 
 
 def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
-    """Return the equations of the body with the reference shape that belongs to z, and the unknowns of the loaded
-    body."""
+    """Return the equations of the body with the reference shape that follows from the unknowns z, and the unknowns of
+    the loaded body."""
     n = 3 * scene.mesh.number_of_nodes
     still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)
     mesh = _reference_shape(scene.mesh, given, still, z)

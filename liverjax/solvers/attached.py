@@ -15,12 +15,12 @@ from liverjax.tensors.places import given, taken
 class Attached(NamedTuple):
     """Stiffness matrices of m additional elements with n nodes each."""
 
-    nodes: jax.Array  # (n, m)
+    nodes: jax.Array  # (n, m) node numbers
     blocks: jax.Array  # (n, 3, n, 3, m) [N/m], symmetric unless there is friction
 
 
 class GivesWay(NamedTuple):
-    """Rank-one change -h h^T / size of a stiffness by an eliminated unknown, e.g. the displacement of an obstacle."""
+    """Rank-one change -h h^T / size of a stiffness due to an eliminated unknown (e.g. motion of an obstacle)."""
 
     h: jax.Array  # (V, 3) [N/m] forces on the nodes per unit of this unknown
     size: jax.Array  # () [N/m] stiffness of this unknown if the nodes do not move
@@ -29,7 +29,7 @@ class GivesWay(NamedTuple):
 class Masses(NamedTuple):
     """For each element: the consistent minus the lumped mass matrix, or this difference times k/dt^2.
 
-    The product with k/dt^2 is its term in the effective stiffness of a time step (k of `liverjax.physics.inertia`).
+    The difference times k/dt^2 is a term of the effective stiffness of a time step (k: see `liverjax.physics.inertia`).
     """
 
     nodes: jax.Array  # (n, E)
@@ -78,7 +78,7 @@ def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
 
 
 def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -> BlockMatrix:
-    """Add the blocks of the elements to the matrix of the vertices, for vertices that are neighbours in the body."""
+    """Add the blocks `attached` to the vertex matrix A, except blocks between vertices that are no neighbours."""
     if not attached:
         return A
     rows = jnp.stack([jnp.stack(row[:3]) for row in A.rows[:3]])
@@ -96,7 +96,7 @@ def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -
 
 
 def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
-    """Restrict the elements to motions that are linear along edges: a midside node moves by the mean of its edge."""
+    """Restrict A to motions that are linear along edges: the motion of a midside node is the mean of both ends."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     edge = jnp.clip(A.nodes - V, 0, low.shape[0] - 1)
     is_vertex = A.nodes < V
@@ -107,7 +107,7 @@ def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
 
 
 def symmetric_part(A: Attached) -> Attached:
-    """Replace the matrix of each element by its symmetric part."""
+    """Replace the stiffness matrix of each additional element by its symmetric part."""
     return Attached(A.nodes, 0.5 * (A.blocks + jnp.transpose(A.blocks, (2, 3, 0, 1, 4))))
 
 

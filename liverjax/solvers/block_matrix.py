@@ -1,8 +1,9 @@
 """Symmetric block matrices with one block for each pair of neighbouring nodes, assembled from element blocks.
 
 All rows are padded to one length. Every row stores the numbers of its neighbours, so a matrix-vector product needs no
-search for column indices. The block of each edge is added only once. Forces do not change under translation, so a
-diagonal block is minus the sum of the other blocks in its row. The caller adds other terms of the diagonal.
+search for column indices. The block of each edge is assembled only once, for both nodes. Forces do not change under
+translation, so a diagonal block is minus the sum of the other blocks in its row. The caller adds other terms of the
+diagonal.
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,7 +23,7 @@ Block = tuple[tuple[Any, ...], ...]
 
 
 class BlockMatrix(NamedTuple):
-    """A symmetric matrix (V m, V m) of m x m blocks; each entry of a block is an array over the nodes."""
+    """A symmetric matrix (V m, V m) of m x m blocks for V nodes. Each entry of a block is an array over the nodes."""
 
     rows: Block  # arrays (W, V): blocks between each node and its W neighbours
     diagonal: Block  # arrays (V,)
@@ -30,7 +31,7 @@ class BlockMatrix(NamedTuple):
 
 
 def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
-    """Assemble the blocks between nodes and their neighbours, m x m arrays (W, V).
+    """Assemble the blocks between nodes and their W neighbours: m x m arrays (W, V).
 
     Each block is the sum of the element blocks of `PAIRS`, m x m arrays (E,). An entry that is None in all element
     blocks stays None.
@@ -90,7 +91,7 @@ def added(a: Block, b: Block) -> Block:
 
 
 def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None = None) -> Block:
-    """Invert the 3 x 3 diagonal blocks. Directions with `mask` (V, 3) equal to 0 get unit rows.
+    """Invert the 3 x 3 diagonal blocks. In directions with `mask` (V, 3) equal to 0, rows are those of the unit matrix.
 
     If a block is not positive definite, its mean absolute diagonal entry is inverted instead. `normals` (V, 3) are unit
     vectors or 0. Nodes do not move along their normals. So the coupling of a block with the normal direction is
@@ -115,7 +116,7 @@ def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None =
 
 
 def _across(A: Block, normals: jax.Array) -> Block:
-    """Return (I - n n^T) A (I - n n^T) + mean n n^T, with the mean of the diagonal of A."""
+    """Return (I - n n^T) A (I - n n^T) + mean n n^T, with the normals n and the mean of the diagonal of A."""
     n = normals.T
     mean = (A[0][0] + A[1][1] + A[2][2]) / 3
     An = [sum(A[r][c] * n[c] for c in range(3)) for r in range(3)]

@@ -1,7 +1,7 @@
 """Dense inverse blocks for clusters of near nodes: a part of the preconditioner for meshes with thin cells.
 
-In a thin cell, nodes are coupled much more strongly through the thickness than along the cell. Block-Jacobi spreads a
-motion through the thickness by only one node per iteration. So each cluster of near nodes
+In a thin cell, nodes are coupled much more strongly through the thickness than along the cell. In one iteration of
+block-Jacobi, a motion spreads through the thickness by only one node. So each cluster of near nodes
 (`liverjax.mesh.adjacency.Clusters`) is treated as one block.
 """
 
@@ -18,14 +18,14 @@ from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.tensors.places import given, taken
 
-#: Number of blocks between nodes that are computed at the same time, for quadratic elements.
+#: Number of stiffness blocks that are computed at the same time, for quadratic elements.
 _AT_ONCE = 2048
 
 
 class Inverses(NamedTuple):
-    """Inverse blocks of single nodes (0 for nodes in clusters), and of clusters of M nodes."""
+    """Inverse blocks of single nodes (0 for nodes in clusters), and of G clusters of at most M nodes."""
 
-    nodes: Block  # 3 x 3 of (V,)
+    nodes: Block  # 3 x 3 arrays (V,)
     clusters: jax.Array | None = None  # (G, 3 M, 3 M)
 
 
@@ -38,7 +38,7 @@ def inverses(
 
     Args:
         clusters: clusters of the mesh, or None if the mesh has no clusters.
-        entries: blocks (n, 3, 3) of the matrix, one for each entry of `clusters.sources`.
+        entries: blocks (n, 3, 3) of the matrix, one for each of the n entries of `clusters.sources`.
         diagonal: diagonal blocks of the matrix, 3 x 3 arrays (V,).
         mask: (V, 3) 1 for free directions, else 0.
         single: inverse blocks of single nodes, 3 x 3 arrays (V,).
@@ -75,7 +75,7 @@ def smoothed(clusters: Clusters | None, A: Inverses, columns: Sequence[jax.Array
 
 
 def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) of a matrix of the vertices, one for each entry of `clusters.sources`."""
+    """Blocks (n, 3, 3) of the matrix A of the vertices: one for each of the n entries of `clusters.sources`."""
     if clusters is None:
         return None
     slots = taken(edge_slots, clusters.sources[0])
@@ -84,7 +84,7 @@ def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) ->
 
 
 def of_points(clusters: Clusters | None, order: int, A: PointMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) of the matrix between two shape functions a and b, one for each entry of `clusters.sources`.
+    """Blocks (n, 3, 3) of the matrix between two shape functions a and b, for the n entries of `clusters.sources`.
 
     A block is the sum of c_ak K_kl c_bl over the integration points of the element and over k and l. c_ak is the
     derivative of function a with respect to the barycentric coordinate k, minus its derivative with respect to

@@ -74,7 +74,7 @@ def _filled(blocks: Block, like: jax.Array) -> jax.Array:
 
 
 def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
-    """Matrix (size, size) with the 3 x 3 block n n^T of every node (normal n), in the order of the unknowns."""
+    """Matrix (size, size) with the 3 x 3 block n n^T of every node (unit normal n), in the order of the unknowns."""
     import scipy.sparse  # slow to import (a fifth of the package's time), so it is imported only where it is used
 
     number, own = len(normals), np.arange(len(normals))
@@ -175,7 +175,8 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
 def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: tuple) -> np.ndarray:
     """Solve (A - H S^-1 H^T) x = b (n,). x is 0 where `free` (n,) is 0. `ways` contains H and the diagonal of S.
 
-    `along` contains the normals (or None) and a stiffness. x is 0 along the normals. The stiffness replaces A there.
+    `along` contains the normals (or None) and a stiffness. x is 0 along the normals, and the stiffness replaces the
+    entries of A in these directions.
     """
     import scipy.sparse.linalg
 

@@ -42,7 +42,7 @@ def conjugate_gradients(
 
     def step(c):
         x, r, p, rz_before, k, _ = c
-        z = precondition(r)  # the only call, so that the compiled program contains it once
+        z = precondition(r)  # the only call of the preconditioner, so that it is compiled once
         rz = jnp.vdot(r, z)
         p = z + rz / rz_before * p
         Ap = matvec(p)
@@ -129,21 +129,22 @@ def stabilised_biconjugate_gradients(
     return x, LinearStatistics(k, true_residual(matvec, b, x), jnp.array(True))
 
 
-#: EARLIER: number of earlier solves that are kept to compute the starting vector of a solve. An earlier load is skipped
-#: if newer loads represent this load up to the fraction _NEW of its norm, because solutions are not more accurate.
+#: EARLIER: number of earlier solves that are kept to compute the starting vector of a solve. _NEW: an earlier
+#: right-hand side is skipped if newer ones represent it with a relative error below _NEW, because solutions are not
+#: more accurate.
 EARLIER, _NEW = 6, 1e-7
 
 
 class Earlier(NamedTuple):
-    """Loads (right-hand sides) and solutions of earlier solves, the latest first. Missing solves are zeros."""
+    """Right-hand sides (`loads`) and solutions of earlier solves, the latest first. Missing solves are zeros."""
 
-    loads: jax.Array  # (EARLIER, n)
-    solutions: jax.Array  # (EARLIER, m)
+    loads: jax.Array  # (EARLIER, n), n entries each
+    solutions: jax.Array  # (EARLIER, m), m entries each
 
     def combined(self, b: jax.Array) -> jax.Array:
-        """Linear combination (m,) of the earlier solutions that has the load closest to b (n,).
+        """Linear combination (m,) of the earlier solutions. Its right-hand side is as close as possible to b (n,).
 
-        The method is Gram-Schmidt orthogonalisation of the loads, applied twice.
+        The method is Gram-Schmidt orthogonalisation of the right-hand sides, applied twice.
         """
 
         def add(c, pair):
@@ -169,7 +170,7 @@ class Earlier(NamedTuple):
 
 
 def no_earlier(load: jax.Array, solution: jax.Array) -> Earlier:
-    """Return an empty `Earlier` (zeros) for loads and solutions of the same sizes as `load` and `solution`."""
+    """Return an empty `Earlier` (zeros), with the sizes of a right-hand side `load` and of a `solution`."""
     return Earlier(*(jnp.zeros((EARLIER, len(each)), each.dtype) for each in (load, solution)))
 
 
@@ -191,11 +192,11 @@ def symmetric_solve(
     Args:
         matvec: function (x, earlier) -> (A x, the same earlier).
         both: b, and the earlier solves that give the starting vector.
-        solver: function (b, earlier) -> solution, its load, and the true residual divided by the norm of the load. The
-            load is b, or what remains of b after the elimination of unknowns.
+        solver: function (b, earlier) -> solution, right-hand side, and the norm of the true residual divided by that of
+            the right-hand side. The right-hand side is b, or what remains of b after the elimination of unknowns.
         tolerance: tolerance of the solver.
     """
-    # All in one vector: JAX raises an error if a derivative with respect to one part lacks cotangents for the others.
+    # All arrays are joined to one vector: JAX raises an error if a derivative lacks the cotangents of some arrays.
     joined, parted = ravel_pytree(both)
 
     def solve(_, vector):

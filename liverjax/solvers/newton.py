@@ -25,7 +25,7 @@ class NewtonStatistics(NamedTuple):
     status: jax.Array
     iterations: jax.Array
     linear_iterations: jax.Array
-    residual: jax.Array  # |r| divided by the given scale, at the returned point
+    residual: jax.Array  # |r| divided by the given scale, at the returned q
 
 
 class NewtonOptions(NamedTuple):
@@ -71,7 +71,7 @@ def newton_root(
 
 
 class _Iterate(NamedTuple):
-    """State of the iteration: `q` is the best point found, and `q + t dq` is the next trial point."""
+    """State of the iteration: `q` has the smallest residual r so far, and `q + t dq` is the next trial."""
 
     q: jax.Array
     r: jax.Array
@@ -98,15 +98,16 @@ def _halving_newton(residual, start, precondition, scale, options):
         trial = c.q + c.t * c.dq
         r, matvec = jax.linearize(residual, trial)
         first = c.iterations == 0
-        better = (norm(r) < norm(c.r)) | first  # false for NaN
+        better = (norm(r) < norm(c.r)) | first  # false if |r| is NaN
         q, r = jnp.where(better, trial, c.q), jnp.where(better, r, c.r)
         halvings = jnp.where(better, 0, c.halvings + 1)
         converged = norm(r) <= goal
         spent = (c.iterations > options.max_iterations) | (halvings > options.max_halvings)
         done = converged | spent | ~jnp.isfinite(norm(r))
-        # The solve is not stricter than the last Newton step needs, and not looser than the linear tolerance.
+        # The tolerance of the solve is as small as the last Newton step needs, and at most the linear tolerance.
         forcing = jnp.clip(0.1 * goal / norm(r), 1e-12, options.linear_tolerance)
-        load = jnp.where(better & ~done, -r, jnp.zeros_like(r))  # a load of 0 needs no iteration
+        # With a right-hand side of 0, the linear solver needs no iteration.
+        load = jnp.where(better & ~done, -r, jnp.zeros_like(r))
         dq, s = method(matvec, load, precondition, forcing, options.max_linear_iterations)
         return _Iterate(
             q=q,

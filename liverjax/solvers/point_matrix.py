@@ -27,10 +27,13 @@ from liverjax.tensors.places import given
 
 
 class PointMatrix(NamedTuple):
-    """Derivative of the nodal forces and, if pressures are unknowns, of the negative balance of nodal volumes."""
+    """Derivative of the nodal forces and, if pressures are unknowns, of the negative balance of nodal volumes.
 
-    blocks: dict[tuple[int, int], Matrix]  # for corners 1 <= a <= b <= 3, arrays (Q, E) [N/m]
-    own: Block | None  # 3 x 3 arrays (V,) of forces at nodes; entries that are 0 are None
+    Each of E elements has Q integration points.
+    """
+
+    blocks: dict[tuple[int, int], Matrix]  # stiffness K_ab for corners 1 <= a <= b <= 3, arrays (Q, E) [N/m]
+    own: Block | None  # stiffness of forces at nodes, 3 x 3 arrays (V,); entries that are 0 are None
     border: list[Vector] | None  # (Q, E) [m^2] derivatives of a point's volume with respect to corners 1, 2, 3
     pressures: BlockMatrix | None  # block of the vertex pressures [m^3/Pa]
 
@@ -38,7 +41,7 @@ class PointMatrix(NamedTuple):
 class Levels(NamedTuple):
     """The two levels of the preconditioner."""
 
-    diagonal: Block  # 3 x 3 of (V,)
+    diagonal: Block  # 3 x 3 arrays (V,)
     vertices: BlockMatrix  # the matrix for motions that are linear in every element
 
 
@@ -78,7 +81,7 @@ def levels(mesh: TetMesh, A: PointMatrix, bulk: Number | None = None) -> Levels:
     """Return the diagonal blocks of A, and the matrix of linear elements on the vertices.
 
     Args:
-        bulk: (Q, E) additional stiffness [Pa/m^3] against volume changes at the points, or None.
+        bulk: additional stiffness (Q, E) [Pa/m^3] against volume changes at the integration points, or None.
     """
     blocks = A.blocks
     if bulk is not None and A.border is not None:
@@ -99,8 +102,9 @@ def levels(mesh: TetMesh, A: PointMatrix, bulk: Number | None = None) -> Levels:
 def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
     """Diagonal blocks, 3 x 3 arrays (V,).
 
-    The block of node a is the sum of c_ak K_kl c_al over elements, points and k, l = 1, 2, 3. c_ak is the derivative of
-    shape function a with respect to the barycentric coordinate k, minus its derivative with respect to coordinate 0.
+    The block of node a is the sum of c_ak K_kl c_al over elements, integration points and k, l = 1, 2, 3. K_kl are the
+    blocks of A. c_ak is the derivative of shape function a with respect to the barycentric coordinate k, minus its
+    derivative with respect to coordinate 0.
     """
     c = basis(mesh.order).c
     slopes = c[:, 1:] - c[:, :1]

@@ -20,14 +20,14 @@ Columns = Sequence[jax.Array]
 
 
 class Coarse(NamedTuple):
-    """Inverse of a matrix that is restricted to the coarse space."""
+    """Inverse of a matrix that is restricted to the coarse space of P patches, with m components per node."""
 
     inverse: jax.Array  # (4 m P, 4 m P)
     used: jax.Array  # False if the coarse space is not used
 
 
 def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coarse:
-    """Make the coarse space of the leading m x m blocks of A.
+    """Make the coarse space from the leading m x m entries of the blocks of A.
 
     The stored inverse is 0 if `used` is false, or if the coarse matrix is not positive definite.
 
@@ -110,7 +110,7 @@ def corrected(
 
 
 def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, number: int) -> jax.Array:
-    """Coarse matrix Z^T A Z (4 m P, 4 m P): the sum over the edges, its transpose, and the diagonal blocks."""
+    """Coarse matrix Z^T A Z (4 m P, 4 m P) of P patches: sum over edges, plus its transpose and the diagonal blocks."""
     pattern, m = mesh.pattern, mask.shape[1]
     size = 4 * m * number
     low, high = pattern.edges

@@ -25,7 +25,7 @@ class StepStatistics(NamedTuple):
     iterations: jax.Array  # Newton iterations of all substeps
     linear_iterations: jax.Array
     cuts: jax.Array  # how often a substep was halved
-    residual: jax.Array  # |r| divided by the norm of all forces
+    residual: jax.Array  # norm of the residual forces, divided by the norm of all forces
 
 
 class StepOptions(NamedTuple):
@@ -47,12 +47,12 @@ class Kept(NamedTuple):
     made: jax.Array  # False if there is no tangent yet
     pace: jax.Array  # linear iterations per digit of accuracy when the preconditioner was new
     worn: jax.Array  # whether the preconditioner now needs many more iterations
-    #: `surprise`: the last root minus its prediction. `trust`: the fraction of this vector that the surprise of the
-    #: step before predicted. The next guess adds `trust` times `surprise`.
+    #: `surprise`: the last root minus its prediction. `trust`: factor (0 to 1) with which the surprise of the step
+    #: before was closest to this vector. The next guess is the prediction plus `trust` times `surprise`.
     surprise: jax.Array
     trust: jax.Array
     beside: jax.Array | None = None  # the additional unknowns at the root (`Problem.beside`)
-    #: The last linear solves for derivatives: the next such solve begins with them. In the simulation they are zeros.
+    #: The last linear solves for derivatives: the next such solve begins with them. They are zeros without derivatives.
     adjoints: Earlier | tuple[()] = ()
 
 
@@ -86,15 +86,16 @@ class Problem(NamedTuple):
     #: Function tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
     #: Function for derivatives if dr/dq is symmetric: (tangent, b, tolerance, max_iterations, earlier solves) -> the
-    #: solution with the exact dr/dq, its load, and its residual divided by the norm of the load. If there are
-    #: additional unknowns (`beside`), b and the solution contain them as well as q. The load is then what remains of b
-    #: after the elimination of the additional unknowns. None: derivatives use products with dr/dq.
+    #: solution with the exact dr/dq, the right-hand side, and the residual divided by the norm of the right-hand side.
+    #: If there are additional unknowns (`beside`), b and the solution contain them as well as q. The right-hand side is
+    #: then what remains of b after the elimination of the additional unknowns; otherwise it is b. None: derivatives use
+    #: products with dr/dq.
     adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
     #: Whether dr/dq is symmetric.
     symmetric: bool = True
     #: Whether r depends on s.
     moved: bool = True
-    #: The norm |r| that the rounding of q causes.
+    #: The norm of r that the rounding of q causes.
     roundoff: Any = 0.0
     beside: Beside | None = None
     #: Whether dr/dq can jump, for example where contact begins.
@@ -121,11 +122,11 @@ class Potential(NamedTuple):
     #: already has such an energy.
     surrogate: Problem | None
     #: A pair: unknowns of the reference shape, and whether the start of the step is only a guess. If it is a guess, the
-    #: load is followed from the reference shape. None: the start is never a guess.
+    #: solution is followed from the reference shape. None: the start is never a guess.
     rest: tuple[jax.Array, jax.Array] | None
     #: Function q -> q with the optimal pressures for its positions; None if pressures are not unknowns.
     settled: Callable[[jax.Array], jax.Array] | None = None
     #: Number of unknowns that are positions; None: all unknowns are positions.
     positions: int | None = None
-    #: Whether a solve with a definite tangent eliminates the pressures. Such a solve needs no stricter tolerance.
+    #: Whether a solve with a definite tangent eliminates the pressures. Then no stricter tolerance is needed for it.
     eliminates: bool = False

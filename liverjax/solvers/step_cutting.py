@@ -3,8 +3,9 @@
 The residual r(q, s) contains the loads and prescribed motions at the beginning of the step for s = 0, and at its end
 for s = 1. Out-of-balance forces at the beginning (inertia, a fluid) are reduced linearly: r - (1 - s) r(start, 0) is 0
 at the beginning of the step. A part of the load, from s to s + ds, is called a substep. Every substep begins with a
-linear solve, with the tangent at its beginning and the load -(r + dr/ds ds). So a prescribed motion enters through the
-tangent and not as a jump. If a substep fails, it is halved. Only the root at s = 1 is returned and differentiated.
+linear solve, with the tangent at its beginning and the right-hand side -(r + dr/ds ds). So a prescribed motion enters
+through the tangent and not as a jump. If a substep fails, it is halved. Only the root at s = 1 is returned and
+differentiated.
 """
 
 from functools import partial
@@ -28,24 +29,24 @@ from liverjax.solvers.problem import (
     StepStatistics,
 )
 
-#: If Newton's method makes no progress, the residual counts as roundoff in two cases. It is below _PRECISIONS times the
-#: precision (in float32 5e-4 of the forces; measured: 1e-4), or below ROUNDINGS times the effect of rounded positions.
-#: Then shorter steps do not help.
+#: If Newton's method makes no progress, the residual counts as roundoff in two cases. The relative residual is below
+#: _PRECISIONS times the machine precision (in float32 5e-4; measured: 1e-4), or the residual is below ROUNDINGS times
+#: the effect of rounded positions. Then shorter steps do not help.
 _PRECISIONS, ROUNDINGS = 4096, 8
 
-#: If the derivative of the residual can jump (kinks) and halving does not help, the full direction is used, at most
-#: this many times per substep. The tangent is different beyond a kink.
+#: If the derivative of the residual can jump (kinks) and halving does not help, the full step q + dq is used, at most
+#: this number of times per substep. The tangent is different beyond a kink.
 _LEAPS = 8
 
-#: A guess is not used if an element has less than this fraction of its volume: the guess may lead to a folded shape.
+#: A guess is not used if the volume ratio of an element is below this value: the guess may lead to a folded shape.
 _FLAT = 0.1
 
-#: Maximum tolerance of the linear solve if there is only one per step.
+#: Maximum tolerance of the linear solve if a step consists of only one solve.
 _ONE_STEP = 1e-4
-#: If |r| does not decrease by this factor in an iteration, a new tangent is made.
+#: A new tangent is made if |r|, divided by the norm of the right-hand side of the last direction, exceeds this value.
 _CONTRACTION = 0.15
-#: If the linear iterations per digit of accuracy exceed this multiple of their first value, a new preconditioner is
-#: made.
+#: A new preconditioner is made if the linear iterations per digit of accuracy exceed this multiple of their first
+#: value.
 _WEAR = 1.2
 #: Tolerance of the solves for derivatives, divided by the tolerance of the step.
 _ADJOINT = 0.1
@@ -55,28 +56,28 @@ ROOT = "root"
 
 
 class _Point(NamedTuple):
-    q: jax.Array  # best point of the current substep
-    size: jax.Array  # |r| there
-    aim: jax.Array  # |load| for the last direction
+    q: jax.Array  # last accepted iterate of the current substep
+    size: jax.Array  # |r| at q
+    aim: jax.Array  # norm of the right-hand side for the last direction dq
     kept: Kept
-    beside: jax.Array | None  # additional unknowns there (`Problem.beside`), or None
+    beside: jax.Array | None  # additional unknowns at q (`Problem.beside`), or None
     looser: jax.Array  # factor that multiplies the tolerance of the next solve for `beside`
     indefinite: jax.Array  # whether the tangent of the last solve was not positive definite
-    stale: jax.Array  # dq comes from a tangent that was made before q
-    remake: jax.Array  # the next evaluation is at q again, for a new tangent
+    stale: jax.Array  # whether dq comes from a tangent that was made at an earlier iterate
+    remake: jax.Array  # whether the next evaluation is at q again, for a new tangent
     dq: jax.Array
-    t: jax.Array  # the next trial point is q + t dq
+    t: jax.Array  # the next trial iterate is q + t dq
     s: jax.Array
     q_begin: jax.Array  # unknowns at the beginning of the current substep
-    guessing: jax.Array  # the substep began at the guess
+    guessing: jax.Array  # whether the substep began at the guess
     unbalanced: jax.Array  # r at the step's beginning, 0 while guessing
     s_begin: jax.Array
     ds: jax.Array
-    launch: jax.Array  # the next evaluation is at the beginning of a substep
-    first: jax.Array  # the next evaluation is the first of a substep
+    launch: jax.Array  # whether the next evaluation is at the beginning of a substep
+    first: jax.Array  # whether the next evaluation is the first after the beginning of a substep
     iterations: jax.Array  # number of iterations in this substep
     halvings: jax.Array
-    leaps: jax.Array  # number of full directions in this substep although |r| did not decrease
+    leaps: jax.Array  # number of full steps q + dq in this substep although |r| did not decrease
     total: jax.Array
     linear: jax.Array
     cuts: jax.Array
@@ -105,9 +106,9 @@ def solve(
     kept: Kept | None = None,
     near: Any = None,
 ) -> tuple[jax.Array, StepStatistics, Kept]:
-    """Find the root q of r(q, 1), followed from `start` (n,) at s = 0. If `guess` is given, it is tried first.
+    """Find the root q of r(q, 1): follow the solution from `start` (n,) at s = 0. Try `guess` first if it is given.
 
-    `start` and `guess` have no derivatives.
+    The root has no derivatives with respect to `start` and `guess`.
 
     Returns the root, the statistics, and the `Kept` for the next step. The argument `kept` comes from the last step,
     and `near` is a nearby tangent for derivatives. If the problem has an `adjoint`, the additional unknowns `beside` of
@@ -142,8 +143,8 @@ def solve(
         guessing = jnp.array(guess is not None)
         return _follow(problem, start, start if guess is None else guess, guessing, kept, options)
 
-    # Two derivative rules: the search has no derivative, and the derivative of the root uses the tangent at the root.
-    # For the first rule, any function with a constant root is enough.
+    # There are two derivative rules: the search has no derivative, and the derivative of the root uses the tangent
+    # there. For the first rule, any function with a constant root is enough.
     if options.differentiable:
         found_by = jax.lax.custom_root(lambda q: q, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     else:
@@ -160,7 +161,7 @@ def solve(
 
 
 def _foretold(vector: jax.Array, before: jax.Array) -> jax.Array:
-    """Fraction (0 to 1) of `vector` that the vector `before` of the last step predicted."""
+    """Return the factor (0 to 1) with which `before`, the vector of the last step, is closest to `vector`."""
     square = jnp.vdot(before, before)
     return jnp.clip(jnp.vdot(vector, before) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
 
@@ -224,7 +225,7 @@ def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
 
 
 def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Array | None, looser: Number) -> tuple:
-    """Residual at q. The solve for the additional unknowns begins with `beside`, their values at a nearby point."""
+    """Residual at q. The solve for the additional unknowns begins with `beside`, their values at a nearby q."""
     if problem.beside is None or beside is None:
         return problem.residual(q, s)
     return problem.residual(q, s, problem.beside.guess(beside, looser))
@@ -266,10 +267,10 @@ def _follow(
 def _robust(
     problem: Problem, potential: Potential, start: jax.Array, guess: jax.Array, kept: Kept, options: StepOptions
 ) -> tuple[jax.Array, jax.Array]:
-    """Follow the load. If this fails, or if elements are inverted at the beginning, minimise the energy.
+    """Follow the solution along the load. Minimise the energy if this fails or if elements are inverted at first.
 
     Without inertia, a start that differs from the reference shape is only a guess. If an element of the guess is nearly
-    flat, or if the guess leads to no solution, the load is followed from the reference shape.
+    flat, or if the guess leads to no solution, the solution is followed from the reference shape.
     """
     zero = jnp.zeros((), start.dtype)
     nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
@@ -336,19 +337,19 @@ def _first_point(
 
 
 class _Verdict(NamedTuple):
-    """The decision that follows from the residual at a trial point."""
+    """The decision that follows from the residual at a trial iterate."""
 
-    accepted: jax.Array  # the point is the best found in its substep, or the beginning of a substep
+    accepted: jax.Array  # the trial iterate replaces the last accepted one
     better: jax.Array
     converged: jax.Array  # at the end of a substep
     arrived: jax.Array  # converged at the end of the last substep
     remake: jax.Array
     failed: jax.Array
     lost: jax.Array  # the guess leads to no solution: the last equilibrium is tried next, and no cut is counted
-    launch_now: jax.Array  # a new substep begins at this point
+    launch_now: jax.Array  # a new substep begins at this iterate
     go_on: jax.Array  # a new direction is needed
     halvings: jax.Array
-    leap: jax.Array  # the full last direction is used, even if |r| increases
+    leap: jax.Array  # the full step q + dq is used, even if |r| increases
     cuts: jax.Array
     done: jax.Array
 
@@ -357,12 +358,13 @@ def _judge(
     c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, problem: Problem, options: StepOptions
 ) -> _Verdict:
     finite = jnp.isfinite(size) & jnp.isfinite(relative)
-    # The first point of a substep need not be better if its direction was computed with a new tangent.
+    # The first iterate of a substep may have a larger |r| in two cases: its direction comes from a new tangent, or |r|
+    # is below the norm of the right-hand side of this direction (`aim`).
     free = c.first & (~c.stale | (size < c.aim))
     better = finite & ((size < c.size) | free | c.remake) & ~c.launch
     converged = better & (relative <= options.tolerance)
     arrived = converged & (s >= 1)
-    # If a direction of an earlier tangent does not help, a new tangent is made first. The direction is not halved.
+    # If dq comes from an earlier tangent and does not reduce |r|, a new tangent is made first. The step is not halved.
     remake = ~better & ~c.launch & c.stale
     halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
     small = (c.relative <= _PRECISIONS * float(jnp.finfo(size.dtype).eps)) | (c.size <= ROUNDINGS * problem.roundoff)
@@ -450,7 +452,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     )
 
 
-#: Error of the solve for the additional unknowns, divided by the residual that is expected after a direction.
+#: Error of the solve for the additional unknowns, divided by the residual that is expected after the next iteration.
 _BESIDE = 0.1
 
 

@@ -1,1 +1,1 @@
-"""Algebra of 3 x 3 matrices (one per element), material axes, principal stretches."""
+"""Algebra of 3 x 3 matrices (one matrix per element), material axes, principal stretches."""

@@ -1,4 +1,4 @@
-"""Directions of a material: fibres, and orthogonal axes of fibre, sheet and normal."""
+"""Directions of a material: fibre directions, and three orthogonal axes (fibre, sheet and normal)."""
 
 import jax.numpy as jnp
 
@@ -8,7 +8,10 @@ from liverjax.tensors.matrices import IDENTITY, Matrix, Vector, add, cross, dot,
 
 
 def components(direction: Numbers | None, like: Number) -> Vector:
-    """Normalise a direction (3,), or one per element (E, 3). Return its components in the precision of `like`."""
+    """Normalise a direction (3,), or one direction per element (E, 3), and return its three components.
+
+    The precision (number of bits) is that of `like`. If `like` is an array, its last axis is the elements.
+    """
     direction = jnp.asarray(direction, jnp.result_type(like))
     shape, elements = direction.shape, jnp.shape(like)
     if shape[-1:] != (3,) or (len(shape) > 1 and elements and shape[-2] != elements[-1]):
@@ -17,9 +20,9 @@ def components(direction: Numbers | None, like: Number) -> Vector:
 
 
 def orthogonal_axes(fibre: Numbers | None, sheet: Numbers | None, like: Number) -> Matrix:
-    """Matrix with columns fibre, sheet (made orthogonal to the fibre), normal. Without a fibre: the coordinate axes.
+    """Return the matrix with the columns fibre, sheet (made orthogonal to the fibre) and normal.
 
-    The directions have the form that `components` accepts.
+    `fibre` and `sheet` have the form that `components` accepts. If `fibre` is None, the coordinate axes are returned.
     """
     if fibre is None:
         return IDENTITY

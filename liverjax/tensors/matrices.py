@@ -1,6 +1,6 @@
 """Deformation gradients and invariants. Every component is an array over the elements.
 
-A vector is a tuple of three arrays (E,), and a matrix is a tuple of three such rows (a tuple matrix). In this form XLA
+A vector is a tuple of three arrays (E,). A matrix is a tuple of three such rows (here: tuple matrix). In this form XLA
 vectorises over the elements. XLA does not vectorise batched products of arrays (E, 3, 3).
 """
 
@@ -23,74 +23,74 @@ class Invariants(NamedTuple):
 
     I1: Any = None  # tr C
     I2: Any = None  # (I1^2 - tr C^2) / 2
-    I4: jax.Array | None = None  # a . C a with the fibre direction a of the law
+    I4: jax.Array | None = None  # a . C a, with the fibre direction a of the law
     J: Any = None  # det F
     stretches: Any = None  # `liverjax.tensors.principal.Stretches`
     E: Any = None  # Green's strain, a tuple matrix in the axes of the law
 
 
 def dot(a: Vector, b: Vector) -> Any:
-    """Scalar product a . b."""
+    """Return the scalar product a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """Vector product a x b."""
+    """Return the vector product a x b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def add(*vectors: Vector) -> Vector:
-    """Sum of vectors."""
+    """Return the sum of vectors."""
     return tuple(sum(c[1:], c[0]) for c in zip(*vectors, strict=True))
 
 
 def scale(s: Number, a: Vector) -> Vector:
-    """Scalar times vector."""
+    """Return the product of a scalar and a vector."""
     return (s * a[0], s * a[1], s * a[2])
 
 
 def scale_matrix(w: Number, A: Matrix) -> Matrix:
-    """Scalar times matrix."""
+    """Return the product of a scalar and a matrix."""
     return tuple(scale(w, row) for row in A)
 
 
 def matvec(A: Matrix, v: Vector) -> Vector:
-    """Matrix times vector."""
+    """Return the product of a matrix and a vector."""
     return (dot(A[0], v), dot(A[1], v), dot(A[2], v))
 
 
 def transpose(A: Matrix) -> Matrix:
-    """Transposed matrix."""
+    """Return the transposed matrix."""
     return tuple(zip(*A, strict=True))
 
 
 def matmul(A: Matrix, B: Matrix) -> Matrix:
-    """Matrix product."""
+    """Return the product A B of two matrices."""
     columns = transpose(B)
     return tuple(tuple(dot(row, c) for c in columns) for row in A)
 
 
 def cofactor(F: Matrix) -> Matrix:
-    """Cofactor cof F = J F^-T, from cross products of the columns of F. It needs no inverse and is finite at J = 0."""
+    """Return the cofactor cof F = J F^-T, from cross products of the columns of F. It is also finite at J = 0."""
     c0, c1, c2 = transpose(F)
     return transpose((cross(c1, c2), cross(c2, c0), cross(c0, c1)))
 
 
 def determinant(F: Matrix) -> jax.Array:
-    """Determinant J = det F."""
+    """Return the determinant J = det F."""
     c0, c1, c2 = transpose(F)
     return dot(c0, cross(c1, c2))
 
 
 def right_cauchy_green(F: Matrix) -> Matrix:
-    """Right Cauchy-Green tensor C = F^T F; only its six different entries are computed."""
+    """Return the right Cauchy-Green tensor C = F^T F. Only its six different entries are computed."""
     c = transpose(F)
     xx, yy, zz, xy, xz, yz = (dot(c[a], c[b]) for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
     return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
 
 
 def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
-    """Compute the invariants among I1, I2 and J that are in `names`."""
+    """Return those of the invariants I1, I2 and J of F whose names are in `names`."""
     values = {}
     if "I1" in names or "I2" in names:
         values["I1"] = sum(dot(row, row) for row in F)
@@ -103,23 +103,23 @@ def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
 
 
 def green_strain(FA: Matrix) -> Matrix:
-    """Green's strain E = (C - I) / 2 in the axes A (columns of a rotation), from the product F A."""
+    """Return Green's strain E = (C - I) / 2 in axes A (the columns of a rotation), from the product F A."""
     C = right_cauchy_green(FA)
     return tuple(tuple(0.5 * (C[i][j] - (1.0 if i == j else 0.0)) for j in range(3)) for i in range(3))
 
 
 def outer(a: Vector, b: Vector) -> Matrix:
-    """Tensor product a (x) b."""
+    """Return the tensor product a (x) b."""
     return tuple(scale(x, b) for x in a)
 
 
 def unit(a: Vector) -> Vector:
-    """Unit vector a / |a|."""
+    """Return the unit vector a / |a|."""
     return scale(1 / jnp.sqrt(dot(a, a)), a)
 
 
 def add_matrices(A: Matrix, B: Matrix) -> Matrix:
-    """Sum A + B of two matrices."""
+    """Return the sum A + B of two matrices."""
     return tuple(add(a, b) for a, b in zip(A, B, strict=True))
 
 
@@ -134,28 +134,30 @@ def pack(A: Matrix) -> jax.Array:
 
 
 def stored(values: T) -> T:
-    """Return the same pytree, stored in memory (RAM). A branch prevents XLA:CPU from computing it for every use.
+    """Return a pytree with the same values, stored in memory (RAM).
 
-    The leaves are numbers or arrays; at least one of them is not empty.
+    A branch prevents XLA on the CPU from computing the values again for every use. The leaves are numbers or arrays. At
+    least one of them is not empty.
     """
     values = jax.tree.map(jnp.asarray, values)
     number = max(jax.tree.leaves(values), key=jnp.size).ravel()[0]
-    always = (number != -jnp.inf) | (number < 0)  # true for every number and NaN; unknown to the compiler
+    always = (number != -jnp.inf) | (number < 0)  # true for every number and for NaN; the compiler does not know this
     return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
 
 
 def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
-    """Deformation gradient F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3 (the shape vectors D add up to zero).
+    """Return the deformation gradient F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3.
 
-    The entries of F are (E,), or (Q, E) if elements have Q points (`TetMesh.edges`).
+    x_a are the positions of the nodes of an element, and D_a the gradients of their shape functions. All D_a, with D_0,
+    add up to 0. The entries of F are (E,), or (Q, E) if elements have Q integration points (`TetMesh.edges`).
 
     Args:
         mesh: `TetMesh`.
         x: current positions (V, 3) [m]. For another field (V, 3), the result is the gradient of that field.
 
     Raises:
-        InputError: x has another shape. Without this check, an index that is too large would silently read the last
-            node.
+        InputError: x does not have the shape (V, 3). Without this check, node numbers that are too large would read the
+            last node, without an error.
     """
     if jnp.shape(x) != mesh.points.shape:
         raise InputError(f"positions have shape {jnp.shape(x)}: give one row of 3 per node, {mesh.points.shape}")

@@ -1,4 +1,4 @@
-"""Read array entries, or add to entries, at node or edge numbers. The numbers must be valid; they are not checked."""
+"""Read array entries, or add to entries, at node or edge numbers. These numbers must be valid. They are not checked."""
 
 import jax
 
@@ -6,7 +6,7 @@ from liverjax.core.struct import Indices
 
 
 def taken(values: jax.Array, places: Indices) -> jax.Array:
-    """Read `values` (n, …) at `places`, an array of whole numbers from 0 to n - 1 of any shape."""
+    """Return the entries of `values` (n, …) at `places`, an array (of any shape) of whole numbers from 0 to n - 1."""
     return values.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 

@@ -1,13 +1,13 @@
 """Principal stretches and sums of their powers, with derivatives that also exist if stretches are equal.
 
-For the principal stretches lambda_m, Xi(alpha) = sum_m lambda_m^alpha = tr C^(alpha/2) is a smooth function of C,
-although the eigenvectors of C are not. So the eigenvectors are held constant in derivatives. In their axes
-C = diag(c) + X, where X is zero but has derivatives, and
+With the principal stretches lambda_m, the sum Xi(alpha) = sum_m lambda_m^alpha = tr C^(alpha/2) is a smooth function of
+C, although the eigenvectors of C are not. So the eigenvectors are constant in derivatives. In the axes of the
+eigenvectors, C = diag(c) + X. The value of X is zero, but X has derivatives. Then
 
     tr (C + X)^q = sum f(c_i) + sum g[c_i] X_ii + 1/2 sum g[c_i, c_j] X_ij^2 + 1/3 sum g[c_i, c_j, c_k] X_ij X_jk X_ki
 
-with q = alpha/2, f(c) = c^q, g = f' and the divided differences g[...] (Daleckii and Krein 1965). This expansion is
-exact up to the third derivative.
+with q = alpha/2, f(c) = c^q, g = f' and the divided differences g[...] of g (Daleckii and Krein 1965). This expansion
+is exact up to the third derivative.
 """
 
 import math
@@ -21,23 +21,25 @@ from liverjax.core.struct import Number
 from liverjax.tensors.material_axes import PAIRS, SIX, rotated, six_of, symmetric
 from liverjax.tensors.matrices import Matrix, Vector, determinant, dot, matvec, right_cauchy_green, transpose
 
-#: Number of cyclic Jacobi sweeps. After four sweeps, off-diagonal entries were roundoff in all tested matrices.
+#: Number of cyclic Jacobi sweeps. In all tested matrices, the off-diagonal entries were only roundoff after four
+#: sweeps.
 SWEEPS = 5
 
 
 class Stretches(NamedTuple):
-    """Principal stretches of F. In derivatives `logs` are constants; `change` and `log_J` are not."""
+    """Principal stretches of F. In derivatives, `logs` are constant. `change` and `log_J` have derivatives."""
 
     logs: Vector  # ln lambda_m
-    change: tuple  # X: result of `change`, in principal axes
-    log_J: jax.Array  # NaN for J < 0: isochoric stretches do not exist there
+    change: tuple  # X of the module docstring: the result of the function `change`, in principal axes
+    log_J: jax.Array  # ln J; NaN for J < 0, where isochoric stretches do not exist
 
 
 def principal(F: Matrix) -> tuple[Vector, Matrix]:
-    """Logarithms ln lambda_m of the principal stretches, and the matrix with the principal directions n_m as columns.
+    """Return the logarithms ln lambda_m of the principal stretches, and the principal directions as columns of a
+    matrix.
 
-    C = F^T F is diagonalised by Jacobi rotations, without LAPACK. The stretches are |F n_m|, so that a small stretch
-    has a good relative accuracy even if others are large.
+    C = F^T F is diagonalised by Jacobi rotations, without LAPACK. The stretches are computed as |F n_m|, with the
+    principal directions n_m. So the relative accuracy of a small stretch is good even if other stretches are large.
     """
     F = jax.lax.stop_gradient(F)
     axes = symmetric_axes(right_cauchy_green(F))
@@ -46,7 +48,7 @@ def principal(F: Matrix) -> tuple[Vector, Matrix]:
 
 
 def symmetric_axes(C: Matrix) -> Matrix:
-    """Eigenvectors of a symmetric matrix as the columns of a rotation."""
+    """Return the eigenvectors of a symmetric matrix as the columns of a rotation."""
     shape, dtype = jnp.shape(C[0][0]), jnp.result_type(C[0][0])
     one, zero = jnp.ones(shape, dtype), jnp.zeros(shape, dtype)
     columns = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
@@ -63,7 +65,7 @@ def symmetric_axes(C: Matrix) -> Matrix:
 
 
 def _rotate(entries: dict, columns: tuple, p: int, q: int) -> tuple[dict, tuple]:
-    """One Jacobi rotation (Golub and Van Loan, section 8.5) that makes entry (p, q) zero."""
+    """Do one Jacobi rotation (Golub and Van Loan, section 8.5) that makes entry (p, q) of the matrix zero."""
     r = 3 - p - q
     rp, rq = (min(r, p), max(r, p)), (min(r, q), max(r, q))
     a, d = entries[p, q], entries[q, q] - entries[p, p]
@@ -86,14 +88,17 @@ def _rotate(entries: dict, columns: tuple, p: int, q: int) -> tuple[dict, tuple]
 
 
 def stretches(F: Matrix) -> Stretches:
-    """Principal stretches of F, in a form that `power_sum` can differentiate."""
+    """Return the principal stretches of F, in a form that `power_sum` can differentiate."""
     logs, axes = principal(F)
     X = rotated(symmetric(change(F, 3)), transpose(axes))
     return Stretches(logs, six_of(X), jnp.log(determinant(F)))
 
 
 def change(F: Matrix, orders: int) -> tuple:
-    """Six entries of C minus their values: zeros that can be differentiated `orders` times with respect to F."""
+    """Return the six entries of C minus their values.
+
+    The results are zeros, but they can be differentiated `orders` times with respect to F.
+    """
     C = right_cauchy_green(F)
     return _counted(orders, tuple(C[i][j] for i, j in SIX))
 
@@ -111,7 +116,10 @@ def _(left, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _counted_one(left: int, C: tuple) -> jax.Array:
-    """The number 1, which can be differentiated `left` times. One more derivative is wrong, so it raises an error."""
+    """Return the number 1, which can be differentiated `left` times.
+
+    A further derivative would be wrong, so it raises an error.
+    """
     return jnp.ones_like(C[0])
 
 
@@ -126,7 +134,7 @@ def _(left, primals, tangents):
 
 
 def power_sum(s: Stretches, alpha: Number) -> jax.Array:
-    """Sum over m of (J^(-1/3) lambda_m)^alpha, minus 3, without cancellation error near the undeformed state."""
+    """Return the sum over m of (J^(-1/3) lambda_m)^alpha, minus 3, without cancellation near the undeformed state."""
     return _power_sum(jnp.asarray(alpha, jnp.result_type(s.log_J)), s.logs, s.change, s.log_J)
 
 
@@ -141,13 +149,13 @@ def _(primals, tangents):
     return value, jax.jvp(expanded_power_sum, primals, tangents)[1]
 
 
-_PAIRS_OF_NODES = ((0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1))  # i, j of g[i, i, j]
+_PAIRS_OF_NODES = ((0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1))  # indices i and j of the divided differences g[i, i, j]
 
 
 def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -> jax.Array:
-    """Expansion of the module docstring for (J^(-1/3) lambda)^alpha, differentiable with respect to alpha, X, ln J.
+    """Return the expansion of the module docstring for (J^(-1/3) lambda)^alpha, differentiable in alpha, X and ln J.
 
-    Divided differences of one kind are stacked in one array. So only a tenth of the operations is compiled.
+    Divided differences of the same kind are computed as one array. So only a tenth of the operations must be compiled.
     """
     q, log_J0 = alpha / 2, jax.lax.stop_gradient(log_J)
     l = 2 * (jax.lax.stop_gradient(jnp.stack(logs)) - (log_J0 / 3)[None])
@@ -171,7 +179,10 @@ def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -
 
 
 def divided_difference(p: Number, *logs: Number) -> jax.Array:
-    """Divided difference of c^p at one, two or three nodes c = exp(log), also accurate for close or equal nodes."""
+    """Return the divided difference of c^p at one, two or three nodes c = exp(log).
+
+    It is also accurate for nodes that are close to each other or equal.
+    """
     if len(logs) == 1:
         return jnp.exp(p * logs[0])
     if len(logs) == 2:
@@ -189,9 +200,11 @@ def divided_difference(p: Number, *logs: Number) -> jax.Array:
 
 
 def _divided_power(p: Any, y: list) -> Number:
-    """Divided difference of (1 + c)^p at the three values c in y (|c| < 0.11), by the binomial series of the power,
-    truncated at 0.11^16 = 5e-16."""
-    homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]  # complete homogeneous sums h_k of the nodes
+    """Return the divided difference of (1 + c)^p at the three values c in y, with |c| < 0.11.
+
+    It is computed by the binomial series of the power, truncated at 0.11^16 = 5e-16.
+    """
+    homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]  # complete homogeneous sums h_k of the nodes y
     for node in y:
         for k in range(1, 16):
             homogeneous[k] = homogeneous[k] + node * homogeneous[k - 1]
@@ -203,12 +216,12 @@ def _divided_power(p: Any, y: list) -> Number:
 
 
 def sinh_ratio(p: Number, delta: Number) -> jax.Array:
-    """Ratio sinh(p delta) / sinh(delta), which is p at delta = 0."""
+    """Return the ratio sinh(p delta) / sinh(delta), which is p at delta = 0."""
     return p * _sinhc(p * delta) / _sinhc(delta)
 
 
 def _sinhc(x: Number) -> Any:
-    """Function sinh(x)/x. For |x| < 1 its power series is used (last coefficient 1/19!)."""
+    """Return sinh(x)/x. For |x| < 1 its power series is used (last coefficient 1/19!)."""
     square = x * x
     near = square < 1
     small: jax.Array = jnp.where(near, square, 0.0)

@@ -1,18 +1,19 @@
-"""Proper orthogonal decomposition: a few fields that represent many fields up to a small error."""
+"""Proper orthogonal decomposition: find a few fields that represent many fields up to a small error."""
 
 import numpy as np
 
-#: Maximum size of the matrix of products. If both rows and columns are more than this, only this number of
+#: Maximum size of the matrix of scalar products. If there are more rows and more columns than this, only this number of
 #: evenly spaced rows is used.
 MOST_PRODUCTS = 6000
 
 
 def principal_fields(rows: np.ndarray, tolerance: float) -> np.ndarray:
-    """Orthonormal fields (n, P) that represent rows (N, P) up to `tolerance` times the Frobenius norm of the rows.
+    """Return orthonormal fields (n, P) that represent rows (N, P) with a relative error of at most `tolerance`.
 
-    The fields are computed from the eigenvectors of the matrix of scalar products between rows, or between columns if
-    there are fewer columns (Sirovich 1987). The products keep only half of the digits, so the minimum useful tolerance
-    is 1e-7.
+    The error is relative to the Frobenius norm of the N rows, which have P values each. The n fields are computed from
+    the eigenvectors of the matrix of scalar products between rows, or between columns if there are fewer columns
+    (Sirovich 1987). In scalar products, half of the significant digits are lost, so the minimum useful tolerance is
+    1e-7.
     """
     if min(rows.shape) > MOST_PRODUCTS:
         rows = rows[np.linspace(0, len(rows) - 1, MOST_PRODUCTS).round().astype(int)]
@@ -22,5 +23,5 @@ def principal_fields(rows: np.ndarray, tolerance: float) -> np.ndarray:
     left = np.sqrt(np.maximum(size.sum() - np.cumsum(size), 0.0) / size.sum())
     n = min(int(np.sum(left > tolerance)) + 1, int(np.sum(size > 1e-14 * size[0])))
     fields = vectors[:, :n].T @ rows if few_rows else vectors[:, :n].T
-    # Now the fields are orthonormal to full precision.
+    # After this factorisation, the fields are orthonormal to full precision.
     return np.linalg.qr(fields.T)[0].T

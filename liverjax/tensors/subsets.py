@@ -1,4 +1,7 @@
-"""Subsets of elements that are computed separately: select the values of a subset, and join those of all subsets."""
+"""Subsets of elements that are computed separately.
+
+Functions of this module select the values of one subset, and join the values of all subsets.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -15,20 +18,22 @@ class Subsets(NamedTuple):
     """A partition of the elements: every element is in exactly one subset."""
 
     elements: tuple[jax.Array, ...]  # element numbers (1, n) of each subset; no array of element values has this shape
-    places: jax.Array  # position of each element in the joined subsets: (E,), or (1, E) with several points
+    places: jax.Array  # (E,), or (1, E) with several integration points: position of each element in the joined subsets
 
     @property
     def number_of_elements(self) -> int:
-        """Number of elements, E."""
+        """Return the number E of all elements."""
         return self.places.shape[-1]
 
 
 def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
-    """Return the subsets: first the elements without a group, if any, then each group.
+    """Return the subsets. The first one contains the elements without a group, if there are any.
+
+    Then follow the groups.
 
     Args:
-        groups: element numbers (n,) of groups without common elements. Inside jit these numbers may be unknown.
-        number_of_elements: E.
+        groups: element numbers (n,) of each group. No element is in two groups. Inside jit the numbers may be unknown.
+        number_of_elements: number E of all elements.
     """
     E = number_of_elements
     groups = [jnp.asarray(group, jnp.int32) for group in groups]
@@ -41,7 +46,10 @@ def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
 
 
 def in_subset(s: Subsets, k: int, numbers: T) -> T:
-    """Reduce the arrays (…, E) and (…, E, 3) of a pytree to the elements of subset k. Other arrays are not changed."""
+    """Return a pytree in which arrays (…, E) and (…, E, 3) have only the elements of subset k.
+
+    Other arrays do not change.
+    """
     E, own = s.number_of_elements, s.elements[k][0]
 
     def one(a: Number) -> Number:
@@ -54,14 +62,17 @@ def in_subset(s: Subsets, k: int, numbers: T) -> T:
 
 
 def put_together(s: Subsets, numbers: Sequence[T]) -> T:
-    """Join the pytrees of all subsets (of the same structure, with arrays (…, n)) to values of all elements."""
+    """Join the pytrees of all subsets to one pytree with values of all elements.
+
+    The pytrees have the same structure, and contain arrays (…, n) for the n elements of their subset.
+    """
     leaves, trees = zip(*(jax.tree.flatten(each) for each in numbers), strict=True)
     shapes = [
         jnp.broadcast_shapes(*map(jnp.shape, own), (e.shape[1],)) for own, e in zip(leaves, s.elements, strict=True)
     ]
     lead = jnp.broadcast_shapes(s.places.shape[:-1], *(shape[:-1] for shape in shapes))
     dtype = jnp.result_type(*(a for own in leaves for a in own))
-    # One array per subset, so that one copy brings the numbers of all elements into order.
+    # The values of each subset are stacked in one array, so that a single copy arranges the values of all elements.
     stacked = [
         jnp.stack([jnp.broadcast_to(jnp.asarray(a, dtype), (*lead, shape[-1])) for a in own])
         for own, shape in zip(leaves, shapes, strict=True)

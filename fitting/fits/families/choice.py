@@ -12,20 +12,21 @@ from fitting.fits.viscoelastic import FLUID, Kind
 
 #: The special cases of each general model. For some values of its parameters, the general model equals the special
 #: case. `contains` adds three cases. A spectrum contains every model. `prony` contains every fluid with at most as many
-#: modes. A fractional Zener model contains a single Prony mode (exponent 1).
+#: modes. A fractional Zener model with exponent 1 is a solid with a single Prony mode.
 SPECIAL_CASES = {
     "fractional_kelvin_voigt": ("springpot",),
     "fractional_maxwell": ("springpot",),
     "fractional_parallel": ("springpot", "fractional_kelvin_voigt"),
     "fractional_zener": ("springpot", "fractional_kelvin_voigt"),
 }
-#: A model is chosen only if its criterion is lower than the criterion of its special case by this difference (strong
-# evidence).
+#: A model is chosen only if its criterion is lower than the criterion of its special case by at least this difference
+#: (strong evidence).
 GENERAL = 6.0
 
 
 class Label(NamedTuple):
-    """The name of a model, and its number of modes if it is made of modes (else 0)."""
+    """The name of a model, and its number of Prony modes. The number is 0 for models that do not consist of Prony
+    modes."""
 
     name: str
     modes: int = 0
@@ -68,5 +69,5 @@ class OfAKind(Protocol):
 
 
 def label_of(fit: OfAKind) -> Label:
-    """Return the label of a fit. Only models made of Prony modes have a number of modes."""
+    """Return the name of the fitted model, and its number of modes (0 if the model does not consist of Prony modes)."""
     return Label(fit.kind.name, fit.modes if fit.kind.values is None else 0)

@@ -22,23 +22,24 @@ class Candidate(NamedTuple):
     units: tuple[str, ...]
     values: Callable[[jax.Array, Any], jax.Array]  # (u, modulus scale [Pa]) -> parameters in the order of `names`
     law: Callable[[jax.Array], Law]  # law with these values, without volumetric energy
-    random: Callable[[np.random.Generator, int], np.ndarray]  # random starting points (n, len(u))
+    random: Callable[[np.random.Generator, int], np.ndarray]  # (generator, n) -> n random starting points (n, len(u))
     notes: tuple[str, ...] = ()  # notes about parameters that are not fitted
 
 
 def candidates(name: str, terms: int | None = None) -> list[Candidate]:
-    """Return the candidates for this name of a law. `FILE.py:LAW` stands for the law LAW in a file, and `all` for all
-    laws of this package. Without `terms`, Ogden's law is returned several times, each time with another number of
-    terms.
+    """Return the laws to be fitted for a given `name`. `FILE.py:LAW` is the law LAW in a file, and `all` means all laws
+    of this package that can be fitted. If `terms` is None, Ogden's law is returned several times, each time with
+    another number of terms.
 
     Raises:
-        InputError: unknown law, or a law whose energy is not an isochoric energy plus U(J).
+        InputError: the law is unknown, its energy is not an isochoric energy plus U(J), or `terms` is given for another
+            law than Ogden's.
     """
     if terms is not None and name not in ("ogden", "all"):
         raise InputError(f"--terms {terms} cannot be used with {name}, only with ogden: remove --terms")
     if name == "all":
         singles = [c for n in laws.LAWS if n != "ogden" and incompressible_form(n) for c in candidates(n)]
-        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term gives law bogen
+        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term is the law bogen
     typical = gradient_check.load(name)
     if laws.isochoric_part(typical) is None:
         usable = ", ".join(n for n in laws.LAWS if incompressible_form(n))
@@ -60,8 +61,8 @@ def _candidate(label: str, law: Law) -> Candidate:
 
 
 def _sum(label: str, parts: list[Candidate]) -> Candidate:
-    """Return the candidate for a sum of laws. Parameters have the same names as in a scene: `1.mu` is mu of the second
-    law."""
+    """Return the candidate for a sum of laws. The parameters have the same names as in a scene. For example, `1.mu` is
+    the parameter mu of the second law."""
     ends = np.cumsum([len(p.names) for p in parts])[:-1]  # there are as many unconstrained variables as parameters
 
     def values(u, scale):
@@ -95,7 +96,7 @@ def _single(label: str, typical: Law) -> Candidate:
     middle = np.array([float(getattr(typical, n)) for n in names])
     positive = np.array([f.metadata.get("above") == 0 for f in fields])
     modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
-    # A law with only higher terms has G = 0; then its largest modulus is the scale.
+    # If the law has only terms of higher order, its shear modulus is 0. Then its largest parameter in Pa is the scale.
     size = abs(ground_state_modulus(typical)) or np.abs(middle[modulus]).max(initial=0.0)
     middle = middle / np.where(modulus, size, 1.0)
 
@@ -106,7 +107,8 @@ def _single(label: str, typical: Law) -> Candidate:
     def random(rng, n):
         near = np.log(np.abs(middle)) + 1.5 * rng.standard_normal((n, len(names)))
         u = np.where(positive, near, middle * np.exp(rng.standard_normal((n, len(names)))))
-        # An exponent alpha may be positive or negative. The other parameters without a bound are coefficients.
+        # An exponent alpha may be positive or negative. The other parameters without a bound are coefficients and keep
+        # their signs.
         alpha = np.array([m == "alpha" for m in names])
         return np.where(alpha, _exponents_of_law(rng, (n, len(names))), u)
 
@@ -117,7 +119,8 @@ def _single(label: str, typical: Law) -> Candidate:
 
 
 def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
-    """Return the fields to be fitted (their value is not 0), and notes on the fields that are not fitted.
+    """Return the parameters (fields) of the law that are fitted, because their value is not 0, and notes on the
+    parameters that are not fitted.
 
     Raises:
         InputError: a parameter is a list, or no parameter is left to be fitted.
@@ -147,8 +150,8 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
 
 
 def ground_state_modulus(law: Law) -> float:
-    """Return the shear modulus [Pa] in the undeformed state. If the law does not give this modulus, dP12/dF12 in this
-    state is returned."""
+    """Return the shear modulus [Pa] in the undeformed state. If the law cannot compute this modulus, dP12/dF12 in this
+    state is returned (P: first Piola-Kirchhoff stress, F: deformation gradient)."""
     try:
         return float(law.shear_modulus())
     except InputError:
@@ -167,8 +170,8 @@ def _ogden_starts(rng: np.random.Generator, n: int, terms: int) -> np.ndarray:
 
 
 def _ogden(terms: int) -> Candidate:
-    """Return the candidate for Ogden's law with G_k = mu_k alpha_k / 2 > 0 in every term, so that the law is stable at
-    every stretch."""
+    """Return the candidate for Ogden's law. In every term k the shear modulus mu_k alpha_k / 2 is above 0, so the law
+    is stable at every stretch."""
     names = tuple(f"{n}[{k}]" for n in ("mu", "alpha") for k in range(terms))
 
     def values(u, scale):

@@ -21,8 +21,9 @@ NAMES = {"shear_modulus": "instantaneous modulus", "equilibrium_modulus": "equil
 
 
 def of_the_model(own: Estimate | None) -> dict[str, float]:
-    """Return the moduli [Pa] of a model at infinite frequency and at frequency 0. The keys are their names in fit.json.
-    Infinite moduli are not included."""
+    """Return the moduli [Pa] of a model at infinite frequency and at frequency 0. The keys are the names of these
+    moduli in fit.json. Infinite moduli are not included. `own`: parameters of the model; if None (Prony modes), the
+    result is empty."""
     if own is None:
         return {}
     values = {name: float(value) for name, value in zip(own.names, own.values, strict=True)}
@@ -46,16 +47,17 @@ def equilibrium_of(model: Maxwell) -> float:
 
 
 def limit_errors(modes: Estimate, model: Maxwell, own: Estimate | None) -> dict[str, float]:
-    """Return the standard errors [Pa] of the moduli of Prony modes at infinite frequency and at frequency 0. They
-    contain the difference from the moduli of the model."""
+    """Return the standard errors [Pa] of the moduli of Prony modes at infinite frequency and at frequency 0. The
+    difference between the moduli of the modes and the moduli of the model is added to each error (root of the sum of
+    squares)."""
     found = {"shear_modulus": float(modes.standard_errors[0]), "equilibrium_modulus": equilibrium_error(modes)}
     here = of_the_modes(model)
     return found | {name: float(np.hypot(found[name], there - here[name])) for name, there in of_the_model(own).items()}
 
 
 def limit_sentences(name: str, modes: Estimate, model: Maxwell, own: Estimate | None) -> list[str]:
-    """Return one warning for each frequency, 0 and infinity, at which the moduli of modes and model differ by more than
-    `TOLD` standard errors of the fit."""
+    """Return a warning for frequency 0, for infinite frequency, or for both, if the modulus of the Prony modes there
+    differs from the modulus of the model by more than `TOLD` standard errors of the fit."""
     here, alone = of_the_modes(model), limit_errors(modes, model, None)
     out = []
     for limit, there in of_the_model(own).items():
@@ -81,7 +83,7 @@ def still_relaxing(storage: np.ndarray, noise: float, longest: float) -> list[st
         return []
     return [
         f"G' falls by {100 * fall / storage[1]:.2g} % in the lowest half decade and by "
-        f"{100 * next_fall / storage[2]:.2g} % in the next. The equilibrium modulus is the modulus after {longest:.3g} "
-        "s, the longest time of the model. It is unknown how much of this modulus relaxes later, and the stated error "
-        "does not contain this: measure at lower frequencies"
+        f"{100 * next_fall / storage[2]:.2g} % in the next. The equilibrium modulus is the modulus after "
+        f"{longest:.3g} s, the longest relaxation time of the model. It is unknown how much of this modulus relaxes "
+        "later. The stated error does not contain this part: measure at lower frequencies"
     ]

@@ -1,8 +1,8 @@
 """Further models besides free Prony modes (springpots, a spectrum on a grid, fluids), and the choice between them. The
 moduli of all models are known in closed form, without simulation.
 
-The same information criterion compares all models and chooses the number of modes. For the simulation, each model is
-converted to Prony modes. The fit gives the error of this conversion over the band.
+One information criterion is used both to compare the models and to choose the number of modes. For the simulation, each
+model is converted to Prony modes. The details of a fit contain the largest error of this conversion over the band.
 """
 
 import time
@@ -34,9 +34,10 @@ SHARP = 1e-4
 
 
 def fractional(sweep: Sweep) -> list[Fit]:
-    """Fit every model of `springpots.FRACTIONAL`. Each fit is the best minimum from 24 starting points."""
+    """Fit every springpot model of `springpots.FRACTIONAL` to a sweep. Each fit is the best minimum from 24 starting
+    points."""
     starts = springpots.starting_points(sweep)
-    # A model with as many parameters as data fits any data without residuals, so its fit would prove nothing.
+    # A model with as many parameters as data fits any data without residuals, so such a model is not fitted.
     most = 2 * len(np.unique(sweep.angular_frequency))
     out = []
     for model in springpots.FRACTIONAL:
@@ -70,8 +71,8 @@ def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution,
 
 
 def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = None) -> Fit:
-    """Fit a smooth, non-negative spectrum with 2 or 3 relaxation times per decade. `found`: the spectrum, if it was
-    computed before."""
+    """Fit a smooth, non-negative relaxation spectrum with 2 or 3 relaxation times per decade. `found`: this spectrum,
+    if it was computed before."""
     found = found or relaxation_spectrum.fit(sweep)
     solid = int(found.equilibrium > 0)
     strengths = np.concatenate([[found.equilibrium], found.strengths])[1 - solid :]
@@ -125,7 +126,7 @@ def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> as_prony_modes.Conver
 
 
 def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
-    """Add the error of the conversion to Prony modes, and the warnings about the model, to the fit."""
+    """Return the fit with the error of the conversion to Prony modes, and with the warnings about the model."""
     sentences = [_cut_off(fit)] if fit.kind.name != "fractional_zener" and fit.kind.effective is None else []
     if made.error > as_prony_modes.ALLOWED:
         sentences.append(
@@ -141,13 +142,13 @@ def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
 def _cut_off(fit: Fit) -> str:
     return (
         f"the model {fit.kind.name} has no finite instantaneous modulus: shear_modulus belongs to the {fit.modes} "
-        "Prony modes that represent the model over the measured band. It is not valid at higher frequencies"
+        "Prony modes that represent the model over the measured band, and is not valid at higher frequencies"
     )
 
 
 def undetermined(fit: Any) -> list[str]:
-    """Return warnings about the parameters of a fractional model that the data do not determine. `fit` may be a fit of
-    any data."""
+    """Return warnings about the parameters of a fractional model that the data do not determine. `fit` may be the fit
+    of a sweep, of another test or of several tests."""
     if fit.parameters is None or fit.kind.effective is not None:
         return []
     free = [n for n, ok in zip(fit.kind.names, determined(fit.parameters), strict=True) if not ok]
@@ -158,7 +159,8 @@ def undetermined(fit: Any) -> list[str]:
 
 
 def at_bounds(own: Estimate) -> list[str]:
-    """Return a warning for each exponent at its bound. The standard error of such an exponent has no meaning."""
+    """Return a warning for each exponent at its bound, 0 or 1. The standard error of such an exponent has no
+    meaning."""
     out = []
     for name, value, bound in zip(own.names, own.values, _bounded(own), strict=True):
         if bound:
@@ -185,15 +187,16 @@ def _bounded(own: Estimate) -> np.ndarray:
 
 
 def identifiable(fit: Fit, sweep: Sweep) -> bool:
-    """Return whether the fit converged and the data determine every parameter. A spectrum only has to converge, because
-    it has a prior."""
+    """Return whether the fit converged and the data determine every parameter. For a spectrum, only the convergence is
+    checked, because the spectrum has a prior."""
     if fit.parameters is None:
         return viscoelastic.identifiable(fit, sweep)
     return fit.converged and (fit.kind.effective is not None or bool(np.all(determined(fit.parameters))))
 
 
 def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
-    """Fit modes without an equilibrium modulus. The information criterion chooses the number of modes."""
+    """Fit Prony modes of a fluid, which has no equilibrium modulus. The information criterion chooses the number of
+    modes."""
     largest = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
     chosen, failures = None, 0
     for modes in range(1, largest + 1):
@@ -226,8 +229,8 @@ def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) ->
 
 
 def best_of_models(tried: Sequence[Fit], sweep: Sweep) -> tuple[Fit, list[Fit]]:
-    """Return the best model, and all models whose parameters the data determine. If there is no such model, all of
-    `tried` are returned."""
+    """Return the fit of the best model, and the fits of all models whose parameters the data determine. If there is no
+    such model, all of `tried` are compared and returned."""
     able = [fit for fit in tried if identifiable(fit, sweep)] or list(tried)
     return able[preferred([label_of(f) for f in able], [information_criterion(f) for f in able])], able
 
@@ -254,7 +257,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
 
 
 def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
-    """Return the criterion of each model, best first."""
+    """Return a table with the information criterion and other results of each model, best model first."""
     best = min(information_criterion(fit) for fit in tried)
     rows = [
         {
@@ -297,8 +300,8 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
 
 
 def comparison(fit: Fit) -> list[str]:
-    """Return lines of text with the criterion of each model, best first. The list is empty if only one model was
-    fitted."""
+    """Return lines of text with the information criterion of each model, best model first. The list is empty if only
+    one model was fitted."""
     rows = fit.details.get("models_compared", [])
     if len(rows) < 2:
         return []

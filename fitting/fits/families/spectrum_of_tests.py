@@ -1,9 +1,9 @@
-"""A smooth spectrum on a fixed grid of relaxation times, from one relaxation or creep test or from several tests
-together.
+"""A smooth relaxation spectrum on a fixed grid of relaxation times, fitted to one relaxation or creep test or to
+several tests together.
 
 Stress is linear in the strengths of the spectrum, so one linear problem is enough for sweeps and relaxation tests
-(`relaxation_spectrum`). Creep and shear waves are not linear in the strengths. For them the linearised problem is
-solved repeatedly.
+(`relaxation_spectrum`). The strain in creep and the velocities of shear waves are not linear in the strengths. For such
+tests the linearised problem is solved repeatedly.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,11 +25,11 @@ from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 from liverjax.solvers.blas import one_blas_thread
 
-#: WEIGHTS: tried weights of the second differences, largest first. MOST_TANGENTS: maximum number of iterations for each
-#: weight.
+#: WEIGHTS: weights of the smoothness term (second differences of the strengths) that are tried, largest first.
+#: MOST_TANGENTS: maximum number of iterations for each weight.
 WEIGHTS, MOST_TANGENTS = np.logspace(4, -6, 21), 30
-#: STILL: a search ends if the relative decrease of the cost is below this value. NONE: value that replaces a strength
-#: of 0, in the unit of the grid.
+#: STILL: the iterations end if the relative decrease of the cost, expected or achieved, is at most this value. NONE:
+#: number that is added to every strength (divided by `grid.unit`), so that no strength is 0.
 STILL, NONE = 1e-9, 1e-12
 
 
@@ -39,7 +39,7 @@ class SpectrumFit(NamedTuple):
     kind: Kind
     model: Maxwell  # few Prony modes that represent the spectrum
     solution: Solution
-    spread: Estimate  # parameters of these modes
+    spread: Estimate  # parameters of these modes, with standard errors
     own: Estimate  # equilibrium modulus and strengths
     details: Content
     sentences: tuple[str, ...]
@@ -47,7 +47,7 @@ class SpectrumFit(NamedTuple):
 
 def _modes_on_grid(grid: GridOfTimes) -> Callable[[np.ndarray], Maxwell]:
     """Return a NumPy function that computes Prony modes from x (…, 1 + K). x contains the equilibrium modulus and the
-    strengths, divided by `grid.unit`."""
+    strengths at the K times of the grid, divided by `grid.unit`."""
 
     def maxwell(x):
         strengths = grid.unit * (x + NONE)
@@ -65,8 +65,9 @@ class _Minimum(NamedTuple):
 
 
 def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> _Minimum:
-    """Return the least-squares minimum for x >= 0 and the smoothness of the grid. Gauss-Newton begins at x and halves
-    each step until the cost falls."""
+    """Return the minimum of the cost for x >= 0 (see `_modes_on_grid`). The cost is the sum of the squared residuals
+    plus the smoothness term of the grid. The Gauss-Newton iterations begin at the given x. Each step is halved until
+    the cost falls."""
     L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
     kind = Kind("spectrum", _modes_on_grid(grid))
 
@@ -86,7 +87,7 @@ def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> 
             trial = x + length * (target - x)
             new, length = at(trial), 0.5 * length
         if new is None or not new[2] < cost:
-            return _Minimum(x, r, J, True)  # no step lowers the cost: this is the minimum, up to roundoff
+            return _Minimum(x, r, J, True)  # no step lowers the cost: x is the minimum, up to roundoff
         still = cost - new[2] <= STILL * cost
         x, (r, J, cost) = trial, new
         if still:
@@ -97,12 +98,12 @@ def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> 
 def spectrum_of(
     tests: Sequence[Measured], near: Maxwell, noise: np.ndarray
 ) -> tuple[GridSpectrum, GridOfTimes, _Minimum]:
-    """Return (spectrum, grid, minimum) for the grid and the weight of smoothness with the highest restricted
+    """Return (spectrum, grid, minimum) for the grid and the weight of the smoothness term with the highest restricted
     likelihood.
 
     Args:
         tests: one or more tests.
-        near: Prony modes with about the same moduli. These modes give the unit of each strength.
+        near: Prony modes with about the same moduli as the tests. These modes give the unit of each strength.
         noise: relative noise of each test.
     """
     low, high = together.resolved_by(tests)
@@ -132,8 +133,8 @@ def _weighed_parts(tests: Sequence[Measured], noise: np.ndarray) -> list:
 def _as_a_fit(
     tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, told: GridSpectrum, over: Callable | None = None
 ) -> SpectrumFit:
-    """Return the spectrum as a fit. `over`: function that divides the residuals at the minimum by their noise. If
-    `over` is None, the noise is estimated."""
+    """Return the spectrum `told` as a fit. `over`: function that divides the residuals at the minimum by their noise.
+    If `over` is None, the noise is estimated from the residuals."""
     low, high = together.resolved_by(tests)
     kept = found.x[1:] > 1e-10 * found.x.max()
     solid = told.equilibrium > 0
@@ -183,7 +184,8 @@ def _as_a_fit(
 
 
 def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
-    """Return the spectrum of a relaxation or creep test. `near`: Prony modes with about the same moduli."""
+    """Fit a smooth spectrum to a relaxation or creep test. `near`: Prony modes with about the same moduli as the
+    test."""
     told, grid, found = spectrum_of([test], near, np.ones(1))
     fit = _as_a_fit([test], grid, found, told)
     _, answer, scales = together.reported_numbers(test)
@@ -193,8 +195,8 @@ def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
 
 
 def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -> Together:
-    """Return the spectrum of several tests, each with separate noise. `near` and `noise` are the same as in
-    `spectrum_of`."""
+    """Fit one smooth spectrum to several tests. Each test has its individual noise level. `near` and `noise` are the
+    same as in `spectrum_of`."""
     parts = [together.reported_numbers(t) for t in tests]
     for _ in range(2):
         told, grid, found = spectrum_of(tests, near, noise)

@@ -1,8 +1,8 @@
 """Springpot models for relaxation and creep tests and for several tests together, and the choice between all models.
 
-The response of a springpot model is computed with many modes of its relaxation spectrum (`springpots.as_modes`). The
-responses to any load are therefore computed as for Prony modes. The fit varies and reports only the few parameters of
-the springpot model.
+The response of a springpot model is computed with many modes of its relaxation spectrum (`springpots.as_modes`). So the
+response to any load is computed in the same way as for Prony modes. The fit varies and reports only the few parameters
+of the springpot model.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,10 +34,10 @@ from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 
 #: STARTS: number of starting points for each model. AROUND: standard deviation of the random starting points around the
-#: point from Prony modes. MOST_STEPS: maximum number of iterations.
+#: first one, which comes from Prony modes. MOST_STEPS: maximum number of iterations.
 STARTS, AROUND, MOST_STEPS = 10, 1.0, 80
-#: An exponent is a logistic function of its variable. For variables above this size, the derivative is too small to
-#: begin a search.
+#: An exponent is a logistic function of its variable. If the size of this variable is above MOST_LOGIT, the derivative
+#: is too small for the first step of a search.
 MOST_LOGIT = 2.0
 
 
@@ -46,13 +46,13 @@ class Spans(NamedTuple):
     springpots refer."""
 
     low: float  # shortest time [s] that the tests resolve
-    high: float
-    times: np.ndarray
-    reference: float
+    high: float  # longest time [s] that the tests resolve
+    times: np.ndarray  # relaxation times [s] of the modes
+    reference: float  # [rad/s]
 
 
 def spans_of(tests: Sequence[Measured]) -> Spans:
-    """Return the range of times and the reference frequency for all times that the tests resolve."""
+    """Return the times of the modes and the reference frequency, for the range of times that the tests resolve."""
     low, high = together.resolved_by(tests)
     return Spans(low, high, springpots.times_of_modes(low, high), float(1 / np.sqrt(low * high)))
 
@@ -68,7 +68,8 @@ def _dense_modes(case: Fractional, spans: Spans) -> Callable[[Array], Maxwell]:
 
 
 def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], jax.Array]:
-    """Return a JAX function from the variables u of the model to the residuals (m,) of a relaxation or creep test."""
+    """Return a JAX function from the variables u of the springpot model `name` to the residuals (m,) of the m fitted
+    values of a relaxation or creep test."""
     (case,) = (c for c in FRACTIONAL if c.name == name)
     maxwell, (at, measured, scales) = _dense_modes(case, spans_of([test])), together.reported_numbers(test)
 
@@ -79,7 +80,8 @@ def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], j
 
 
 def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.ndarray, data: list) -> Solution:
-    """Return the best minimum of a model for one or more tests, from starting points (S, P).
+    """Return the best minimum of the springpot model `case` for one or more tests, from S starting points (S, P) of its
+    P variables.
 
     `data`: for each test, the arrays from which it is predicted, its measured values, and the divisors of its
     residuals.
@@ -90,8 +92,8 @@ def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.nda
 
 
 def _starts_near(model: Maxwell, spans: Spans) -> list[np.ndarray]:
-    """Return starting points (STARTS, P) for each model. The first point fits the model to the moduli of Prony modes;
-    the others lie around the first."""
+    """Return starting points (STARTS, P) for each springpot model, with P variables. The first point is the fit of the
+    springpot model to the moduli of the Prony modes `model`. The other points lie around the first."""
     omega = np.geomspace(1 / spans.high, 1 / spans.low, 24)
     like, rng = Sweep(omega, *generalised_maxwell.moduli(model, omega)), np.random.default_rng(0)
     first = [np.asarray(fit.solution.u) for fit in models.fractional(like)]
@@ -99,14 +101,14 @@ def _starts_near(model: Maxwell, spans: Spans) -> list[np.ndarray]:
 
 
 def _around(u: np.ndarray, case: Fractional, rng: np.random.Generator) -> np.ndarray:
-    """Return random starting points (STARTS - 1, P) around the variables u (P,) of a model. Exponents do not begin near
-    0 or 1."""
+    """Return random starting points (STARTS - 1, P) around the variables u (P,) of a springpot model. The points are
+    not centred at exponents near 0 or 1."""
     near = np.where(np.array(case.free) % 2 == 1, np.clip(u, -MOST_LOGIT, MOST_LOGIT), u)
     return near + AROUND * rng.standard_normal((STARTS - 1, len(u)))
 
 
 class _Springpot(NamedTuple):
-    """One springpot model at its minimum."""
+    """One springpot model with the parameters at its minimum."""
 
     case: Fractional
     kind: Kind
@@ -119,8 +121,8 @@ class _Springpot(NamedTuple):
 
 
 def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise: bool) -> _Springpot:
-    """Return a model at its minimum. `over_noise`: whether the residuals are divided by a known noise, so that no noise
-    is estimated."""
+    """Return a springpot model with the parameters, errors and warnings at its minimum. `over_noise`: whether the
+    residuals are divided by a known noise, so that no noise is estimated."""
 
     def at(u, omega):
         return springpots.moduli(springpots.full(case, u), case.switches, omega / spans.reference)
@@ -130,7 +132,7 @@ def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise
 
     def moduli(omega):
         storage, loss = at(solution.u, omega)
-        return storage, np.maximum(loss, 1e-12 * np.hypot(storage, loss))  # a fit that diverged may have no loss
+        return storage, np.maximum(loss, 1e-12 * np.hypot(storage, loss))  # the loss modulus of a diverged fit may be 0
 
     made = as_prony_modes.convert(moduli, 1 / spans.high, 1 / spans.low, case.solid)
     kind = Kind(case.name, lambda u: as_prony_modes.modes(made, at(u, made.omega)), case.names, case.units, values)
@@ -200,7 +202,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
 def _with_ends_of_record(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
     fit = fit._replace(details=fit.details | {CONSTANT_NOISE: test.constant_noise})
     if time_tests.ELASTIC in fit.details and not fit.converged:
-        return fit  # its modes have no meaning
+        return fit  # the modes of an elastic material have no meaning
     fit, of_offset = with_offset_errors(fit, [test], [1.0])
     fit = with_rise_of_load(fit, test, prony)
     return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise], common=of_offset), test)
@@ -215,7 +217,7 @@ def _preferred_of(fits: Sequence[AFit], criterion: Callable[[AFit], float]) -> A
 
 
 def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Band) -> list[Content]:
-    """Return the criterion of each compared model, best first."""
+    """Return a table with the information criterion of each compared model, best model first."""
     best = min(map(criterion, tried))
     rows: list[Content] = [
         {
@@ -229,14 +231,18 @@ def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Ban
     return sorted(rows, key=lambda row: row["above_the_lowest"])
 
 
-#: Minimum number of measured values of a test for a check whether its noise has a constant size.
+#: Tests with fewer measured values are not checked for noise of constant size.
 _ENOUGH = 10
-#: Fields that are times in seconds.
+#: Fields of a fit that are computing times [s].
 TIMES = ("run_time", "compile_time")
 
 
 def _cautions_in_time(fit: TimeFit) -> list[str]:
-    out = [] if fit.converged else ["the fit did not converge; its best point is given: try another --model"]
+    out = (
+        []
+        if fit.converged
+        else ["the fit did not converge, and the parameters with the smallest misfit are given: try another --model"]
+    )
     assert fit.parameters is not None
     mean = float(fit.relative_errors.mean())
     if mean > 0.05:
@@ -246,8 +252,8 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
 
 
 def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
-    """Fit every springpot model to several tests, each with separate noise. `near`: Prony modes that give the starting
-    points."""
+    """Fit every springpot model to several tests. Each test has its individual noise level. `near`: Prony modes that
+    give the starting points."""
     spans, parts = spans_of(tests), [together.reported_numbers(t) for t in tests]
     out = []
     for case, starts in zip(FRACTIONAL, _starts_near(near, spans), strict=True):
@@ -271,8 +277,8 @@ def choose_together(
     progress: Callable[[str], None] = lambda text: None,
     relative: float = 0.0,
 ) -> Together:
-    """Return the fit with the lowest information criterion for several tests. See `choose_in_time` and `together.fit`
-    for the arguments.
+    """Return the fit of several tests with the lowest information criterion. The arguments `model` and `modes` are
+    those of `choose_in_time`, and `progress` is that of `together.fit`.
 
     `relative`: relative error of all moduli of a test due to the size of its sample.
     """
@@ -286,8 +292,8 @@ def choose_together(
 
 
 def _by_its_noise(test: Measured) -> Measured:
-    """Return the test. A relaxation or creep test with enough values gets the mark `constant_noise` if its noise has a
-    constant size."""
+    """Return the test. For a relaxation or creep test with enough values, `constant_noise` is set to True if its noise
+    has a constant size."""
     if not isinstance(test, TimeTest) or np.sum(test.used) < _ENOUGH:
         return test
     return fitted_by_its_noise(test)[0]
@@ -321,8 +327,8 @@ def _best_of_models(tests: list[Measured], model: str, prony: Together, progress
 
 
 def _shares_of_springpots(fit: Together) -> list[Share]:
-    """Return the contribution of each test: the errors of the springpot parameters without this test, and the misfit of
-    a fit to this test alone."""
+    """Return the contribution of each test to the common fit: the standard errors of the springpot parameters if this
+    test is left out, and the misfit of a fit to this test alone."""
     (case,) = (c for c in FRACTIONAL if c.name == fit.kind.name)
     parts = [together.reported_numbers(t) for t in fit.tests]
     assert fit.kind.values is not None and fit.parameters is not None

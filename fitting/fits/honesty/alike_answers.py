@@ -16,16 +16,17 @@ from fitting.methods.noise.alike_noise import alike_noise
 from fitting.methods.noise.uneven_noise import probability_of_sizes, uneven_root
 from fitting.readers.time_tests import TimeTest
 
-#: Standard errors computed from the size of each residual are used if they exceed the errors of equal noise by this
-#: factor.
+#: Standard errors computed from the size of each residual are used if they exceed the standard errors for noise of
+#: equal size by this factor.
 _UNEVEN_FROM = 1.3
 
 
 def fitted_by_its_noise(test: TimeTest, modes: int | str = "auto") -> tuple[TimeTest, TimeFit]:
-    """Return the test and the fit of its Prony modes. The test has `constant_noise` if its noise has a constant size.
+    """Return the test and the fit of its Prony modes. `constant_noise` of the returned test is True if the noise has
+    the same standard deviation at all measured values.
 
-    The first fit assumes noise that is proportional to the measured values. If its residuals show noise of a constant
-    size, the test is fitted again with equal scales. Otherwise small values would have too much weight.
+    The first fit assumes noise that is proportional to the measured values. If the residuals show noise of a constant
+    size instead, the test is fitted again with equal scales, because small values had too much weight in the first fit.
     """
     fit = time_tests.fit(test, modes)
     if test.constant_noise or not _has_constant_noise(fit):
@@ -45,9 +46,9 @@ def _has_constant_noise(fit: TimeFit) -> bool:
 
 
 def with_own_noise(fit: TimeFit) -> TimeFit:
-    """Return the fit with standard errors for its real noise. The noise of neighbouring values may be correlated
-    (`with_alike_noise`). The noise may also be larger for some values than for others, for example if the noise grows
-    with time.
+    """Return the fit with standard errors for the noise that its residuals show. The noise of neighbouring values may
+    be correlated (`with_alike_noise`). The noise may also be larger for some values than for others, for example if it
+    grows with time.
     """
     own = fit.parameters
     if fit.kind.effective is not None or not np.all(np.isfinite((own or fit.uncertainty).standard_errors)):
@@ -65,8 +66,9 @@ def with_own_noise(fit: TimeFit) -> TimeFit:
 
 
 def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
-    """Return the estimate. A standard error is replaced by that of another covariance if the latter is much larger.
-    `root` (P, k): square root of the other covariance."""
+    """Return the estimate with some larger standard errors. `root` (P, k) is the square root of a second covariance of
+    the P parameters, with k columns. If the second covariance gives a standard error more than `_UNEVEN_FROM` times
+    larger, this standard error is used."""
     ratio = np.linalg.norm(root, axis=1) / np.where(estimate.standard_errors > 0, estimate.standard_errors, np.inf)
     factor = np.where(np.isfinite(ratio) & (ratio > _UNEVEN_FROM), ratio, 1.0)
     return estimate._replace(
@@ -79,8 +81,8 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
     show such noise.
 
     Two kinds of correlation are tested. The correlation may decrease with the distance in time, for example in a drift.
-    Or the correlation may decrease with the number of values in between, for example if the instrument averages or the
-    model lacks a part of the spectrum. The more probable kind is used.
+    Or the correlation may decrease with the number of measured values in between, for example if the instrument
+    averages or the model lacks a part of the spectrum. The more probable kind of correlation is used.
     """
     r, J = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian)
     numbers = fit.parameters or fit.uncertainty
@@ -117,16 +119,17 @@ def _modes_of(fit: TimeFit | Together) -> Callable:
     return partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
 
 
-#: The noise counts as constant in size if this assumption raises the log of the probability by more than this value.
+#: Noise of constant size is assumed if the log of its probability exceeds that of noise proportional to the response by
+#: more than this value.
 _CONSTANT = 3.0
 
 
 def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the standard deviations of the residuals r (m,), and whether the noise has a constant size. Otherwise the
-    standard deviation of the noise is proportional to the measured response. The residuals decide which case is more
-    probable."""
-    # The scales contain the measured values with their noise, and this noise would seem to depend on J. So the fitted
-    # values are used here.
+    """Return the standard deviations of the m residuals r (m,), and whether the noise has a constant size. Otherwise
+    the standard deviation of the noise is proportional to the measured response. The residuals decide which case is
+    more probable. J: derivatives (m, p) of the residuals with respect to the p unknowns."""
+    # The scales are computed from measured values, so they contain noise, which would disturb the comparison. So the
+    # fitted values replace the measured values here.
     if np.ptp(fit.scales) == 0:  # the fit already assumes constant noise
         equal = np.ones(len(r))
         return probability_of_sizes(J, r, equal)[1] * equal, True
@@ -141,8 +144,9 @@ def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool
 def _of_such_noise(
     estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray, independent: float | None = None
 ) -> Estimate:
-    """Return the estimate with errors from another covariance of the unknowns u. `root` (p, k): square root of this
-    covariance."""
+    """Return the estimate with standard errors from another covariance of the p unknowns u. `root` (p, k): square root
+    of this covariance, with k columns. `independent`: number of independent residuals, or None if it does not
+    change."""
     root = host.with_jacobian(natural_of, u)[1] @ root
     errors, correlation = errors_and_correlation(root)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
@@ -155,10 +159,11 @@ AFit = TypeVar("AFit", TimeFit, Together)
 
 
 def with_offset_errors(fit: AFit, tests: Sequence[Measured], factors: Sequence[float]) -> tuple[AFit, float]:
-    """Return the fit with the errors of the subtracted offsets of sensors in its standard errors.
+    """Return (fit, error): the fit with larger standard errors, which also contain the errors of the sensor offsets
+    that were subtracted from the data.
 
-    The second result is the standard error [Pa] of the equilibrium modulus due to these offsets alone. All measured
-    values of a test contain the same error, so more values do not make it smaller.
+    `error` is the standard error [Pa] of the equilibrium modulus due to these offsets alone. All measured values of a
+    test contain the same offset error, so more measured values do not make this standard error smaller.
 
     Args:
         fit: the fit of these tests.
@@ -187,8 +192,8 @@ def with_offset_errors(fit: AFit, tests: Sequence[Measured], factors: Sequence[f
 def _with_shifts(
     estimate: Estimate, natural_of: Callable, u: np.ndarray, shifts: np.ndarray
 ) -> tuple[Estimate, np.ndarray]:
-    """Return the estimate with errors that move the unknowns u by the columns of `shifts`, and the changes of its
-    parameters."""
+    """Return the estimate with additional independent errors, and the changes of the parameters due to these errors.
+    Each column of `shifts` is the change of the unknowns u if one of the errors is one standard deviation."""
     moved = host.with_jacobian(natural_of, u)[1] @ shifts
     root = np.column_stack([estimate.root, moved])
     errors, correlation = errors_and_correlation(root)

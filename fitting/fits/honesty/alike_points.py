@@ -1,6 +1,6 @@
 """Noise that is correlated between neighbouring frequencies of a sweep, for example because of a drift. If the noise is
-treated as independent, the standard errors of the parameters are too small. This module corrects the standard errors. A
-model that lacks a part of the spectrum leaves residuals of this kind too.
+treated as independent, the standard errors of the parameters are too small. This module corrects the standard errors.
+If a model lacks a part of the relaxation spectrum, its residuals are correlated in the same way.
 """
 
 from collections.abc import Callable
@@ -17,12 +17,12 @@ from fitting.readers.frequency_sweep import Sweep
 #: Key in `Fit.details`: the number of moduli with independent noise that carry the same information as the measured
 #: moduli.
 INDEPENDENT = "independent_moduli"
-#: Key in `Fit.details`: the standard errors for independent noise, by name.
+#: Key in `Fit.details`: the standard errors of the parameters for independent noise, by name.
 OF_INDEPENDENT = "errors_of_independent_noise"
-#: If the noise of neighbours is correlated, a warning about structured residuals uses these words about the standard
-#: errors.
+#: Words about the standard errors in the warning about structured residuals, if the noise of neighbouring frequencies
+#: is correlated.
 CONTAINED = "the standard errors contain it as correlated noise of neighbours"
-#: First words of the warning about noise that is correlated between neighbours.
+#: First words of the warning about noise that is correlated between neighbouring frequencies.
 SHARED = "the noise of neighbouring frequencies is correlated"
 
 
@@ -42,16 +42,18 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
         f"{alike.independent:.0f} independent moduli; the standard errors include this"
     )
     fluid = uncertainty.like_a_fluid(modes, uncertainty.LOWER) if fit.kind.name == "prony" else []
-    fluid = [] if any("(a fluid)" in w for w in fit.warnings) else fluid  # reported before, with smaller errors
+    # The warning about a fluid may have been given before, with the smaller errors.
+    fluid = [] if any("(a fluid)" in w for w in fit.warnings) else fluid
     details = fit.details | {INDEPENDENT: float(alike.independent)}
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, *fluid, told), details=details)
 
 
 def alike_of(fit: Fit) -> Alike | None:
-    """Return the noise that is correlated between neighbouring frequencies, or None if the residuals show none. No
-    frequency may occur twice.
+    """Return the size and correlation length of noise that is correlated between neighbouring frequencies. Returns None
+    if the residuals show no such noise. No frequency may occur twice.
 
-    The result is also None for spectra, because their errors come from a prior, and for exact data.
+    The function also returns None for exact data, and for spectra, because the errors of a spectrum come from a prior
+    too.
     """
     r, J, n = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian), len(fit.storage)
     numbers = fit.parameters or fit.uncertainty
@@ -65,8 +67,9 @@ def alike_of(fit: Fit) -> Alike | None:
 
 
 def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray) -> Estimate:
-    """Return the estimate with larger errors from noise, where another covariance of u gives larger ones. `root`:
-    square root (p, k) of this covariance. Errors that are common to all points are added again unchanged.
+    """Return the estimate with larger standard errors of those parameters for which another covariance of the p
+    unknowns u gives a larger error due to noise. `root`: square root (p, k) of this covariance, with k columns. Errors
+    that are common to all points are added again unchanged.
     """
     shared = np.zeros((len(estimate.values), 0)) if estimate.shared is None else estimate.shared
     noise = np.asarray(estimate.root)[:, : np.shape(estimate.root)[1] - shared.shape[1]]

@@ -15,14 +15,14 @@ from fitting.readers.rheometer import Sweep
 
 #: Probability that noise alone changes a parameter enough to be reported.
 CHANCE = 0.05
-#: SMOOTH: if the points scatter about a smooth curve by less than this fraction of the residuals, the model causes the
-#: residuals. ENOUGH: minimum number of points for this comparison.
+#: SMOOTH: if the points scatter about a smooth curve by less than this fraction of the residuals, an inadequate model
+#: causes the residuals. ENOUGH: minimum number of points for this comparison.
 SMOOTH, ENOUGH = 0.5, 16
 
 
 def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]:
-    """Return the standard deviation of the change of each parameter of `edges.values` due to noise alone, if only the
-    points `kept` (n,) are fitted. This estimate is of first order in the noise.
+    """Return the standard deviation of the change of each parameter of `edges.values` due to noise alone, if a second
+    fit contains only the points `kept` (n,) of the n points. The result is of first order in the noise.
 
     Both fits contain the kept points. The variance of the change is therefore that of the difference between the two
     fits, not that of the new fit.
@@ -31,7 +31,7 @@ def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]
     points = 2 * len(kept)
     if not (np.all(np.isfinite(J)) and len(J) >= points and len(kept) == len(fit.storage)):
         return dict.fromkeys(names, 0.0)
-    rows = np.concatenate([kept, kept, np.ones(len(J) - points, bool)])  # residuals of a prior stay
+    rows = np.concatenate([kept, kept, np.ones(len(J) - points, bool)])  # residuals of a prior are always kept
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     change = -np.linalg.pinv(J / scale)
     change[:, rows] += np.linalg.pinv(J[rows] / scale)
@@ -51,8 +51,8 @@ def farthest_by_chance(fit: Fit | TimeFit, numbers: int) -> float:
 
 
 def _slopes_of_reported(fit: Fit) -> tuple[list[str], np.ndarray]:
-    """Return the names of the reported parameters, and their derivatives (P, p) with respect to u, also for a
-    compressed sample."""
+    """Return the names of the P reported parameters, and their derivatives (P, p) with respect to the p unknowns u. For
+    a compressed sample, the parameters are those of the sample at rest."""
     u = np.asarray(fit.solution.u)
     if fit.parameters is not None:
         assert fit.kind.values is not None
@@ -77,12 +77,13 @@ def _as_reported(slope: np.ndarray, natural: np.ndarray, reported: np.ndarray) -
 
 
 def _noise_of_residuals(fit: Fit, sweep: Sweep, J: np.ndarray) -> np.ndarray:
-    """Return the noise (2n,) of the residuals, divided by their scales. Residuals that are smooth from point to point
-    are not noise."""
+    """Return the standard deviations (2n,) of the noise of G' and G'' at n frequencies, divided by the scales of the
+    residuals. Residuals that are smooth from point to point are not counted as noise."""
     r, n = np.asarray(fit.solution.residuals)[: len(J)], len(J) // 2
     own = None if fit.kind.effective is not None else grouped_sizes(J, r, np.arange(2 * n) >= n)
     sizes = np.full(2 * n, fit.uncertainty.noise) if own is None else own
-    if len(np.unique(sweep.angular_frequency)) < max(n, ENOUGH):  # a few points do not show their scatter well enough
+    # The scatter of few points, or of points with repeated frequencies, cannot be estimated.
+    if len(np.unique(sweep.angular_frequency)) < max(n, ENOUGH):
         return sizes
     columns = ((sweep.storage, slice(0, n)), (sweep.loss, slice(n, 2 * n)))
     for (modulus, rows), deviation in zip(columns, sweep.deviations, strict=True):

@@ -25,9 +25,9 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
     """Return a warning that names the test and the factor that make all tests agree. There is no warning if the tests
     agree already, or if no factor makes them agree.
 
-    Ratios and times can compensate a factor of a few percent. The common fit then fits each test nearly as well as a
-    separate fit does. Wrong sizes of the samples explain a small factor. `relative` is the relative error of the moduli
-    of each test due to these sizes.
+    The ratios and relaxation times of a common fit can compensate a factor of a few percent. The common fit then fits
+    each test nearly as well as a separate fit does. A small factor may come from wrong sizes of the samples. `relative`
+    is the relative error of the moduli of each test due to the size of its sample.
     """
     if fit.kind.effective is not None:
         return []
@@ -43,8 +43,8 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
     )
     if abs(np.log(factor)) < 2 * np.sqrt(2) * relative:
         return [
-            said + "errors in the sizes of the samples explain this factor. The errors that include the "
-            "errors of these sizes contain this factor"
+            said + "errors in the sizes of the samples explain this factor. The total errors contain the "
+            "errors of these sizes"
         ]
     return [
         said
@@ -73,9 +73,9 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
         return np.concatenate(r, axis=-1), np.concatenate(J, axis=-2)
 
     counts, common = [len(y) for _, y, _ in data], np.append(np.asarray(fit.solution.u), 0.0)[None]
-    if fit.kind.values is not None:  # starting points of modes cannot be used for a springpot
+    if fit.kind.values is not None:  # the starting points below are for Prony modes
         return _certain(from_starts(evaluate, common), counts)
-    # If tests contradict each other, their common fit may have too few modes.
+    # If tests contradict each other, their common fit may have too few modes. So more modes are tried too.
     more, answer = together.MORE if together.disagreements(fit.shares) else 0, None
     for modes in range(fit.modes, fit.modes + 1 + more):
         starts = _starts_at_the_others(fit, k, modes)
@@ -87,7 +87,8 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
 
 
 def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] | None:
-    """Return the result of `factor_of` from the solution. `counts`: the number of residuals of each test."""
+    """Return the factor, its standard error and the largest remaining relative misfit, or None (see `factor_of`).
+    `counts`: the number of residuals of each test."""
     left = np.split(np.asarray(found.residuals), np.cumsum(counts)[:-1])
     worst = max(float(np.sqrt(np.mean(r**2))) for r in left)
     last = np.eye(len(found.u))[-1:]
@@ -99,8 +100,8 @@ def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] |
 
 
 def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
-    """Return starting points that fit the other tests. Each contains the factor that shifts the prediction of test k to
-    the measured values. The common fit is not a good starting point for a large factor.
+    """Return starting points that fit the other tests. Each starting point contains the factor that shifts the
+    prediction of test k to the measured values. For a large factor, the common fit is not a good starting point.
     """
     others = [t for j, t in enumerate(fit.tests) if j != k]
     band = together.ResolvedBand(together.resolved_by(others))

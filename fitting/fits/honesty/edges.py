@@ -16,14 +16,16 @@ from fitting.methods.least_squares import from_starts
 from fitting.readers.rheometer import Sweep, some
 
 HALF_DECADE = float(np.sqrt(10))
-#: KRAMERS_KRONIG: name of the check of the data in its warnings. PARTS: names of the two repeated fits in the report.
+#: KRAMERS_KRONIG: word by which warnings of the Kramers-Kronig check of the data are found. PARTS: names of the two
+#: repeated fits in the report.
 KRAMERS_KRONIG = "Kramers-Kronig"
 PARTS = ("without_first_half_decade", "without_last_half_decade")
 
 
 def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
-    """Add to the fit the influence of the ends of the band, a check of its residuals for structure, and the checks that
-    need only the data."""
+    """Return the fit with further checks and errors: standard errors for correlated noise, the check of the data by the
+    Kramers-Kronig relations, the check of the residuals for structure, the influence of the ends of the band, and the
+    interval of the equilibrium modulus."""
     wider = with_alike_points(fit, sweep)
     if wider is not fit:
         own = {name: error for name, (_, error) in values(fit).items()}
@@ -60,21 +62,22 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
 
 
 def _with_long_times(fit: Fit, sweep: Sweep) -> Fit:
-    """Add the interval of the equilibrium modulus, if the only unknowns of the fit are Prony modes."""
+    """Add the interval of the equilibrium modulus, if the strengths and times of Prony modes are the only unknowns of
+    the fit."""
     if fit.parameters is not None or len(fit.solution.u) != 2 * fit.modes + (fit.kind.name != FLUID.name):
         return fit
     fluid = fit.kind.name == FLUID.name
     natural = generalised_maxwell.natural_fluid if fluid else generalised_maxwell.natural
     own = natural(np.asarray(fit.solution.u))
-    # For a compressed sample, each parameter is the value from the data times a factor.
+    # For a compressed sample, each reported modulus is the modulus that fits the data, times a factor.
     of = "shear_modulus" if fluid else "equilibrium_modulus"
     factor = float(getattr(fit.model, of) / max(float(getattr(own, of)), 1e-300))
     return with_interval(fit, [sweep], [fit.uncertainty.noise], factor) if factor > 0 else fit
 
 
 def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
-    """Return a warning that no model can fit the data much better than `fit`, because most of the misfit comes from the
-    data."""
+    """Return a warning for a fit to data that no model fits well. Even the best spectrum of any shape misses these
+    data, so the data cause a part of the misfit."""
     errors, closer = fit.relative_errors(sweep), fit.kind.effective is None
     return (
         f"{MISSES} by {100 * errors.mean():.2g} % on average and by {100 * errors.max():.3g} % at most. The best "
@@ -93,14 +96,16 @@ def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
 
 
 def _points_left(sweep: Sweep) -> dict[str, np.ndarray]:
-    """Return whether each point (n,) is kept if the first half decade is left out, and if the last one is left out."""
+    """Return whether each of the n points (n,) is kept, for the fits without the first and without the last half
+    decade."""
     omega = sweep.angular_frequency
     kept = (omega > omega[0] * HALF_DECADE * (1 + 1e-9), omega < omega[-1] / HALF_DECADE * (1 - 1e-9))
     return dict(zip(PARTS, kept, strict=True))
 
 
 def values(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
-    """Return the compared parameters with their standard errors. Their names in the report are the keys."""
+    """Return the value and the standard error of each parameter that is compared. The keys are the names of the
+    parameters in the report."""
     from fitting.methods.uncertainty import equilibrium_error
 
     if fit.parameters is not None:
@@ -120,11 +125,13 @@ def moved(fit: Fit) -> set[str]:
 
 def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
     """Return the parameters that change by more than their standard error and by more than expected from noise, if the
-    half decade of `part` is left out. The value is the size of the change, divided by the larger of these two limits.
+    half decade of `part` (one of `PARTS`) is left out. The keys are the names of the parameters. Each value is the size
+    of the change, divided by the larger of these two limits.
     """
     changes, known = (fit.details.get("band_sensitivity") or {}).get(part) or {}, values(fit)
     by_noise = (fit.details.get("band_scatter") or {}).get(part) or {}
-    # If a model misses the data, its smooth residuals are not noise and do not explain a change.
+    # The smooth residuals of an inadequate model are not noise and do not explain a change. So the errors for
+    # independent noise are the limit.
     known |= {name: (known[name][0], e) for name, e in fit.details.get(OF_INDEPENDENT, {}).items() if name in known}
     far, out = chance_of_ends.farthest_by_chance(fit, len(changes)), {}
     for name, change in changes.items():
@@ -140,22 +147,23 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     Returns None if too few points are kept."""
     if len(np.unique(sweep.angular_frequency[kept])) <= max(2, len(fit.solution.u) // 2 + 1):
         return None
-    # Each kept point has its weight from the whole sweep, because standard deviations are smoothed only once.
+    # Each kept point has its weight from the whole sweep, because the standard deviations were smoothed over the whole
+    # sweep.
     storage_sd, loss_sd = sweep.deviations
     part = some(sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd), kept)
     old = {name: value for name, (value, _) in values(fit).items()}
     if fit.kind.effective is not None:
         found = fit.details["spectrum"]
         grid = relaxation_spectrum.at(part, found["times_per_decade"], found["smoothing"])
-        # For a compressed sample, each parameter is the value from the data times a factor.
+        # For a compressed sample, each reported modulus is the modulus that fits the data, times a factor.
         factor = {name: value / float(np.exp(fit.solution.u[0])) for name, value in old.items()}
         return {name: factor[name] * grid.equilibrium - value for name, value in old.items()}
     if fit.parameters is not None:
         (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)
         starts = springpots.starting_points(part)[:, list(model.free)]
         starts[-1] = np.asarray(fit.solution.u)
-        # The variables u use the middle of the whole band as unit of frequency. So the sweep stays whole, and points
-        # left out have no weight.
+        # The unit of frequency in the variables u is the middle of the whole band. So the whole sweep is used, and the
+        # points that are left out get infinite scales, which means no weight.
         scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
         found = springpots.best_minimum(model, sweep, starts, scales)
         assert fit.kind.values is not None
@@ -204,4 +212,4 @@ def _relative_change(change: float, value: float) -> str:
     part = change / value
     if abs(part) >= RUNS_AWAY:
         return "more than tenfold"
-    return f"{100 * part:+.2g} %" if abs(part) < 0.995 else f"{100 * part:+.3g} %"  # not 1e+02 %
+    return f"{100 * part:+.2g} %" if abs(part) < 0.995 else f"{100 * part:+.3g} %"  # three digits avoid 1e+02 %

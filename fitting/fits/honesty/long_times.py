@@ -35,8 +35,8 @@ SLOW = (0.3, 1.0, 3.0)
 SLOW_PART = 0.1
 #: BISECTIONS: number of bisections for each end of the interval. ITERATIONS: maximum number of iterations of each fit.
 BISECTIONS, ITERATIONS = 6, 60
-#: An interval is reported if the distance of its farther end exceeds two limits. The first is WIDER times the half
-#: width of the 95 % interval from the standard error. The second is LARGE times the modulus.
+#: The program warns about an interval if its farther end is far from the fitted equilibrium modulus. The distance must
+#: exceed WIDER times the half width of the 95 % interval from the standard error, and LARGE times this modulus.
 WIDER, LARGE = 2.0, 0.05
 #: Half width of a 95 % interval, divided by the standard error, for many independent residuals.
 NORMAL = 1.96
@@ -47,16 +47,16 @@ class Interval(NamedTuple):
 
     low: float  # [Pa]
     high: float
-    longest: float  # relaxation time [s] up to which materials are considered
+    longest: float  # [s] the interval holds for materials whose relaxation times are at most this long
     modes: int  # number of modes of the model
 
 
 class _Family(NamedTuple):
-    """Prony modes with a given equilibrium modulus. Their unknowns are logs of strengths and logits of bounded log
-    times."""
+    """Fits of Prony modes with a fixed equilibrium modulus. The unknowns u of N modes are the logs of their strengths,
+    and the logits of the positions of their log times between two bounds."""
 
     evaluate: Callable[[float, np.ndarray], Solution]
-    ends: tuple[float, float]  # logs of the shortest and the longest time
+    ends: tuple[float, float]  # logs of the shortest and the longest relaxation time that is allowed
 
     def unknowns(self, strengths: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Return u (2 N,) from strengths (N,) [Pa] and times (N,) [s]."""
@@ -71,8 +71,8 @@ def equilibrium_interval(
 
     Args:
         tests: the fitted tests, one or more.
-        noises: for each test, a known or fitted factor that turns its scales into standard deviations.
-        model: the chosen modes.
+        noises: for each test, the factor by which its scales must be multiplied to become standard deviations.
+        model: the chosen Prony modes.
         error: standard error [Pa] of the equilibrium modulus; it may be infinite.
         independent: number of independent residuals, divided by the number of all residuals.
     """
@@ -122,12 +122,14 @@ def _family(tests: Sequence[Measured], noises: Sequence[float], times: tuple[flo
 def _with_one_more(
     family: _Family, model: tuple[float, np.ndarray, np.ndarray], longest: float, found: Solution
 ) -> tuple[float, Solution]:
-    """Return the equilibrium modulus and the fit at the minimum. One more slow mode is used if the data need it."""
+    """Return the equilibrium modulus and the fit at the minimum. One more mode with a long relaxation time is used if
+    it lowers the misfit by more than `CLOSER`. `longest`: longest time [s] that the test resolves."""
     rest, strengths, times = model
     noise = max(1.0, 2 * float(found.cost) / max(1, len(found.residuals) - len(found.u) - 1))
     best = (rest, found)
-    slow = rest or SLOW_PART * float(np.sum(strengths))  # a fluid has no equilibrium modulus to divide
-    for part in (0.8, 0.5, 0.2, 0.0):  # this part of the equilibrium modulus stays; the rest relaxes slowly
+    # In a solid, the strength of the slow mode is a part of the equilibrium modulus. A fluid has no such modulus.
+    slow = rest or SLOW_PART * float(np.sum(strengths))
+    for part in (0.8, 0.5, 0.2, 0.0):  # this part of the equilibrium modulus is kept; the rest goes to the slow mode
         more = np.append(strengths, (1 - part) * slow)
         starts = np.stack([family.unknowns(more, np.append(times, k * longest)) for k in SLOW])
         trial = family.evaluate(part * rest, starts)
@@ -137,7 +139,9 @@ def _with_one_more(
 
 
 def _end(family: _Family, modulus: float, found: Solution, limit: float, step: float, whole: float) -> float:
-    """Return the equilibrium modulus at which the sum of squares reaches its limit, on one side of the minimum."""
+    """Return the equilibrium modulus at which the sum of squares reaches its limit, on one side of the minimum. The
+    sign of `step` [Pa], the first step away from the minimum, selects the side. The search also ends at 0 and above 10
+    times `whole`."""
     u, inside, outside = np.asarray(found.u), modulus, None
     while outside is None:
         trial = max(0.0, inside + step)
@@ -158,7 +162,7 @@ def _end(family: _Family, modulus: float, found: Solution, limit: float, step: f
     return outside
 
 
-#: Key of the interval in the details of a fit.
+#: Key in `details` of a fit: the 95 % interval of the equilibrium modulus.
 INTERVAL = "equilibrium_modulus_interval_95"
 AFit = TypeVar("AFit", Fit, TimeFit, Together)
 
@@ -172,7 +176,8 @@ def with_interval(
     Args:
         fit: the fit of these tests.
         tests, noises: see `equilibrium_interval`.
-        factor: equilibrium modulus in the fit divided by the one in the data, different from 1 for a compressed sample.
+        factor: reported equilibrium modulus divided by the one that fits the data. It differs from 1 for a compressed
+            sample.
         common: standard error [Pa] of the equilibrium modulus that comes from an error common to all measured values.
     """
     if fit.parameters is not None or not fit.converged:
@@ -204,7 +209,7 @@ def _told_interval(ends: tuple[float, float, float], error: float, found: Interv
     readers understand the number after ± as a standard error.
     """
     low, rest, high = ends
-    where = f"if parts of the material relax in up to {found.longest:.3g} s"
+    where = f"if parts of the material have relaxation times of up to {found.longest:.3g} s"
     if rest <= 1e-9 * whole:
         if high < LARGE * whole:
             return []

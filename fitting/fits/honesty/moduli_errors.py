@@ -22,11 +22,11 @@ def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
     """Return G' then G'' (2n,) [Pa] of a fit in closed form, with errors by the delta method (linear propagation of
     errors).
 
-    The errors come from noise and from the choice of the model. They also contain the errors of gap and instrument if
-    the fit has them.
+    The errors come from noise and from the choice of the model. They also contain the errors of the gap and of the
+    instrument if the fit contains these errors.
 
     Args:
-        fit: the fit; its field `rivals` has the other models if several were fitted.
+        fit: the fit; its field `rivals` contains the fits of the other models if several models were fitted.
         omega: angular frequencies (n,) [rad/s].
         noise_given: whether the data have standard deviations.
     """
@@ -67,8 +67,9 @@ def _akaike(fit: Fit) -> float:
 
 
 def _shared_errors(fit: Fit, omega: np.ndarray) -> np.ndarray:
-    """Return the change (s, 2n) [Pa] of the moduli if a systematic error (gap, instrument), common to all points,
-    changes by one standard deviation. There is one row for each error."""
+    """Return the changes (s, 2n) [Pa] of G' and G'' at n frequencies, with one row for each of s systematic errors
+    (gap, instrument). Such an error is common to all points. Each row is the change if the error is one standard
+    deviation."""
     shared, n = fit.uncertainty.shared, fit.modes
     if shared is None:
         return np.zeros((0, 2 * len(omega)))

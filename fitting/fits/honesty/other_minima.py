@@ -1,5 +1,5 @@
-"""Other parameter values of a law may fit the test data equally well. This module checks whether they predict the same
-stress in tension and compression.
+"""Other parameter values of a law may fit the test data equally well. This module checks whether such values predict
+the same stress in tension and compression as the fitted values.
 
 In simple shear and pure shear one principal stretch is 1 and the other two are l and 1/l. In these tests, one term (mu,
 alpha) of Ogden's law equals the term (-mu, -alpha). In tension and compression, the stresses of the two terms differ by
@@ -24,16 +24,16 @@ _SAME, _MOST = 0.02, 12
 def of_other_minima(
     names: Sequence[str], law_of: Callable[..., Law], values: np.ndarray, every: np.ndarray, F: np.ndarray
 ) -> list[str]:
-    """Return a warning if another minimum has the same cost as the best one, but another stress in tension or
+    """Return a warning if another minimum has the same cost as the fit, but gives another stress in tension or
     compression.
 
     Args:
         names: names of the parameters of the law (P,).
         law_of: function from parameters (P,) to the law with these parameters.
         values: fitted parameters (P,).
-        every: parameters (S, P) of all searches that reached the cost of the fit.
-        F: deformation gradients (n, 3, 3) of the tests. The compared stretches stay within the stretches of the tests,
-            or within 1 % of 1.
+        every: parameters (S, P) of the S searches that reached the cost of the fit.
+        F: deformation gradients (n, 3, 3) at the n points of the tests. Stresses are compared at the largest stretch of
+            the tests (at least 1.01, at most 1.4), and at its inverse (at least 0.7).
     """
     far = float(np.clip(np.max(np.linalg.norm(F, 2, axis=(1, 2))), 1.01, _STRETCHES[1]))
     stretches = np.array([max(1 / far, _STRETCHES[0]), far])

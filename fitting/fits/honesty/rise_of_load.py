@@ -1,9 +1,9 @@
-"""A load that changes between two rows of the file of a relaxation or creep test. No row shows how the load changed, so
-a linear change is assumed.
+"""Effect of a load that changes between two rows of the file of a relaxation or creep test. No row shows how the load
+changed, so a linear change is assumed.
 
-If the load was a step at the later row, the material had relaxed less until then, and G0 is smaller. If the sample is
-already loaded in the first row, the load may have been a step at 0 s. The change matters if relaxation times are as
-short as the time between the two rows.
+If the load was a step at the later row, the material had relaxed less until this row, and the true G0 is smaller. If
+the sample is already loaded in the first row, the load may have been a step at 0 s. The assumption matters if
+relaxation times are as short as the time between the two rows.
 """
 
 from fitting.fits import time_tests
@@ -18,11 +18,12 @@ SHOWN = 2.0
 
 
 def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
-    """Return the fit. A warning is added if steps of the load, instead of linear changes between rows, change G0 by
-    more than `SHOWN` standard errors. A fit of Prony modes also gets the changes of its parameters.
+    """Return the fit. A warning is added if G0 changes by more than `SHOWN` standard errors when steps of the load are
+    assumed instead of linear changes between rows. The changes of all parameters are added to the details of a fit of
+    Prony modes.
 
     Args:
-        fit: fit of any model.
+        fit: a fit of any model to this test.
         test: data.
         prony: the fit of Prony modes, which gives the change of G0 for other models.
     """
@@ -70,7 +71,7 @@ def _remedy_of_jumps(test: TimeTest) -> str:
 
 
 def share_of_rise(fit: TimeFit, names: list[str]) -> dict[str, float]:
-    """Return the size of the change of each parameter if the load was a step. The size is 0 if `with_rise_of_load`
-    found no change."""
+    """Return the absolute change of each parameter, by name, if the load was a step. The change is 0 if
+    `with_rise_of_load` added no changes to the fit."""
     changes = fit.details.get(OF_A_STEP, {})
     return {name: abs(changes.get(name, 0.0)) for name in names}

@@ -1,8 +1,8 @@
 """Errors of the parameters of several tests due to errors in the sizes of the samples.
 
-Torque divided by twist is G pi R^4 / (2 h), so a wrong gap h or radius R multiplies all moduli of a test by a factor.
-In one test this factor changes G0 alone. If tests with different factors are fitted together, ratios and times change
-too.
+Torque divided by twist is G pi R^4 / (2 h) for the shear modulus G, so a wrong gap h or radius R multiplies all moduli
+of a test by a factor. In one test this factor changes G0 alone. If tests with different factors are fitted together,
+ratios and times change too.
 """
 
 from functools import partial
@@ -22,7 +22,7 @@ def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, flo
 
     Args:
         fit: the common fit.
-        relative: relative standard deviation of a test's factor, see `total_error.of_geometry`.
+        relative: relative standard deviation of the factor of a test, see `total_error.of_geometry`.
     """
     own = fit.uncertainty if fit.parameters is None else fit.parameters
     names = [n for n in own.names if not n.startswith("strengths[")]

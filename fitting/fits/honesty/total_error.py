@@ -21,7 +21,7 @@ GAP, RADIUS = 50e-6, 10e-6
 
 def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
     """Return the relative error of all moduli due to the size of the sample between the plates. Torque divided by twist
-    is G pi R^4 / (2 h) for the radius R and the gap h.
+    is G pi R^4 / (2 h) for the shear modulus G, the radius R and the gap h.
 
     If a `gap_error` [m] is given, the standard errors contain it already, and it is not counted here.
     """
@@ -30,14 +30,15 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
 
 
 def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
-    """Return the errors of the parameters: for each source, a dictionary with the names of `edges.values` as keys.
+    """Return the errors of the parameters: for each source of error, a dictionary with the parameter names of
+    `edges.values` as keys.
 
     The share `band` is the larger change of a parameter if one end of the band is left out. This change counts only if
     it is larger than expected from noise (`edges.decided_by`). The square of the change due to noise is subtracted from
-    its square. If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter. The share
-    `long_times` comes from the farther end of `long_times.equilibrium_interval`, as a standard deviation. The share
-    `short_times` is the part of G0 that `short_times` finds to be missing. The share `rise_of_load` is the change if
-    the load was a step at the row that shows it first.
+    the square of this change. If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter.
+    The share `long_times` comes from the farther end of `long_times.equilibrium_interval`, as a standard deviation. The
+    share `short_times` is the part of G0 that `short_times` finds to be missing. The share `rise_of_load` is the change
+    if the load was a step at the first row that shows the new load.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -89,8 +90,8 @@ def _moduli(fit: Fit | TimeFit) -> set[str]:
 
 
 def _of_modes(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
-    """Return absolute changes by name, from the changes `moved` (P,) of G0, ratios and times. The change of the
-    equilibrium modulus is added."""
+    """Return the absolute change of each parameter, by name. `moved` (P,): changes of G0, ratios and relaxation times.
+    The change of the equilibrium modulus is computed from these changes."""
     out = {name: abs(float(d)) for name, d in zip(fit.uncertainty.names, moved, strict=True)}
     out["equilibrium_modulus"] = abs(float(equilibrium_change(fit.uncertainty.values, moved)))
     return {name: out[name] for name in edges.values(fit)}

@@ -17,7 +17,7 @@ from liverjax.laws import Law, homogeneous
 #: _FEWEST: minimum number of points of a curve whose residuals are tested. _EXACT: residuals below this value are
 #: roundoff.
 _FEWEST, _EXACT = 8, 1e-6
-#: A cause is reported if it lowers the criterion by more than _BETTER and if the remaining residuals look random
+#: A cause is reported if it lowers Akaike's criterion by more than _BETTER and if the remaining residuals look random
 #: (probability of their order above _RANDOM).
 _BETTER, _RANDOM = 10.0, 0.05
 _stress = jax.jit(homogeneous.nominal_stress)
@@ -26,9 +26,10 @@ _stress = jax.jit(homogeneous.nominal_stress)
 class _Cause(NamedTuple):
     """Another meaning of the columns of a curve. The driven quantity is the imposed one, for example the stretch. The
     function `driven` computes the true driven quantity from (driven column, number). The function `column` computes the
-    stress column from (nominal stress, driven column, number).
+    values in the stress column from (nominal stress, true driven quantity, number).
 
-    The fitted number is in units of the range of `driven`, or in units of the stress scale of the curve.
+    During the fit, the number is divided by the range of the driven column, or by the stress scale of the curve if the
+    number is a stress.
     """
 
     words: str
@@ -47,13 +48,13 @@ _CAUSES = (
 
 
 def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> list[str]:
-    """Return a warning about the curves whose residuals keep their sign over many points, with the cause if one is
-    found.
+    """Return a warning about the curves whose residuals keep their sign over many points. If another meaning of the
+    columns explains these residuals, the warning states this cause.
 
     Args:
         curves: the curves.
-        fit: the best fit.
-        every: whether all laws were tried.
+        fit: the best fit of the curves.
+        every: whether all laws were tried, so that the warning does not advise to try other laws.
     """
     # If the fit has reported a factor for each test already, this factor is not an error of the law.
     named = any(sentence.startswith(OWN_FACTORS) for sentence in fit.warnings)
@@ -87,7 +88,7 @@ def _nearest_factor(law: Law, curve: Curve, named: bool) -> float:
 
 
 def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
-    """Return a string that states the cause that lowers the criterion most and leaves random residuals. The string is
+    """Return a string with the cause that lowers Akaike's criterion most and leaves random residuals. The string is
     empty if there is no such cause."""
     found = [(_criterion(fit.law, curves, odd, None), "")]
     limit = found[0][0].value - _BETTER
@@ -108,14 +109,14 @@ def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
 
 class _Refit(NamedTuple):
     value: float  # Akaike's criterion, corrected for few points
-    chance: float  # probability of the order of the residuals, the smallest of the curves with structure
+    chance: float  # smallest probability of the order of residuals, of all curves with a structured misfit
     number: float
     law: Law
 
 
 def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | None) -> _Refit:
-    """Fit the law again from its best parameters. `cause` states another meaning of the columns of the curves `odd`
-    (None: the stated meaning)."""
+    """Fit the law again, starting from its fitted parameters, and return Akaike's criterion and other results. `cause`
+    is another meaning of the columns of the curves `odd`; None: the columns are what their names say."""
     leaves, tree = jax.tree.flatten(law)
     every = np.array([float(leaf) for leaf in leaves])
     start = every[every != 0]

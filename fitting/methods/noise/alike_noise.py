@@ -31,11 +31,11 @@ FEW, MOST = 12, 400
 #: Noise counts as correlated if the correlation raises the log likelihood by more than this value. With uncorrelated
 #: noise, this happens once in a thousand cases.
 GAIN = 7.0
-#: If the root mean square of the residuals is below this value, they are not the stated noise, for example in synthetic
-#: data without noise.
+#: If the root mean square of the residuals is below this value, the data do not contain the stated noise, for example
+#: because they are synthetic data without noise.
 LEAST = 0.2
-#: Residuals are clipped at this many robust standard deviations: a single wrong point must not look like correlated
-#: noise.
+#: Residuals are clipped at this many robust standard deviations, so that a single wrong point does not look like
+#: correlated noise.
 OUTLIER = 5.0
 #: An unknown is considered if the norm of its derivatives in the chosen groups, divided by their norm in all groups,
 #: exceeds this value.
@@ -48,7 +48,7 @@ ROWS = 500
 
 
 class Alike(NamedTuple):
-    """Correlated noise of neighbouring points, as the residuals show it."""
+    """Correlated noise of neighbouring points, estimated from the residuals of a fit with p unknowns."""
 
     length: float  # [m]
     part: float  # correlated part a of the variance
@@ -111,9 +111,8 @@ def _alike_noise(
 
 
 def _determined(J: np.ndarray) -> np.ndarray:
-    """Return the directions (p, k) of the unknowns that the derivatives J (n, p) determine. If a parameter is at its
-    bound, one direction is not determined, and a determinant with it would be only roundoff.
-    """
+    """Return the k directions (p, k) of the unknowns that the derivatives J (n, p) determine. If a parameter is at its
+    bound, one direction is not determined. A determinant that contains this direction would be only roundoff."""
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
     _, values, directions = np.linalg.svd(J / size, full_matrices=False)

@@ -25,19 +25,20 @@ _SAME = 1e-12
 
 
 class FactorNoise(NamedTuple):
-    """Unknown factors of the series, and their effect on the parameters."""
+    """Unknown factors of K series with n residuals in all, and their effect on P parameters."""
 
     deviation: float  # most probable standard deviation of a factor [1], possibly 0; at most `HIDDEN` if not shown
     root: np.ndarray  # (P, n + K) square root of the covariance of the parameters
     shown: bool  # whether the residuals show factors: independent noise alone does not explain them
     hidden: float  # largest standard deviation of factors that the residuals do not exclude [1], at most `HIDDEN`
-    moves: np.ndarray  # (P,) standard deviations of the parameters due to factors of this size
+    moves: np.ndarray  # (P,) standard deviations of the parameters due to factors of the size `hidden`
 
 
 def factors_of_series(
     counts: list[int], J: np.ndarray, r: np.ndarray, fitted: np.ndarray, slope: np.ndarray
 ) -> FactorNoise | None:
-    """Fit noise with the covariance s^2 (I + q^2 f_k f_k^T) to the residuals of each series k. Returns None for a
+    """Fit noise with the covariance s^2 (I + q^2 f_k f_k^T) to the residuals of each series k. Here s is the standard
+    deviation of the independent noise, q s that of the factors, and f_k are the fitted values. Returns None for a
     single series or too few residuals.
 
     There are few factors, so their standard deviation is uncertain. If the residuals show factors, their standard

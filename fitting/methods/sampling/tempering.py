@@ -30,13 +30,13 @@ LONG = 0.1
 class Density(NamedTuple):
     """A posterior density. Its functions take the parameters u (W, P) of W points."""
 
-    log_likelihood: Callable[[np.ndarray], np.ndarray]  # -> (W,), up to a constant
-    log_prior: Callable[[np.ndarray], np.ndarray]  # -> (W,), -inf outside of its support
+    log_likelihood: Callable[[np.ndarray], np.ndarray]  # u -> logarithms (W,), up to a constant
+    log_prior: Callable[[np.ndarray], np.ndarray]  # u -> logarithms (W,); -inf where the prior is 0
     from_prior: Callable[[np.random.Generator, int], np.ndarray]  # (generator, W) -> (W, P)
 
 
 class Chains(NamedTuple):
-    """Draws of independent runs."""
+    """N draws of P parameters from each of the independent runs."""
 
     draws: np.ndarray  # (CHAINS, N, P)
     log_evidence: np.ndarray  # (CHAINS,) log of the evidence (the mean likelihood under the prior)
@@ -48,8 +48,8 @@ class Chains(NamedTuple):
 
 class _Particles(NamedTuple):
     u: np.ndarray  # (N, P)
-    likelihood: np.ndarray  # (N,) log
-    prior: np.ndarray  # (N,) log
+    likelihood: np.ndarray  # (N,) logarithm of the likelihood
+    prior: np.ndarray  # (N,) logarithm of the prior density
 
     def at(self, places: np.ndarray) -> "_Particles":
         return _Particles(*(field[places] for field in self))
@@ -122,7 +122,7 @@ def _moved(
     density: Density, start: _Particles, power: float, limit: float, rng: np.random.Generator
 ) -> tuple[_Particles, int, float, float]:
     """Return the particles after moves that do not change the tempered density. Also return the number of moves, the
-    accepted fraction, and the correlation with the positions before."""
+    accepted fraction, and the correlation with the positions before the moves."""
     half = len(start.u) // 2
     halves = slice(0, half), slice(half, 2 * half)
     now = _Particles(*(field.copy() for field in start))
@@ -150,7 +150,7 @@ def _half_moved(
     reach = np.where(rng.random(half) < LONG, 1.0, usual)[:, None]
     trial = own + reach * (other[first] - other[second]) + 1e-6 * rng.standard_normal(own.shape)
     prior, likelihood = density.log_prior(trial), _finite_only(density.log_likelihood(trial))
-    with np.errstate(invalid="ignore"):  # a point with zero likelihood is rejected
+    with np.errstate(invalid="ignore"):  # -inf minus -inf gives NaN; such a point is rejected
         gain = power * (likelihood - now.likelihood[halves[0]]) + prior - now.prior[halves[0]]
     take = np.log(rng.random(half)) < np.where(np.isnan(gain), -np.inf, gain)
     for field, value in zip(now, (trial, likelihood, prior), strict=True):

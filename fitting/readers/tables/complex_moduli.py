@@ -69,7 +69,7 @@ def fault_of(column: Column, written: float, value: float, smallest: float, larg
     elif value <= 0:
         problem, remedy = "is not positive", "correct the sign or remove the line"
     elif column.quantity == "phase" and value >= 0.5 * np.pi:
-        problem, remedy = "is no phase below 90 degrees", "check the unit, or remove the line"
+        problem, remedy = "is not a phase below 90 degrees", "check the unit, or remove the line"
     elif not smallest < value < largest:
         problem, remedy = "is beyond any measurement", "check the unit"
     else:
@@ -78,10 +78,10 @@ def fault_of(column: Column, written: float, value: float, smallest: float, larg
 
 
 def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
-    """Divide moduli of tension or bending by 3, in place. Return a note on this."""
+    """Divide moduli of tension or bending by 3, in place. Return a note if there are such moduli."""
     moduli = [q for q in columns if q.split("_")[0] in MODULI]
     tensile = [q for q in moduli if is_tensile(columns[q][0])]
-    if tensile:  # "tensile_storage_modulus, loss_modulus": both are of tension
+    if tensile:  # in "tensile_storage_modulus, loss_modulus", both columns are of tension
         sheared = [columns[q][0].name for q in moduli if q not in tensile and names_shear(columns[q][0])]
         if sheared:
             raise InputError(
@@ -100,7 +100,7 @@ def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
 def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
     """Return storage and loss moduli (n,) [Pa] from columns in SI units, and their standard deviations if given.
 
-    Standard deviations of |G*|, phase or tan(delta) are converted to first order, as independent errors.
+    Standard deviations of |G*|, phase or tan(delta) are converted by first-order propagation of independent errors.
     """
     pair = pair_of(values)
     assert pair is not None
@@ -110,8 +110,8 @@ def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[st
     delta = np.arctan(angle) if pair[1] == "tangent" else angle
     s, c = np.sin(delta), np.cos(delta)
     notes.append(f"G' and G'' are computed from {NAMES[pair[0]]} and {NAMES[pair[1]]}")
-    # Each modulus is the measured modulus times a function of the angle. For G' and G'': this function, then its
-    # derivative.
+    # Each modulus is the measured modulus times a function of the angle. The entries are this function and its
+    # derivative, first for G', then for G''.
     by_angle = {
         "complex": ((c, -s), (s, c)),
         "storage": ((1 + 0 * c, 0 * c), (s / c, 1 / c**2)),

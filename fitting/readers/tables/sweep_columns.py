@@ -71,7 +71,7 @@ def header_columns(cells: list[str]) -> list[Column]:
     found = [(k, cell, quantity_of(cell)) for k, cell in enumerate(cells)]
     columns = [Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]
     shear = {c.quantity for c in columns if not is_tensile(c)}
-    if "frequency" in shear and pair_of(shear):  # G before E if a file has both
+    if "frequency" in shear and pair_of(shear):  # if a file has both G and E, G is read
         columns = [c for c in columns if not is_tensile(c)]
     pair = pair_of({c.quantity for c in columns})
     if pair:

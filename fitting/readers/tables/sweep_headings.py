@@ -71,8 +71,8 @@ def known_unit(quantity: str, unit: str | None) -> bool:
 
 
 def quantity_of(cell: str) -> tuple[str, str | None] | None:
-    """Return quantity and unit of a heading, or None if it is unknown. Quantities of standard deviations end in
-    "_sd"."""
+    """Return quantity and unit of a heading, or None if the heading is not known. Quantities of standard deviations end
+    in "_sd"."""
     name = cell
     for sign, plain in _PLAIN.items():
         name = name.replace(sign, plain)
@@ -90,7 +90,7 @@ def quantity_of(cell: str) -> tuple[str, str | None] | None:
     first, quantity = found
     rest = "_".join(w for w in words[len(first) :] if w.lower() not in IDLE_WORDS)
     if unit is not None and rest:
-        return None  # "Storage compliance (1/Pa)", "Frequency point (1)"
+        return None  # another quantity, for example "Storage compliance (1/Pa)" or "Frequency point (1)"
     unit = unit if unit is not None else (rest or None)
     if " ".join(first) in UNCERTAIN and not known_unit(quantity, unit):
         return None

@@ -46,7 +46,7 @@ class Table(NamedTuple):
     raw: dict[str, np.ndarray]  # raw measurements of the instrument, one value per row
     strain_unit: str = ""  # unit of the strain column, as in the file
     beside: tuple[tuple[Column, np.ndarray], ...] = ()  # columns that the sweep does not need, for comparison
-    notes: tuple[str, ...] = ()  # on headings and numbers with two possible meanings
+    notes: tuple[str, ...] = ()  # notes on headings and numbers with two possible meanings
 
     @property
     def frequencies(self) -> int:
@@ -96,8 +96,9 @@ def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int
 
 
 def tables_of(path: str, lines: list[str]) -> list[Table]:
-    """Return all tables that have numbers. If there is none, raise an `InputError` that names what is missing."""
-    for uncomment in (False, True):  # np.savetxt writes its header as a comment
+    """Return all tables that have numbers. If no table has numbers, raise an `InputError` that names what is
+    missing."""
+    for uncomment in (False, True):  # second try: the header is a comment, as np.savetxt writes it
         tables, headers = _search(path, [line.lstrip("#% ") for line in lines] if uncomment else lines)
         if tables:
             return tables
@@ -123,7 +124,7 @@ def tables_of(path: str, lines: list[str]) -> list[Table]:
 
 
 def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
-    """Return the tables with numbers, and the line numbers of all complete headers."""
+    """Return the tables with numbers, and the line numbers of all headers that name enough quantities for a sweep."""
     tables, headers, k, free = [], [], 0, 0  # `free`: first line after the last table
     while k < len(lines):
         line = lines[k]
@@ -210,7 +211,7 @@ def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
     for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():
         values = _cells_of(place, rows, delimiter, sign)
         known = np.isfinite(values)
-        # For the other columns, later steps ignore points without a value.
+        # A temperature is needed in every row. For the other columns, later steps ignore points without a value.
         if known.all() if quantity == "temperature" else known.any():
             found[quantity] = factor * values + offset
     return found

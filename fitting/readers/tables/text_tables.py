@@ -94,7 +94,8 @@ def _delimiters(line: str) -> list[str]:
 
 
 def delimiter_of_header(line: str, complete: Callable[[list[str]], bool]) -> str:
-    """Return the most frequent delimiter whose cells are complete, or else the most frequent delimiter.
+    """Return the most frequent delimiter for which the cells name all needed quantities (`complete` is true). If there
+    is none, return the most frequent delimiter.
 
     In "Frequency, Hz;Modulus, Pa" the commas are more frequent, but only the semicolon gives two complete headings.
     """
@@ -103,7 +104,7 @@ def delimiter_of_header(line: str, complete: Callable[[list[str]], bool]) -> str
 
 
 def split_line(line: str, delimiter: str | None = None) -> tuple[str, list[str]]:
-    """Return the delimiter and the cells of a line. If no delimiter is given, it is found from the line."""
+    """Return the delimiter and the cells of a line. If `delimiter` is None, the delimiter is found from the line."""
     delimiter = delimiter or find_delimiter(line)
     return delimiter, split_cells(line, delimiter)
 

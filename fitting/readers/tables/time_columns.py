@@ -249,8 +249,8 @@ def _names_a_test(cells: list[str]) -> bool:
 
 
 def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """Return for each quantity the column index and unit of the first cell that names the quantity. A step time is
-    preferred to other times."""
+    """Return for each quantity the column index and unit of the first cell that names the quantity. If there are
+    several times, the step time is used."""
     found: dict[str, tuple[int, str | None]] = {}
     for k, cell in sorted(enumerate(cells), key=lambda each: not _is_own_time(each[1])):
         text = cell.strip().strip('"')
@@ -259,9 +259,10 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
         name = (text[: bracket.start()] if bracket else text).replace("_", " ").strip()
         for word, quantity in WORDS:
             if name.lower().startswith(word):
-                rest = re.sub(r"^(?:[/,]|in\b)\s*", "", name[len(word) :].strip())  # "Zeit / s", "time, s", "time in s"
+                # Remove the sign or word before the unit, as in "Zeit / s", "time, s" or "time in s".
+                rest = re.sub(r"^(?:[/,]|in\b)\s*", "", name[len(word) :].strip())
                 if rest and not _known_column(quantity, rest):
-                    break  # "strain rate", "stress (step)"
+                    break  # another quantity, for example "strain rate" or "stress (step)"
                 if word in ("e(t)", "d(t)") and name[0].islower():
                     break  # in small letters, e(t) is a strain and d(t) a displacement
                 if word == "t" and not (name[0] == "t" and (unit or rest) and _known_column("time", unit or rest)):

@@ -20,9 +20,10 @@ TOO_FAR = 1.5
 #: Below this chi^2 per equation, the stated noise is too large, if there are FEW equations or more.
 TOO_NEAR, FEW = 0.4, 50
 #: The chi^2 of a map is reported if it exceeds 1 per equation by more than ROUGH plus BY_CHANCE standard deviations.
-#: ROUGH is for the error of the estimated noise.
+#: ROUGH allows for the error of the estimated noise.
 BY_CHANCE, ROUGH = 5.0, 0.03
-#: The correlation of a map's residuals is reported if it enlarges the deviations this much more than chi^2 does.
+#: Correlated residuals of a map are reported if `noise_factor` exceeds this value times the square root of chi^2 per
+#: equation. Values of chi^2 per equation below 1 count as 1.
 CORRELATED = 1.1
 #: Above this chi^2 per equation, the moduli may be wrong by more than their errors.
 WRONG = 10.0
@@ -61,15 +62,15 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
             )
     if drawn is not None and not drawn.distance <= FAR:
         told.append(
-            f"the map stopped {drawn.distance:.2g} standard deviations away from its minimum: compare it with regions"
+            f"the map stopped {drawn.distance:.2g} standard deviations from its minimum: compare the map with regions"
         )
     if drawn is not None and drawn.noise_factor.max() > CORRELATED * np.sqrt(max(1.0, drawn.chi2 / drawn.components)):
         told.append(
             "map: its residuals at neighbouring voxels are correlated, so the standard deviations of the map are "
             f"enlarged {drawn.noise_factor.max():.3g} times"
         )
-    # The mean of n squares has the standard deviation sqrt(2/n). The noise that divides the residuals is only an
-    # estimate.
+    # The mean of n squares has the standard deviation sqrt(2/n). ROUGH is added because the noise that divides the
+    # residuals is only an estimate.
     if drawn is not None and drawn.chi2 / drawn.components > 1 + ROUGH + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(
             f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation, so its standard deviations are too "

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 
 def at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
-    """Interpolate values at the corners (P,) to the voxels (nx, ny, nz). Voxels outside of the organ are NaN."""
+    """Interpolate values (P,) at the P corners of the mesh to the voxels (nx, ny, nz). Voxels outside of the organ are
+    NaN."""
     nothing = complex(np.nan, np.nan) if np.iscomplexobj(corners) else np.nan
     out = np.full(organ.field.mask.shape, nothing, corners.dtype)
     out[tuple(organ.body.voxel.T)] = voxels.on_all_nodes(organ.body, corners)
@@ -25,7 +26,8 @@ def at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
 
 
 def write_at_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.ndarray) -> None:
-    """Write waves.h5: the mask, the direct inversion (F, nx, ny, nz) [Pa], and the map with its standard deviations."""
+    """Write waves.h5: the mask, the direct inversion `usual` (F, nx, ny, nz) [Pa] at F frequencies, and the map with
+    its standard deviations."""
     with h5py.File(path, "w") as file:
         for name in ("frequencies", "spacing", "origin", "mask"):
             file[name] = getattr(organ.field, name)
@@ -67,7 +69,7 @@ def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
     size = 1e3 * organ.field.spacing * np.array(organ.field.mask.shape)
     across = [a for a in range(3) if a != axis]
     fig, axes = pyplot().subplots(1, 4, figsize=(13, 4.2), layout="constrained")
-    top = np.nanquantile(panels[0][1], 0.995)  # a single voxel must not set the colour scale
+    top = np.nanquantile(panels[0][1], 0.995)  # so that a single voxel does not set the colour scale
     for ax, (title, values, colours) in zip(axes, panels, strict=True):
         limits = {"vmin": 0.0, "vmax": top} if "storage" in title else {"vmin": 0.0}
         shown = np.take(values, k, axis).T

@@ -32,7 +32,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
     Args:
         out: folder.
         organ, found, drawn: the organ, its fitted regions, and its map (None: no map).
-        usual: direct inversion (F, nx, ny, nz) [Pa].
+        usual: modulus from the direct inversion (F, nx, ny, nz) [Pa], complex, at F frequencies.
     """
     content = {
         "data": organ.field.source,
@@ -63,11 +63,12 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
 
 
 def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) -> list[Content]:
-    """Return one dictionary per region, with lists over the frequencies.
+    """Return one dictionary for each of R regions, with lists over the F frequencies.
 
     The errors contain the noise, the uncertain position of the edges, and the discretisation error of the elements. The
-    relative discretisation error has two parts: its mean `bias` (F, R) over 2 D plane waves, and the contribution
-    `left` (F, R, 2 D) of each wave to the uncertainty of this mean.
+    relative discretisation error was computed for 2 D plane waves (D directions, two polarisations). It has two parts:
+    its mean `bias` (F, R) over these waves, and the contribution `left` (F, R, 2 D) of each wave to the uncertainty of
+    this mean.
     """
     omega, rows = organ.waves.omega, []
     for r in range(own.modulus.shape[1]):
@@ -146,7 +147,7 @@ def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
             own["error_storage_Pa"],
             own["error_loss_Pa"],
         ]
-        if any(v is None for column in columns for v in column):  # a region that the data do not determine
+        if any(v is None for column in columns for v in column):  # the data do not determine this region
             continue
         rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
         rows += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]

@@ -35,8 +35,8 @@ NAMES = (
     "unit",
 )
 WAVES = ("displacement", "real", "imag", "phases", "wrapped")
-#: Name of the entry for the position of the voxels in space (3, 4) [m]: the vectors of the three axes, then the first
-#: voxel. Only NIfTI files have this entry.
+#: Name of the entry for the position of the voxels in space (3, 4) [m]: the vectors from voxel to voxel along the three
+#: axes, then the position of the first voxel. Only NIfTI files have this entry.
 PLACE = "(place)"
 #: Name of the entry for an error message if a file states two different voxel sizes.
 CONFLICT = "(conflict)"
@@ -74,9 +74,9 @@ def arrays(path: Path) -> Content:
         raise
     except (OSError, ValueError, KeyError, EOFError) as error:
         reason = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: cannot be read as {ending} ({reason}): write it again") from None
+        raise InputError(f"{path}: cannot be read as {ending} ({reason}): write the file again") from None
     except Exception as error:  # damaged files raise many kinds of errors: zip, zlib, NIfTI headers
-        raise InputError(f"{path}: the file is damaged ({type(error).__name__}): write it again") from None
+        raise InputError(f"{path}: the file is damaged ({type(error).__name__}): write the file again") from None
 
 
 def single(path: Path, name: str, spacing_given: bool = False) -> tuple[np.ndarray, object, object]:
@@ -128,8 +128,8 @@ def _matlab(path: Path) -> Content:
 
 
 def _nearly_known(names: Iterable[str]) -> Content:
-    """Return notes on unknown names that are similar to a known one, under `NEARLY`. A mask of a wrong name would
-    otherwise be ignored without a word."""
+    """Return notes on unknown names that are similar to a known one, under `NEARLY`. Without such a note, the program
+    would ignore, for example, a mask with a misspelt name silently."""
     names = list(names)
     waves = set(WAVES) & set(names)
     wanted = [name for name in NAMES if name not in names and not (waves and name in WAVES)]
@@ -226,7 +226,7 @@ def _voxel_table(path: Path) -> Content:
     for k, (number, line) in enumerate(lines[1:]):
         cells = [_quick_number(cell, between) for cell in split_cells(line, between)[: len(head)]]
         if None in cells:
-            raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is not a number: correct it")
+            raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is not a number: correct this row")
         rows[k, : len(cells)] = cells
     column = dict(zip(head, rows.T, strict=True))
     places = _LENGTHS[units.get("x", "m")] * np.stack([column[a] for a in "xyz"], axis=1)

@@ -19,7 +19,7 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
     Args:
         name: name of the file, for the messages.
-        phases: (F, T, nx, ny, nz, 3) [rad], T instants of a period.
+        phases: (F, T, nx, ny, nz, 3) [rad], at F frequencies and T instants of a period.
 
     Raises:
         InputError: phases are outside of [-pi, pi], or scikit-image is not installed.

@@ -19,8 +19,8 @@ class Costa(Law):
 
     Q = b_ff E_ff^2 + b_ss E_ss^2 + b_nn E_nn^2 + 2 (b_fs E_fs^2 + b_fn E_fn^2 + b_sn E_sn^2). Costa, Holmes and
     McCulloch 2001. The book chapter names this law (section 4.1.2 i, for heart muscle) but prints no formula for it. E
-    is Green's strain in the axes fibre, sheet (made orthogonal to the fibre) and normal. The energy is not isochoric,
-    so it adds to the bulk modulus.
+    is Green's strain in the axes fibre, sheet (made orthogonal to the fibre) and normal. The exponential energy is not
+    isochoric, so it increases the bulk modulus.
     """
 
     c: Number = param("Pa", "scale", above=0.0, typical=200.0)
@@ -79,7 +79,7 @@ class Costa(Law):
         size = np.linalg.norm(f, axis=-1) * np.linalg.norm(s, axis=-1)
         if np.any(np.linalg.norm(np.cross(f, s), axis=-1) <= 1e-9 * size):
             raise InputError(
-                "law costa: sheet is parallel to fibre, or one of them is zero; give two different directions"
+                "law costa: sheet is parallel to fibre, or one of the two is zero: give two different directions"
             )
 
     @classmethod

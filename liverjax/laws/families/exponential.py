@@ -1,6 +1,6 @@
 """Exponential of a power of the principal stretches.
 
-Table 1 of the book chapter prints "- 1" instead of "- 3". With "- 1" the energy at rest would not be 0.
+In this energy, Table 1 of the book chapter prints "- 1" instead of "- 3". With "- 1" the energy at rest would not be 0.
 """
 
 from typing import ClassVar

@@ -27,7 +27,7 @@ def _monomial(coefficient: float, *factors: tuple[Any, int]) -> Number:
 class MooneyRivlin(Law):
     """W = sum c_ij (Ibar1 - 3)^i (Ibar2 - 3)^j + U(J), i + j <= 3.
 
-    Book chapter, Table 1. A coefficient that is not given is 0. It needs no computation and cannot be fitted.
+    Book chapter, Table 1. A coefficient that is not given is 0. Its term is not computed, and it cannot be fitted.
     """
 
     c10: Number = param("Pa", "coefficient of (Ibar1 - 3)", typical=300.0)
@@ -44,7 +44,7 @@ class MooneyRivlin(Law):
     invariants: ClassVar = ("I1", "I2", "J")
 
     def terms(self):
-        """Return coefficient and powers of every monomial with a given coefficient."""
+        """Return (c_ij, i, j) for every coefficient c_ij that is given."""
         return [(getattr(self, name), i, j) for name, (i, j) in _POWERS.items() if getattr(self, name) is not None]
 
     def isochoric_energy(self, I1, I2):

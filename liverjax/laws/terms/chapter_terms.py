@@ -1,8 +1,9 @@
-"""Stress and stiffness as in the book chapter (section 4.1.2): six terms for every product g^k(I1, I2) h^k(J).
+"""Stress and stiffness as in the book chapter (section 4.1.2), for an energy that is a sum of products g^k(I1, I2)
+h^k(J). The stiffness has six terms for every product.
 
-This is a variant for comparison. The default, `liverjax.laws.terms.invariant_terms`, first sums the scalars over k. The
-default gives the same values up to roundoff, and its cost does not grow with the number of products.
-`liverjax.laws.products` writes the laws as such products.
+This is a variant for comparison. The default, `liverjax.laws.terms.invariant_terms`, first adds the scalar derivatives
+of all products. The default gives the same values up to roundoff, and its cost does not grow with the number of
+products. `liverjax.laws.products` writes the laws as such products.
 """
 
 from typing import NamedTuple
@@ -70,7 +71,7 @@ class _At(NamedTuple):
     B: Matrix  # I1 Id - C
     cof: Matrix
     J: jax.Array
-    groups: list  # (terms, phi', phi'')
+    groups: list  # for each group of products: terms, phi', phi''
 
 
 def _state_at(law: Energies, F: Matrix) -> _At:
@@ -93,7 +94,10 @@ def _stress_of_product(t: _Term, s: _At) -> Matrix:
 
 
 def first_piola(law: Energies, F: Matrix) -> Matrix:
-    """First Piola-Kirchhoff stress sum_k phi' (h' g cof F + h F S^k) [Pa]."""
+    """First Piola-Kirchhoff stress [Pa] of the products g h: sum_k phi' (h' g cof F + h F S^k).
+
+    phi is the function of a group of products (`liverjax.laws.products.Group`), and S^k = 2 dg/dC.
+    """
     s = _state_at(law, F)
     total = scale_matrix(0.0, F)
     for terms, phi1, _ in s.groups:
@@ -104,16 +108,18 @@ def first_piola(law: Energies, F: Matrix) -> Matrix:
 
 
 def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, jax.Array]]:
-    """Return D_i (x) D_j and D_i . D_j of every pair, which are the constant parts of the matrices L and U."""
+    """Return D_i (x) D_j and D_i . D_j for every pair of shape vectors: constant parts of the chapter's L and U."""
     return [(outer(D[i], D[j]), dot(D[i], D[j])) for i, j in pairs]
 
 
 class Layout(NamedTuple):
     """Which values are stored in memory. The default is the fastest choice (experiments/chapter)."""
 
-    #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes. None means: computed when used.
+    #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes. None means that the values are computed
+    #: when they are used.
     constant: list | None = None
-    #: Whether values that several blocks need are written to memory, as `invariant_terms` does. Here this is slower.
+    #: Whether values that several stiffness matrices need are written to memory, as `invariant_terms` does. In this
+    #: module, this is slower.
     write: bool = False
 
 
@@ -125,10 +131,10 @@ def blocks(
     regularised: bool = False,
     layout: Layout = Layout(),
 ) -> list[Matrix]:
-    """Return stiffness blocks d2W/dx_i dx_j per reference volume.
+    """Return stiffness matrices d2W/dx_i dx_j per reference volume, for pairs (i, j) of nodes with shape vectors D.
 
-    A block is the sum over k of the chapter's terms G + H + I + Lambda + M + R, plus the term with phi''. `regularised`
-    changes the term G of every product, but not the term with phi''.
+    A matrix is the sum over k of the chapter's terms G + H + I + Lambda + M + R, plus the term with phi''.
+    `regularised` changes the term G of every product, but not the term with phi''.
     """
     keep = _written if layout.write else lambda values: values
     s = keep(_state_at(law, F))
@@ -187,9 +193,10 @@ def _second_derivative_of_J(F: Matrix, Di: Vector, Dj: Vector) -> Matrix:
 
 
 def _linear_matrices(t: _Term, i: _Node, j: _Node, constant: tuple[Matrix, Number]) -> Matrix:
-    """Return the matrices L + U.
+    """Return the sum L + U of the chapter's matrices L and U.
 
-    They follow from dS/dC : H = beta H + sum delta_ab (B_b : H) B_a, with B_1 = Id and B_2 = I1 Id - C.
+    They follow from dS/dC : H = beta H + sum delta_ab (B_b : H) B_a for any symmetric H, with B_1 = Id and B_2 = I1 Id
+    - C. The numbers beta and delta_ab are combinations of derivatives of g.
     """
     DiDj, product = constant
     beta = -2 * t.g2

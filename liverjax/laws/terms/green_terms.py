@@ -31,7 +31,7 @@ from liverjax.tensors.matrices import (
 
 
 class GreenModuli(NamedTuple):
-    """Moduli dS/dE in the axes of the material: orthotropic moduli plus `curvature` times S (x) S."""
+    """Moduli dS/dE of the stress S, in the axes of the material: orthotropic moduli plus `curvature` times S (x) S."""
 
     normal: Matrix  # C_mmnn
     shear: Vector  # C_mnmn of the pairs 12, 13, 23
@@ -45,7 +45,10 @@ def stress(law: Energies, F: Matrix) -> Matrix:
 
 
 def blocks(law: Energies, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """Return the material stiffness blocks d2w/dx_i dx_j per reference volume, for index pairs (i, j) into D."""
+    """Return the part of the stiffness d2w/dx_i dx_j per reference volume that contains the moduli.
+
+    The result has one matrix for each pair (i, j) of nodes with shape vectors D.
+    """
     A = law.material_axes(F[0][0])
     FA = matmul(F, A)
     E, turned = green_strain(FA), [matvec(transpose(A), d) for d in D]
@@ -70,7 +73,7 @@ def _stress_of_strain(law: Energies, E: Matrix) -> Matrix:
 
 
 def _slopes(function: Any, six: tuple) -> list:
-    """Differentiate with respect to the six entries of a symmetric E. E_ij and E_ji each get half of a shear change."""
+    """Differentiate with respect to the six entries of a symmetric E. For a shear, E_ij and E_ji each get a half."""
     result = []
     for k, (i, j) in enumerate(SIX):
         weight = 1.0 if i == j else 0.5

@@ -1,12 +1,13 @@
-"""Hand-derived terms at one deformation gradient: stress, tangent and the blocks of the stiffness.
+"""Hand-derived terms at one deformation gradient: stress, tangent, and the stiffness between pairs of nodes.
 
-They are the terms of section 4.1.2 of the book chapter, summed over the products g^k h^k. J is an additional invariant.
-With the energy W, the invariants I_a, the positions x_i of the nodes, W_a = dW/dI_a, W_ab = d2W/dI_a dI_b and
-v_a,i = dI_a/dx_i,
+They are the terms of section 4.1.2 of the book chapter, summed over the products g^k(I1, I2) h^k(J) of the energy. Here
+J is an invariant like I1 and I2. With the energy W, the invariants I_a, the positions x_i of the nodes, W_a = dW/dI_a,
+W_ab = d2W/dI_a dI_b and v_a,i = dI_a/dx_i,
 
     d2W/dx_i dx_j = sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j
 
-No matrix is inverted. Energies of stretches and of Green's strain add their stress to S and their moduli to the blocks.
+No matrix is inverted. Energies of principal stretches and of Green's strain add their second Piola-Kirchhoff stress to
+S (see `Stress`), and their moduli to the stiffness.
 """
 
 from typing import Any, NamedTuple
@@ -55,7 +56,7 @@ class Scalars(NamedTuple):
 class State(NamedTuple):
     """Values at one deformation gradient that both force and stiffness need."""
 
-    laws: tuple  # summands with energies of stretches or of Green's strain, which add up
+    laws: tuple  # summands of the law; their energies of stretches and of Green's strain are added
     F: Matrix
     C: Matrix | None
     cof: Matrix
@@ -63,7 +64,7 @@ class State(NamedTuple):
     J: jax.Array
     first: dict
     second: dict
-    fibres: dict  # invariant I4 of a summand -> its fibre direction
+    fibres: dict  # name of an invariant I4 -> fibre direction of the summand with this invariant
     frame: Any  # principal stretches and axes, if a summand has an energy of stretches
 
 
@@ -89,12 +90,12 @@ def _state_of_law(law: Energies, F: Matrix) -> State:
 
 
 def state_of(scalars: Scalars, F: Matrix) -> State:
-    """Return the state at F of an energy of I1, I2 and J with known derivatives."""
+    """Return the state at F of an energy of I1, I2 and J. `scalars`: derivatives of this energy."""
     return _state(scalars, F, ())
 
 
 def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
-    """Return the state. C is computed only if I2 needs it, and principal stretches only if a law needs them."""
+    """Return the state at F. C is computed only if W depends on I2; principal stretches only if a law needs them."""
     first, second = scalars
     cof = cofactor(F)
     C = right_cauchy_green(F) if "I2" in first else None
@@ -105,7 +106,10 @@ def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
 
 
 def stress(s: State | Pieces) -> Stress:
-    """Return S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … (fibre a) and p = W_J. A missing W_k adds 0."""
+    """Return S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J, with W_k = dW/dI_k and the fibre a.
+
+    A derivative W_k that is not in the state is 0.
+    """
     if isinstance(s, Pieces):
         return _put_together(s.subsets, [stress(own) for own in s.states])
     W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
@@ -128,7 +132,7 @@ def stress(s: State | Pieces) -> Stress:
 
 
 def _put_together(subsets: Subsets, found: list[Stress]) -> Stress:
-    """Join the stresses of all elements. If one stress is a matrix, spherical stresses are also written as matrices."""
+    """Join the stresses of all regions. If one of these stresses is a matrix, all are written as matrices."""
     if any(isinstance(S, tuple) for S, _ in found):
         found = [Stress(S if isinstance(S, tuple) else _spherical(S), p) for S, p in found]
     return put_together(subsets, found)
@@ -146,7 +150,7 @@ def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
     return tuple(tuple(FS[i][j] + p * cof[i][j] for j in range(3)) for i in range(3))
 
 
-#: Minimum |J| for the second Piola-Kirchhoff stress.
+#: For a smaller |J|, the second Piola-Kirchhoff stress is computed with this |J| in its denominator.
 _FLAT = 1e-3
 
 
@@ -193,22 +197,22 @@ def _weight(invariant: str) -> float:
 
 
 class _Parts(NamedTuple):
-    """Values that the blocks of all node pairs need."""
+    """Values that the stiffness of all node pairs needs."""
 
     J: jax.Array
     first: dict
     second: dict
     slopes: list[dict]  # `slopes` of every node
     diagonal: dict  # (i, j) -> D_i . S D_j
-    turning: dict  # (i, j) -> W_J F (D_i x D_j), where it is not 0
-    metric: dict  # (i, j) -> D_i . D_j, if I2 needs it
-    left: Matrix | None  # F F^T, if I2 needs it
+    turning: dict  # (i, j) -> W_J F (D_i x D_j), for pairs for which this is not 0
+    metric: dict  # (i, j) -> D_i . D_j, if the energy depends on I2
+    left: Matrix | None  # F F^T, if the energy depends on I2
 
 
 def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Parts:
-    """Compute the values for the blocks and write them to memory.
+    """Compute the values that the stiffness of all node pairs needs, and write these values to memory.
 
-    Otherwise XLA on CPUs would compute them again for each entry, which is 20 % slower.
+    Otherwise, on CPUs, JAX would compute these values again for each matrix entry, which is 20 % slower.
     """
     S, p = stress(s)
     metric = {(i, j): dot(D[i], D[j]) for i, j in pairs}
@@ -221,11 +225,11 @@ def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Pa
 
 
 def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
-    """Return the block of two nodes, without energies of stretches and of Green's strain."""
+    """Return the stiffness between two nodes, without energies of stretches and of Green's strain."""
     vi, vj = s.slopes[pair[0]], s.slopes[pair[1]]
     second = dict(s.second)
     W_JJ = second.pop(("J", "J"), None) if regularised else None
-    # v_a,i (x) sum_b W_ab v_b,j: one outer product per invariant.
+    # The sum is written as v_a,i (x) (sum_b W_ab v_b,j), which needs only one outer product per invariant a.
     partner: dict[str, Vector] = {}
     for (a, b), W in second.items():
         for row, column in dict.fromkeys(((a, b), (b, a))):
@@ -241,7 +245,7 @@ def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
         for r in range(3):
             for c in range(3):
                 K[r][c] = K[r][c] + swapped[r] * vi["I1"][c] + metric * s.left[r][c]
-    # W_1 d2I1 and the first term of W_2 d2I2 together: D_i . S D_j Id.
+    # The sum of W_1 d2I1 and the first term of W_2 d2I2 is D_i . S D_j Id.
     diagonal = s.diagonal[pair]
     if W_JJ is not None:
         eps = jnp.clip(1 - s.J, 0, 1)
@@ -261,12 +265,12 @@ def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
 def blocks(
     s: State | Pieces, D: list[Vector], pairs: tuple[tuple[int, int], ...], regularised: bool = False
 ) -> list[Matrix]:
-    """Return stiffness blocks d2W/dx_i dx_j per reference volume: the sum of the chapter's G, H, I, Lambda, M and R.
+    """Return stiffness matrices d2W/dx_i dx_j per reference volume: the chapter's terms G + H + I + Lambda + M + R.
 
     Args:
         s: `state` of the element.
-        D: shape vectors of its nodes [1/m].
-        pairs: indices (i, j) into D of the blocks to compute.
+        D: shape vectors of the nodes of the element [1/m].
+        pairs: pairs (i, j) of nodes, as indices into D. The result has one matrix for each pair.
         regularised: whether to replace G as in section 4.1.2 iii of the book chapter. Here eps/3 is used where the
             chapter prints eps, so that the trace does not change.
     """
@@ -291,7 +295,7 @@ _UNIT_VECTORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def tangent(s: State | Pieces) -> list[list[Matrix]]:
-    """Return d2W/dF dF [Pa] as nested lists [J][L] of matrices (i, k): the blocks for shape vectors e_J and e_L."""
+    """Return d2W/dF dF [Pa] as nested lists [J][L] of matrices (i, k): `blocks` for unit vectors e_J and e_L."""
     pairs = tuple((J, L) for J in range(3) for L in range(3))
     A = blocks(s, list(_UNIT_VECTORS), pairs)
     return [A[3 * J : 3 * J + 3] for J in range(3)]

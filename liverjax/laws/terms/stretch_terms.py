@@ -1,4 +1,6 @@
-"""Hand-derived stress and stiffness of energies w(Xi(alpha_1), …), with Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha.
+"""Hand-derived stress and stiffness of energies w(Xi(alpha_1), …) of the principal stretches lambda_m.
+
+Here Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha, with exponents alpha and the volume ratio J.
 
 In the principal axes, the second Piola-Kirchhoff stress S is diagonal: S_m = tau_m / lambda_m^2 with
 tau_m = dw/d ln lambda_m. The moduli are
@@ -6,7 +8,7 @@ tau_m = dw/d ln lambda_m. The moduli are
     C_mmnn = (d2w/d ln lambda_m d ln lambda_n - 2 delta_mn tau_m) / (lambda_m lambda_n)^2
     C_mnmn = (S_m - S_n) / (lambda_m^2 - lambda_n^2).
 
-C_mnmn is computed as a divided difference that is exact if stretches are equal. The A H A form of the book chapter
+The formula for C_mnmn is evaluated such that it is exact if stretches are equal. The A H A form of the book chapter
 (section 4.1.2) has a geometric mean instead, which is wrong except for alpha = 2 and 4.
 
 Values are computed with these formulas. Their derivatives are computed from the energy, expanded in frozen principal
@@ -41,7 +43,7 @@ Frame = tuple[Vector, Matrix]
 
 
 class Principal(NamedTuple):
-    """Values at one F that both stress and moduli need."""
+    """Values at one deformation gradient F that both stress and moduli need."""
 
     logs: Vector  # ln lambda_m
     axes: Matrix
@@ -106,17 +108,20 @@ def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
 
 
 def stress(law: Energies, F: Matrix, frame: Frame) -> Matrix:
-    """Second Piola-Kirchhoff stress [Pa] of w only, without the volumetric part; `frame` is `principal(F)`."""
+    """Second Piola-Kirchhoff stress [Pa] of the energy w, without the volumetric energy. `frame`: `principal(F)`."""
     return symmetric(_stress(_arrays(law, F), F, frame))
 
 
 def moduli(law: Energies, F: Matrix, frame: Frame) -> list[list]:
-    """Return the moduli dS/dE [Pa] of w only, 6 x 6 components in the coordinate axes; `frame` is `principal(F)`."""
+    """Return the moduli dS/dE [Pa] of the energy w: 6 x 6 components in coordinate axes. `frame`: `principal(F)`."""
     return _square(_moduli_of_axes(_arrays(law, F), F, frame))
 
 
 def blocks(law: Energies, F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -> list[Matrix]:
-    """Return the material stiffness blocks d2w/dx_i dx_j per reference volume, for index pairs (i, j) into D."""
+    """Return the part of the stiffness d2w/dx_i dx_j per reference volume that contains the moduli.
+
+    The result has one matrix for each pair (i, j) of nodes with shape vectors D.
+    """
     C = stored(moduli(law, F, frame))
     half = stored([half_contracted(C, d) for d in D])
     return [pushed(F, anisotropic(half[j], D[i])) for i, j in pairs]
@@ -135,12 +140,12 @@ def _square(upper: tuple) -> list[list]:
     return [[entries[min(a, b), max(a, b)] for b in range(6)] for a in range(6)]
 
 
-# Functions with a custom derivative rule must not be linear in an argument. Otherwise JAX ignores the rule if only this
-# argument is unknown (forward over reverse mode).
+# A function with a custom derivative rule must not be linear in an argument. Otherwise JAX ignores this rule if only
+# this argument is differentiated (forward over reverse mode).
 
 
 def stress_at_constant(law: Energies, F: Matrix) -> Matrix:
-    """Return `stress` for constant F. The axes are constant, so JAX can differentiate with respect to parameters."""
+    """Return the result of `stress` for constant F. JAX can differentiate it with respect to parameters of the law."""
     return symmetric(_stress.fun(_arrays(law, F), F, principal(F)))
 
 

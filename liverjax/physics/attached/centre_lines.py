@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: Distance between rings along the surface, divided by the mean radius of the tubes.
 _BAND = 2.0
-#: Minimum number of points of a ring: a ring with fewer points does not go around a tube.
+#: Minimum number of points of a ring. A ring with fewer points is ignored, since it does not go around a tube.
 _LEAST = 5
 
 
@@ -33,11 +33,11 @@ class CentreLines(NamedTuple):
 
 
 def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Read corners (n, 3) [m] and triangles (t, 3) from a surface file. Corners with equal coordinates are merged.
+    """Read a surface file: n corners (n, 3) [m], and t triangles (t, 3) of corner numbers. Equal corners are merged.
 
     Args:
         path: file with triangles, in any format that meshio reads (STL, PLY, OBJ, VTK, …).
-        scale: unit of the file [m].
+        scale: length of one unit of the file [m].
         name: name of the vessel, for messages.
 
     Raises:
@@ -48,7 +48,9 @@ def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.nd
     try:
         found = meshio.read(path)
     except (OSError, ValueError, KeyError, IndexError, SystemExit, meshio.ReadError) as error:
-        raise InputError(f"{name} surface {path} cannot be read ({error or 'unknown format'}): give an STL") from None
+        raise InputError(
+            f"{name} surface {path} cannot be read ({error or 'unknown format'}): give an STL file"
+        ) from None
     triangles = [block.data for block in found.cells if block.type == "triangle"]
     if not triangles:
         raise InputError(f"{name} surface {path} contains no triangles: export the surface of the tube")
@@ -61,21 +63,21 @@ def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.nd
 
 
 class _Rings(NamedTuple):
-    """Rings of one surface, and the bands between them."""
+    """r rings with p points on a surface with n corners, and the bands between the rings."""
 
-    points: np.ndarray  # (p, 3) points where edges cross a level of the distance
-    ring: np.ndarray  # (p,) ring of each point
-    below: np.ndarray  # (r,) band below each ring
-    above: np.ndarray  # (r,) band above each ring
-    band: np.ndarray  # (n,) band of each corner
+    points: np.ndarray  # (p, 3) [m] points where edges of the surface cross a level of the distance
+    ring: np.ndarray  # (p,) number of the ring of each point
+    below: np.ndarray  # (r,) number of the band on the side of each ring with smaller distances
+    above: np.ndarray  # (r,) number of the band on the other side of each ring
+    band: np.ndarray  # (n,) number of the band of each corner
 
 
 def centre_lines(points: np.ndarray, triangles: np.ndarray, name: str = "vessel") -> CentreLines:
-    """Compute the centre lines of the tubes with this surface.
+    """Compute the centre lines of the tubes that have this surface.
 
     Args:
-        points: corners (n, 3) [m].
-        triangles: corner numbers (t, 3). The ends of the tubes may be open or closed.
+        points: positions (n, 3) [m] of the n corners of the surface.
+        triangles: corner numbers (t, 3) of the t triangles. The ends of the tubes may be open or closed.
         name: name of the vessel, for messages.
 
     Raises:
@@ -110,7 +112,7 @@ def _edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarray:
-    """Return the distances (n,) [m] of all corners from a corner at one end of the surface, along the edges."""
+    """Return the distances (n,) [m] of all n corners from a corner at one end of the surface, along the edges."""
     from scipy.sparse.csgraph import dijkstra
 
     first = dijkstra(graph, directed=False, indices=own[0])
@@ -120,7 +122,7 @@ def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarra
 def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> float:
     """Return the distance [m] between rings: `_BAND` times the mean radius, or more if an edge would cross two rings.
 
-    The mean radius is the area of the surface, divided by its length and by 2 pi.
+    The mean radius is estimated: area of the surface, divided by its length (the maximum of `away`) and by 2 pi.
     """
     a, b, c = (points[triangles[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
@@ -129,7 +131,10 @@ def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> flo
 
 
 def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _Rings:
-    """Find the rings of points where edges cross a level of the distance. Levels are (k + 1/2) times the spacing."""
+    """Find the rings of points where edges cross a level of the distance `away` from one end.
+
+    The levels are (k + 1/2) times the spacing, with k = 0, 1, 2, …
+    """
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components
 
@@ -160,8 +165,10 @@ def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _R
 
 
 def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
-    """Join the centres of the two rings of every band by a line. Where a branch ends, add a line from the centre of its
-    last ring to the end of the surface."""
+    """Join the centres of the two rings of every band by a straight piece of a centre line.
+
+    Where a branch ends, a piece from the centre of its last ring to the end of the surface is added.
+    """
     count = np.bincount(r.ring)
     centre = np.stack([np.bincount(r.ring, r.points[:, k]) for k in range(3)], axis=1) / count[:, None]
     r, real = _without_tips(r, np.flatnonzero(count >= _LEAST))
@@ -173,7 +180,8 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
             if own in others:
                 continue
             beside = real[side[real] == own]
-            # Branches that meet or begin in this band are joined. If there is no other branch, this branch ends here.
+            # If other branches also meet or begin in this band, they are joined with this one. Otherwise this branch
+            # ends here.
             lines += [(centre[a], centre[b], np.isin(r.ring, (a, b))) for b in beside[beside > a]]
             if len(beside) > 1:
                 continue
@@ -188,7 +196,10 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
 
 
 def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
-    """Remove the last ring of each branch, since it may go around a corner of the end. Merge the bands beside it."""
+    """Remove the last ring of each branch, since this ring may lie around a corner of the flat end of the tube.
+
+    The bands on both sides of a removed ring become one band.
+    """
     keep, band, below, above = set(real.tolist()), r.band.copy(), r.below.copy(), r.above.copy()
     sides = np.concatenate([below[real], above[real]])
     for a in real:
@@ -200,7 +211,10 @@ def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
 
 
 def _outwards(centre: np.ndarray, r: _Rings, real: np.ndarray, a: int, own: int) -> np.ndarray:
-    """Direction (3,) of the line at the last ring a: away from the previous ring, or normal to a if a is alone."""
+    """Return the unit direction (3,) of the centre line from the last ring a of a branch to the end of the surface.
+
+    The direction is that from the previous ring to ring a. If there is no previous ring, it is the normal of ring a.
+    """
     inner = r.below[a] if own == r.above[a] else r.above[a]
     before = [b for b in real if b != a and inner in (r.below[b], r.above[b])]
     if before:
@@ -212,7 +226,7 @@ def _outwards(centre: np.ndarray, r: _Rings, real: np.ndarray, a: int, own: int)
 
 
 def _distance(points: np.ndarray, begin: np.ndarray, end: np.ndarray) -> float:
-    """Mean distance of points (n, 3) from the line through two points."""
+    """Return the mean distance [m] of n points (n, 3) from the straight line through two points (3,)."""
     along = (end - begin) / np.linalg.norm(end - begin)
     away = points - begin
     return float(np.mean(np.linalg.norm(away - np.outer(away @ along, along), axis=1)))

@@ -1,4 +1,4 @@
-"""Elements between nodes of the body: membranes, springs, bars. Their energy depends on their lengths and angles.
+"""Elements that connect nodes of the body: membranes, springs, bars. Their energy depends on their lengths and angles.
 
 At every integration point an element has d tangent vectors f_k = sum_a p_ka y_a, with the positions y_a of its nodes
 and constant factors p_ka. The energy of the element is a function W of the metric C_kl = f_k . f_l. The stress is
@@ -18,22 +18,28 @@ from liverjax.solvers.attached import Attached
 
 
 class Elements(NodalForce):
-    """Force term of elements between nodes, for one step."""
+    """Force term, for one step, of elements that connect nodes of the body."""
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Node numbers (n, m) of m elements with n nodes each."""
+        """Return the node numbers (n, m) of m elements with n nodes each."""
         raise TypeError(f"{type(self).__name__} lacks nodes(mesh)")
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Factors p (d, n, Q, m) [1/m] of the nodal positions in the tangent vectors, at Q points of m elements."""
+        """Return the factors p_ka (d, n, Q, m) [1/m] of d tangent vectors and n nodes, at Q points of m elements."""
         raise TypeError(f"{type(self).__name__} lacks tangents(mesh)")
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Energy (Q, m) [J] at every point as a function of the metric: C_11 (Q, m), or C_11, C_12 and C_22."""
+        """Return the energies (Q, m) [J] at Q integration points of m elements.
+
+        `C` are the components of the metric: C_11 (Q, m), or C_11, C_12 and C_22.
+        """
         raise TypeError(f"{type(self).__name__} lacks energies(mesh, C)")
 
     def away(self) -> jax.Array | None:
-        """Vectors (d, 3, Q, m) to subtract from the tangent vectors if an end is not a node, otherwise None."""
+        """Return vectors (d, 3, Q, m) to subtract from the d tangent vectors, at Q points of m elements.
+
+        They are needed if an end of the elements is not a node. Returns None if all ends are nodes.
+        """
         return None
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
@@ -72,26 +78,32 @@ class Elements(NodalForce):
         return Attached(nodes, jnp.einsum("kaqm,kibjqm->aibjm", p, right))
 
     def _vectors(self, p: jax.Array, y: jax.Array) -> jax.Array:
-        """Tangent vectors (d, 3, Q, m) of the elements, from the positions y (n, m, 3) of their nodes."""
+        """Return d tangent vectors (d, 3, Q, m) at Q points of m elements, from positions y (n, m, 3) of n nodes."""
         f, away = jnp.einsum("kaqm,ami->kiqm", p, y), self.away()
         return f if away is None else f - away
 
 
 def _metric(f: jax.Array) -> tuple[jax.Array, ...]:
-    """Components C_kl = f_k . f_l (Q, m) of the metric, for k <= l. f: tangent vectors."""
+    """Return the components C_kl = f_k . f_l, for k <= l, of the metric of the tangent vectors f_k (d, 3, Q, m)."""
     return tuple(jnp.sum(f[k] * f[l], axis=0) for k in range(len(f)) for l in range(k, len(f)))
 
 
 def _tension(slopes: tuple[jax.Array, ...]) -> list[list[jax.Array]]:
-    """Stress T from the derivatives of the energy with respect to C_11, or to C_11, C_12 and C_22."""
+    """Return the stress T_kl as nested lists, from the derivatives of the energy with respect to the metric.
+
+    These are the derivatives with respect to C_11 (one tangent vector), or to C_11, C_12 and C_22 (two tangent
+    vectors).
+    """
     if len(slopes) == 1:
         return [[2 * slopes[0]]]
     return [[2 * slopes[0], slopes[1]], [slopes[1], 2 * slopes[2]]]
 
 
 def _changes(f: jax.Array) -> list[list[jax.Array]]:
-    """Derivatives dC_v/df_k (3, Q, m) of the components C_v of the metric with respect to the tangent vectors f_k, as
-    nested lists [v][k]."""
+    """Return the derivatives dC_v/df_k of the components C_v of the metric, as nested lists [v][k] of arrays (3, Q, m).
+
+    f: one or two tangent vectors f_k, at Q points of m elements.
+    """
     if len(f) == 1:
         return [[2 * f[0]]]
     zero = jnp.zeros_like(f[0])

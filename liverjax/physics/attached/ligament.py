@@ -1,9 +1,9 @@
 """A ligament: a cable between two points of the body, or from a set of nodes to a point outside the body.
 
 The tension at length l is k (l - l0), with the stiffness k and the rest length l0. It is 0 if the ligament is slack, so
-a ligament pulls and does not push. The user gives l0, or the tension T0 in the reference shape. In the reference shape
-the length is L, so l0 = L - T0/k. A ligament from n nodes to a point outside has n fibres, which share stiffness and
-tension equally.
+a ligament pulls and does not push. The user gives l0, or the tension T0 in the reference shape. With the length L in
+the reference shape, the rest length is l0 = L - T0/k. A ligament from n nodes to a point outside has n fibres, which
+share stiffness and tension equally.
 """
 
 from typing import Any, ClassVar
@@ -20,19 +20,19 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
 
-#: A fibre that is shorter than its rest length by this fraction or less is not slack: the difference is roundoff.
+#: If a fibre is shorter than its rest length by at most this fraction, it is not slack: the difference is roundoff.
 _ROUNDED = 1e-9
 
 
 @struct
 class Ligament(Physics):
-    """m fibres. Each fibre pulls at n nodes of the body, and may end at a point outside the body."""
+    """A ligament of m fibres. Each fibre pulls at n nodes of the body, and may end at a point outside the body."""
 
     nodes: Indices = param("1", "node numbers (n, m)", lower=0)
     weights: Array = param(
-        "1", "weights of these nodes in the fibre's vector (n, m): sum 0, or sum 1 if the fibre ends outside"
+        "1", "weights (n, m) of these nodes in the vector along the fibre; their sum is 0, or 1 if it ends outside"
     )
-    to: Numbers | None = param("m", "end of the fibres outside the body (3,); None: both ends are inside", default=None)
+    to: Numbers | None = param("m", "end of all fibres outside the body (3,); None: both ends inside", default=None)
     stiffness: Number = param("N/m", "total stiffness of all fibres", above=0.0)
     pre_tension: Number | None = param(
         "N", "total tension of all fibres in the reference shape", lower=0.0, default=None
@@ -77,13 +77,15 @@ class Ligament(Physics):
             raise InputError(f"{name} needs either pre_tension in N or rest_length in m: give one of them")
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
         if np.any(lengths <= 0):
-            raise InputError(f"{name} has a fibre without length: move its end")
+            raise InputError(f"{name} has a fibre without length: move one of its ends")
         if self.pre_tension is not None and np.any(rest <= 0):
             most = float(np.asarray(self.stiffness) * lengths.min())
-            raise InputError(f"{name}.pre_tension = {self.pre_tension} N must be below its limit, {most:.3g} N")
+            raise InputError(
+                f"{name}.pre_tension = {self.pre_tension} N must be below {most:.3g} N: give a smaller tension"
+            )
 
     def _vectors(self, x: jax.Array) -> jax.Array:
-        """Vectors (m, 3) along the fibres at positions x (V, 3)."""
+        """Return the vectors (m, 3) [m] from end to end of the m fibres, for nodal positions x (V, 3)."""
         f = jnp.einsum("am,ami->mi", jnp.asarray(self.weights), x[self.nodes])
         return f if self.to is None else f - jnp.asarray(self.to)[None]
 
@@ -92,17 +94,17 @@ class Ligament(Physics):
         return jnp.sqrt(jnp.sum(f * f, axis=1))
 
     def _rest(self, mesh: TetMesh) -> jax.Array:
-        """Rest lengths (m,) [m]."""
+        """Return the rest lengths (m,) [m] of the m fibres."""
         L = self._lengths(mesh.points)
         return jnp.full_like(L, self.rest_length) if self.pre_tension is None else L - self.pre_tension / self.stiffness
 
     def freeze(self, memory: None, step: Step) -> "Fibres":
-        """Force term of the fibres, for one step."""
+        """Return the force term of the fibres for one step."""
         rest = self._rest(step.mesh)
         return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes and directions of the fibres that end outside the body and are taut at the beginning."""
+        """Return nodes (n,) and directions (n, 3) of the fibres to a point outside that are taut when a run begins."""
         if self.to is None:
             return np.zeros(0, int), np.zeros((0, 3))
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
@@ -111,11 +113,11 @@ class Ligament(Physics):
         return np.asarray(self.nodes)[0, taut], f / lengths[taut, None]
 
     def pulls_single_nodes(self) -> bool:
-        """True: each fibre pulls at a node, or at the nodes of one element."""
+        """Return True: each fibre pulls at single nodes, or at the nodes of one element."""
         return True
 
     def is_straight_without_tension(self, mesh: TetMesh, x: jax.Array) -> bool:
-        """Whether a fibre has exactly its rest length at positions x (V, 3).
+        """Return whether a fibre has exactly its rest length at positions x (V, 3), so that its tension is 0.
 
         In a small vibration about x such a fibre would be slack half of the time.
         """
@@ -123,14 +125,14 @@ class Ligament(Physics):
         return bool(np.any(np.abs(lengths - rest) <= _ROUNDED * rest))
 
 
-@jax.jit  # compiled, since the checks of a sweep call it for each run
+@jax.jit  # compiled, since the checks of a sweep call this function for each run
 def _lengths_and_rest(ligament: Ligament, mesh: TetMesh) -> tuple[jax.Array, jax.Array]:
-    """Lengths (m,) [m] of the fibres in the reference shape, and their rest lengths (m,) [m]."""
+    """Return the lengths (m,) [m] of the m fibres in the reference shape, and their rest lengths (m,) [m]."""
     return ligament._lengths(mesh.points), ligament._rest(mesh)
 
 
 def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: Any) -> Ligament:
-    """Create a ligament between two points (2, 3) [m] of the body.
+    """Create a ligament of one fibre between two points (2, 3) [m] of the body.
 
     Raises:
         InputError: a point lies outside the body.
@@ -153,31 +155,34 @@ def _vector(value: object, name: str) -> np.ndarray:
 
 @struct
 class Fibres(Elements):
-    """Force term of a ligament, for one step."""
+    """Force term of a ligament with m fibres, for one step. Each fibre pulls at n nodes."""
 
     at: Any = param("1", "node numbers (n, m)")
-    weights: Array = param("1", "weights of the nodes in the fibre's vector (n, m)")
+    weights: Array = param("1", "weights (n, m) of the nodes in the vector along the fibre")
     to: Any = param("m", "end outside the body (3,), or None")
     rest: Any = param("m", "rest lengths (m,)")
     spring: Any = param("N/m", "stiffness of one fibre")
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Numbers (n, m) of the nodes at which the fibres pull."""
+        """Return the numbers (n, m) of the n nodes at which each of the m fibres pulls."""
         return self.at
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Weights p (1, n, 1, m) of the nodes. The tangent vector is the vector from end to end of a fibre."""
+        """Return the weights p (1, n, 1, m) of the n nodes of m fibres.
+
+        The tangent vector goes from end to end of a fibre.
+        """
         return jnp.asarray(self.weights)[None, :, None, :]
 
     def away(self) -> jax.Array | None:
-        """Position of the end outside the body, or None if both ends are in the body."""
+        """Return the positions (1, 3, 1, m) [m] of the ends outside the body, or None if both ends are inside."""
         if self.to is None:
             return None
         return jnp.broadcast_to(jnp.asarray(self.to)[None, :, None, None], (1, 3, 1, len(self.rest)))
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Energy [J]: half the stiffness times the square of the elongation; 0 if the fibre is slack."""
+        """Return the energy [J] of each fibre: half of stiffness times elongation squared; 0 if it is slack."""
         length, rest = jnp.sqrt(C[0]), self.rest[None]
-        # A fibre at its rest length is taut. `maximum` would have half the derivative there.
+        # A fibre at its rest length counts as taut. The function `maximum` would give half of the derivative there.
         longer = jnp.where(length >= (1 - _ROUNDED) * rest, length - rest, 0.0)
         return 0.5 * self.spring * longer * longer

@@ -1,8 +1,8 @@
 """A membrane on a part of the surface, for example the capsule. It follows the surface and has no bending stiffness.
 
-The law of the membrane acts in its plane. The stress through the thickness is 0 (plane stress). A law with an isochoric
-part is treated as incompressible: the stretch of the thickness is 1 divided by the area ratio. For another law the
-stretch of the thickness is an unknown at every integration point.
+The law of the membrane acts in its plane. The stress through the thickness is 0 (plane stress). If the law has an
+isochoric part, the membrane is incompressible: the stretch through the thickness is 1 divided by the area ratio. For
+other laws, this stretch is an unknown at every integration point.
 
 Source: Holzapfel, Eberlein, Wriggers and Weizsaecker 1996, "A new axisymmetrical membrane element for anisotropic,
 finite strain analysis of arteries", and Bonet and Wood 2008, section 6.6 (plane stress).
@@ -27,7 +27,7 @@ from liverjax.physics.base import Physics, Step
 
 @struct
 class Membrane(Physics):
-    """A thin layer on triangles of the surface, without tension in the reference shape."""
+    """A thin layer on m triangles of the surface. It has no tension in the reference shape."""
 
     triangles: Indices = param("1", "node numbers (m, 3)", lower=0)
     thickness: Number = param("m", "thickness of the layer: one number, or one per triangle (m,)", above=0.0)
@@ -59,15 +59,18 @@ class Membrane(Physics):
         selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
         if np.shape(self.thickness) not in ((), (len(self.triangles),)):
             shape, count = np.shape(self.thickness), len(self.triangles)
-            raise InputError(f"{name}.thickness has shape {shape}: give one number, or one per triangle: {count}")
+            raise InputError(f"{name}.thickness has shape {shape}: give one number, or one per triangle ({count})")
         layers.check(self.law, name)
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Membrane":
-        """Return the membrane on the same triangles of the mesh of higher order."""
+        """Return the membrane on the same triangles, for the mesh with elements of higher order."""
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def freeze(self, memory: None, step: Step) -> "Stretched":
-        """Force term with the isochoric part of the law. If the law has no such part, the whole law is used."""
+        """Return the force term.
+
+        It uses the isochoric part of the law, or the whole law if there is no isochoric part.
+        """
         isochoric = self.law.isochoric_part()
         law, solved = (self.law, jnp.ones(0)) if isochoric is None else (isochoric, None)
         return Stretched(triangles=self.triangles, thickness=self.thickness, law=law, solved=solved)
@@ -75,26 +78,29 @@ class Membrane(Physics):
 
 @struct
 class Stretched(Elements):
-    """Force term of a membrane, for one step."""
+    """Force term of a membrane on m triangles, for one step."""
 
     triangles: Indices = param("1", "node numbers (m, 3)")
     thickness: Any = param("m", "of the layer")
-    law: Law = param("1", "isochoric part, or the whole law if the stretch of the thickness is unknown")
-    solved: object = param("1", "not None if the stretch of the thickness is an unknown", default=None)
+    law: Law = param("1", "isochoric part, or the whole law if the stretch through the thickness is an unknown")
+    solved: object = param("1", "not None if the stretch through the thickness is an unknown", default=None)
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Node numbers (n, m) of the m triangles, with n = 3 or more nodes per triangle."""
+        """Return the node numbers (n, m) of the m triangles, with n = 3 or more nodes per triangle."""
         return jnp.stack(surface.triangle_nodes(mesh, self.triangles))
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Factors p of the tangent vectors, for two orthogonal unit vectors in the plane of the reference triangle."""
+        """Return the factors p of two tangent vectors (see `Elements.tangents`).
+
+        In the reference shape, the tangent vectors are orthogonal unit vectors in the plane of the triangle.
+        """
         _, along = surface.triangle_slopes(mesh)
         r11, r12, r22 = (r[None, None] for r in self._edges(mesh))
         first, second = (jnp.asarray(a.T, r11.dtype)[:, :, None] for a in along)
         return jnp.stack([first / r11, (second - r12 / r11 * first) / r22])
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Energy [J] at every point: thickness times area times energy density."""
+        """Return the energy [J] at every integration point: thickness times area times energy density."""
         weights, _ = surface.triangle_slopes(mesh)
         r11, _, r22 = self._edges(mesh)
         law = jax.tree.map(lambda v: v if jnp.ndim(v) == 0 else v[None], self.law)
@@ -102,7 +108,10 @@ class Stretched(Elements):
         return (0.5 * self.thickness * r11 * r22)[None] * jnp.asarray(weights, W.dtype)[:, None] * W
 
     def _edges(self, mesh: TetMesh) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Cholesky factor (r11, r12, r22), each (m,) [m], of the metric of two edges of each reference triangle."""
+        """Return the entries r11, r12 and r22, each (m,) [m], of a Cholesky factor for each of the m triangles.
+
+        It is the factor of the metric of two edges of the triangle in the reference shape.
+        """
         corners = jnp.moveaxis(mesh.points[self.triangles[:, :3]], 0, -1)
         first, second = corners[1] - corners[0], corners[2] - corners[0]
         r11 = jnp.sqrt(jnp.sum(first * first, axis=0))

@@ -2,7 +2,7 @@
 
 The line is cut into pieces at the faces of the tetrahedra. A piece has no additional unknowns: its points move with the
 shape functions of its element. The cross-section is a ring, or a disc if `wall` is None. The law acts in uniaxial
-tension along the piece, at constant volume. The tissue in the volume of the wall is not removed.
+tension along the piece, at constant volume. The tissue of the body is not removed where the wall lies.
 """
 
 from collections.abc import Mapping
@@ -35,8 +35,8 @@ class Vessel(Physics):
     """m pieces of a centre line, each in one element."""
 
     element: Indices = param("1", "element numbers (m,)", lower=0)
-    enters: jax.Array = param("1", "barycentric coordinates where a piece begins (4, m)")
-    leaves: jax.Array = param("1", "barycentric coordinates where a piece ends (4, m)")
+    enters: jax.Array = param("1", "barycentric coordinates (4, m) of the beginning of each piece")
+    leaves: jax.Array = param("1", "barycentric coordinates (4, m) of the end of each piece")
     radius: Number = param("m", "outer radius, one number or one per piece (m,)", above=0.0)
     wall: Number | None = param(
         "m", "thickness of the wall; None: the cross-section is a disc", above=0.0, default=None
@@ -48,7 +48,7 @@ class Vessel(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: dict[str, object], name: str) -> "Vessel":
-        """Read [[vessel]]: a law, and the points of a centre line with radii or the file of a surface."""
+        """Read [[vessel]]: a law, and either the points of a centre line with radii, or the file of a surface."""
         if ("line" in table) == ("surface" in table) or "law" not in table:
             raise InputError(
                 f"{name} needs line = [[x, y, z], …] with radius in m, or surface = 'tube.stl', and [vessel.law]"
@@ -70,7 +70,7 @@ class Vessel(Physics):
                 "give finite numbers"
             )
         if not np.all(np.any(np.diff(line, axis=0) != 0, axis=1)):
-            raise InputError(f"{name} line has the same point twice in succession: correct the line")
+            raise InputError(f"{name} line has the same point twice in succession: remove one of the two")
         return along(mesh, line, radius, law, name=name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
@@ -78,7 +78,7 @@ class Vessel(Physics):
         numbers = np.asarray(self.element)
         if numbers.ndim != 1 or not numbers.size or numbers.max() >= mesh.number_of_elements:
             raise InputError(
-                f"{name} crosses no element, or one above number {mesh.number_of_elements - 1}: correct its line"
+                f"{name} has no elements, or an element number above {mesh.number_of_elements - 1}: correct its line"
             )
         for key in ("enters", "leaves"):
             bounds.check_shape(f"{name}.{key}", getattr(self, key), (4, len(numbers)))
@@ -91,18 +91,21 @@ class Vessel(Physics):
         layers.check(self.law, name)
 
     def freeze(self, memory: None, step: Step) -> "Bars":
-        """Force term with the isochoric part of the law. If the law has no such part, the whole law is used."""
+        """Return the force term.
+
+        It uses the isochoric part of the law, or the whole law if there is no isochoric part.
+        """
         law = self.law.isochoric_part() or self.law
         return Bars(element=self.element, enters=self.enters, leaves=self.leaves, section_area=self.area(), law=law)
 
     def area(self) -> jax.Array:
-        """Area of the cross-section [m^2]."""
+        """Return the area [m^2] of the cross-section: one number, or one per piece (m,)."""
         inner = 0.0 if self.wall is None else self.radius - self.wall
         return jnp.pi * (jnp.asarray(self.radius) ** 2 - inner**2)
 
 
 def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
-    """Centre lines of the tubes in a surface file. A given radius replaces the measured radii."""
+    """Return the centre lines of the tubes in a surface file. If a radius is given, it replaces the measured radii."""
     unit, radius = as_word(table.get("unit", "m"), f"{name} unit"), table.get("radius")
     if unit not in UNITS:
         raise InputError(f"{name} unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
@@ -117,7 +120,9 @@ def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
 
 
 def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "vessel", **given: object) -> Vessel:
-    """Create a vessel along a line (n, 3) [m], with one radius [m] or one per point (n,). Parts outside are ignored.
+    """Create a vessel along a line through n points (n, 3) [m], with one radius [m] or one per point (n,).
+
+    Parts of the line outside the body are ignored.
 
     Raises:
         InputError: the whole line is outside the body.
@@ -132,7 +137,7 @@ def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "v
 
 
 def crossing(mesh: TetMesh, lines: CentreLines, law: Law, name: str = "vessel", **given: object) -> Vessel:
-    """Create a vessel along several centre lines, for example of a tree. Parts outside the body are ignored.
+    """Create a vessel along several centre lines, for example of a tree. Parts of lines outside the body are ignored.
 
     Raises:
         InputError: all lines are outside the body.
@@ -162,7 +167,10 @@ def _of_pieces(
 
 @struct
 class Bars(Elements):
-    """Force term of a vessel, for one step."""
+    """Force term of a vessel with m pieces, for one step.
+
+    `enters` and `leaves` are the barycentric coordinates of the beginning and of the end of each piece.
+    """
 
     element: Indices = param("1", "element numbers (m,)")
     enters: jax.Array = param("1", "barycentric (4, m)")
@@ -171,7 +179,7 @@ class Bars(Elements):
     law: Law = param("1", "law of the wall")
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Node numbers (n, m) of the elements that the vessel crosses."""
+        """Return the node numbers (n, m) of the elements of the m pieces, with n nodes per element."""
         count = 4 if mesh.order == 1 else 10
         return jnp.stack([nodes[self.element] for nodes in mesh.element_nodes[:count]])
 
@@ -181,7 +189,7 @@ class Bars(Elements):
         return jnp.sqrt(jnp.sum(f * f, axis=1))
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Factors p: derivatives of the shape functions along the piece, at the integration points of the piece."""
+        """Return the factors p (see `Elements.tangents`): derivatives of the shape functions along each piece."""
         along = (self.leaves - self.enters) / self._lengths(mesh)[None]
         if mesh.order == 1:
             return along[None, :, None, :]
@@ -192,16 +200,20 @@ class Bars(Elements):
         return jnp.stack(rows, axis=1)[None]
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Energy [J]: volume of the wall times the energy density of an incompressible sample in tension."""
+        """Return the energies [J] at the integration points: volume of the wall times energy density.
+
+        The energy density is that of an incompressible sample in tension.
+        """
         law = jax.tree.map(lambda v: v if jnp.ndim(v) == 0 else v[None], self.law)
         volume = self.section_area * self._lengths(mesh) / len(C[0])
         return volume[None] * layers.axial_energy(law, jnp.sqrt(C[0]))
 
 
 def _slopes_along(L: jax.Array, along: jax.Array) -> jax.Array:
-    """Derivatives (10, m) of the quadratic shape functions in the direction `along` (4, m), at the point L (4, m).
+    """Return the derivatives (10, m) of the ten quadratic shape functions in the direction `along`, for m pieces.
 
-    L are barycentric coordinates. The derivatives are linear in L.
+    L (4, m) are the barycentric coordinates of a point of each piece, and `along` (4, m) are their derivatives along
+    the piece. The derivatives of the shape functions are linear in L.
     """
     corners = np.eye(4)
     table = functions(2, corners)[1]  # (10, 4, 4): derivatives with respect to L_k, at every corner

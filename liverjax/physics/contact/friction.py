@@ -1,10 +1,10 @@
-"""A rigid obstacle with Coulomb friction: the surface sticks to it until the shear reaches mu times the pressure.
+"""A rigid obstacle with Coulomb friction: the surface sticks until the shear stress reaches mu times the pressure.
 
-Every contact point has an elastic slip e [m] along the obstacle's surface, which is stored from step to step. Within a
-step, the slip grows with the motion of the point relative to the obstacle. The maximum slip is mu times the depth of
-the point in the obstacle. At the maximum slip the point slides. The shear stress is `stiffness` times e, and the
-pressure is `stiffness` times the depth. So a sticking point moves by at most mu times its depth, and does not creep.
-When a contact opens, its slip is set to 0.
+mu is the friction coefficient. Every contact point has an elastic slip e [m] along the obstacle's surface, which is
+stored from step to step. Within a step, the slip grows with the motion of the point relative to the obstacle. The
+maximum slip is mu times the depth of the point in the obstacle. At the maximum slip the point slides. The shear stress
+is `stiffness` times e, and the pressure is `stiffness` times the depth. So a sticking point moves by at most mu times
+its depth, and does not creep. When a contact opens, its slip is set to 0.
 
 The force has no energy, since sliding dissipates energy. The tangent is exact. It is not symmetric if points slide.
 
@@ -53,7 +53,7 @@ class RoughObstacle(Obstacle):
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Return the nodes of triangles that touch the obstacle at the beginning, constrained in all directions.
 
-        If mu is 0, the nodes are constrained along the normal only.
+        If the friction coefficient is 0, the nodes are constrained only along the normal.
         """
         nodes, normals = super().holds(mesh)
         if not np.all(np.asarray(self.friction) > 0):
@@ -61,11 +61,14 @@ class RoughObstacle(Obstacle):
         return np.tile(nodes, 3), np.repeat(np.eye(3), len(nodes), axis=0)
 
     def begin(self, start: Start) -> jax.Array:
-        """Elastic slip at the beginning of a run: zeros (3, Q, m)."""
+        """Return the elastic slip at the beginning: zeros (3, Q, m) for Q contact points on each of m triangles."""
         return jnp.zeros_like(contact_points(self, start.mesh, start.x))
 
     def freeze(self, memory: Any, step: Step) -> "Rubbing":
-        """Return the force term. It stores slip and contact points (relative to the obstacle) of the beginning."""
+        """Return the force term of a step.
+
+        It stores the slip and the contact points (relative to the obstacle) at the beginning of the step.
+        """
         plain = super().freeze(memory, step)
         moved = plain.moved
         # In a static run the first positions are only a guess, so slip is measured from the reference shape.
@@ -84,18 +87,18 @@ class RoughObstacle(Obstacle):
         )
 
     def advance(self, memory: jax.Array, acting: "Rubbing", end: End) -> jax.Array:
-        """Elastic slip (3, Q, m) [m] at the end of the step."""
+        """Return the elastic slip (3, Q, m) [m] of the contact points at the end of the step."""
         return acting.slip_at(acting.points(end.x), 1.0)
 
 
 @struct
 class Rubbing(Touching):
-    """Force term of an obstacle with friction, for one step."""
+    """Force term of an obstacle with friction, for one step: Q contact points on each of m triangles with n nodes."""
 
     friction: Number = param("1", "mu", default=0.0)
-    slip: Any = param("m", "elastic slip at the beginning (3, Q, m)", default=None)
+    slip: Any = param("m", "elastic slip at the beginning of the step (3, Q, m)", default=None)
     past: jax.Array | None = param(
-        "m", "contact points at the beginning, relative to the obstacle (3, Q, m)", default=None
+        "m", "contact points at the beginning of the step, relative to the obstacle (3, Q, m)", default=None
     )
     nodes: Array | None = param("1", "nodes of the triangles (n, m)", default=None)
     functions: Array | None = param(
@@ -105,48 +108,51 @@ class Rubbing(Touching):
     conservative: ClassVar[bool] = False  # type: ignore[misc]
 
     def points(self, x: jax.Array) -> jax.Array:
-        """Contact points (3, Q, m) [m] at nodal positions x (V, 3)."""
+        """Return the positions (3, Q, m) [m] of the contact points, at nodal positions x (V, 3)."""
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
 
     def slip_at(self, at: jax.Array, s: Number) -> jax.Array:
-        """Elastic slip (3, Q, m) [m] of contact points `at` (3, Q, m), at fraction s of the step."""
+        """Return the elastic slip (3, Q, m) [m] of contact points `at` (3, Q, m) [m], at fraction s of the step."""
         n, most = self._law(at, s)
         trial = self._trial(at, s, n)
         size = _of_slip(trial)
         return trial * jnp.where(size > most, most / size, 1.0)[None]
 
     def _law(self, at: jax.Array, s: Number) -> tuple[jax.Array, jax.Array]:
-        """Normals (3, Q, m), and the maximum slip (Q, m) [m] that the pressure allows."""
+        """Return the normals (3, Q, m) of the obstacle, and the maximum slip (Q, m) [m] at the present pressure."""
         d = distances(self.obstacle, at, self.now(s))
         return jnp.stack(d.normal), jnp.multiply(self.friction, jnp.maximum(-d.value, 0.0))
 
     def _trial(self, at: jax.Array, s: Number, n: jax.Array) -> jax.Array:
-        """Slip (3, Q, m) [m] if all points stick, projected onto planes with normals n (3, Q, m)."""
+        """Return the slip (3, Q, m) [m] if all contact points stick, projected onto planes with normals n (3, Q, m)."""
         trial = self.slip + at - self.now(s)[:, None, None] - self.past
         return trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
 
     def _guessed(self, mesh: TetMesh, at: jax.Array, s: Number) -> jax.Array:
-        """Whether points (1, 1, Q, m) just touch the obstacle. The tangent treats them as pressed and sticking."""
+        """Return whether points just touch the obstacle (1, 1, Q, m).
+
+        In the tangent they count as pressed and sticking.
+        """
         d = distances(self.obstacle, at, self.now(s))
         return (just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0))[None, None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Nodal forces (V, 3) [N] from the contact pressures and from the frictional shear."""
+        """Return the nodal forces (V, 3) [N] due to contact pressure and frictional shear, times -1."""
         shear = weighted_stiffness(self.obstacle, mesh)[None] * self.slip_at(self.points(x), s)
         return super().force(mesh, x, s) + shared_out(self.obstacle, mesh, x, shear)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Stiffness: the complete derivative of the force."""
+        """Return the stiffness: the complete derivative of the force with respect to the positions."""
         at, plain = self.points(x), super().attached(mesh, x, s)
         units = [jnp.zeros_like(at).at[j].set(1.0) for j in range(3)]
         H = jnp.stack([jax.jvp(lambda at: self.slip_at(at, s), (at,), (unit,))[1] for unit in units], axis=1)
         return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(self._law(at, s)[0]), H))
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """Energy [J] of the contact plus an energy of the slip.
+        """Return the energy [J] of the contact, plus an energy of the slip.
 
-        The energy of the slip is half of stiffness times slip squared. It grows linearly above the maximum slip that
-        the pressure at `start` allows.
+        Up to the maximum slip at `start`, the energy of the slip is half of stiffness times slip squared. Above the
+        maximum slip it grows linearly.
         """
         one = jnp.ones((), x.dtype)
         n, most = self._law(self.points(start), one)
@@ -155,7 +161,10 @@ class Rubbing(Touching):
         return self.energy(mesh, x) + jnp.sum(weighted_stiffness(self.obstacle, mesh) * stored)
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of `energy_from`. A sliding point has no stiffness along its direction of sliding."""
+        """Return the second derivative of `energy_from`.
+
+        A sliding point has no stiffness along its direction of sliding.
+        """
         at, plain = self.points(x), super().definite(mesh, x, s)
         n, most = self._law(at, s)
         trial = self._trial(at, s, n)
@@ -166,20 +175,20 @@ class Rubbing(Touching):
         return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(n), H))
 
     def _with_shear(self, mesh: TetMesh, plain: Attached, H: jax.Array) -> Attached:
-        """Add the stiffness of the shear, H (3, 3, Q, m) times `stiffness`, to that of the pressures, `plain`."""
+        """Return the stiffness `plain` of the pressures plus that of the shear (`stiffness` times H (3, 3, Q, m))."""
         shear = weighted_stiffness(self.obstacle, mesh)[None, None] * H
         return Attached(plain.nodes, plain.blocks + between_nodes(mesh, shear))
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
-        """Return zeros, since `attached` contains the whole derivative."""
+        """Return zeros, since `attached` already contains the complete derivative of the force."""
         return jnp.zeros_like(dx)
 
 
 def _of_slip(trial: jax.Array) -> jax.Array:
-    """Lengths (Q, m) [m] of slips (3, Q, m), at least 1e-100 to avoid a division by 0."""
+    """Return the lengths (Q, m) [m] of slips (3, Q, m). They are at least 1e-100, to avoid a division by 0."""
     return jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
 
 
 def _planes(n: jax.Array) -> jax.Array:
-    """Projection tensors (3, 3, Q, m) onto planes with normals n (3, Q, m)."""
+    """Return the projection tensors (3, 3, Q, m) onto planes with normals n (3, Q, m)."""
     return jnp.eye(3, dtype=n.dtype)[:, :, None, None] - n[:, None] * n[None]

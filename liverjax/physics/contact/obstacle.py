@@ -1,10 +1,10 @@
 """A rigid obstacle that the surface of the body cannot enter: a plane, a sphere, a cylinder or a cone.
 
 Contact is tested at some points of every surface triangle (three points in linear and quadratic meshes). At a point
-inside the obstacle a pressure per reference area acts along the obstacle's normal. The pressure is `stiffness` times
-the depth of the point. Nothing acts at points outside, so the surface does not stick to the obstacle. There is no
-friction (see `liverjax.physics.contact.friction`). The energy per area is half of pressure times depth. The gradient
-and the second derivative of the energy are exact.
+inside the obstacle, a force per reference area (the pressure) acts along the obstacle's normal. The pressure is
+`stiffness` times the depth of the point. Nothing acts at points outside, so the surface does not stick to the obstacle.
+There is no friction (see `liverjax.physics.contact.friction`). The energy per area is half of pressure times depth. The
+gradient and the second derivative of the energy are exact.
 
 With this penalty method the surface enters the obstacle by the depth pressure / stiffness. By default the stiffness is
 `HARDNESS` times the modulus of the body, divided by the size of a triangle. If the pressure is as large as this
@@ -35,25 +35,26 @@ from liverjax.physics.contact.passage import in_body
 from liverjax.physics.contact.shapes import SHAPES, Distance, distance
 from liverjax.solvers.attached import Attached
 
-#: Stiffness of the contact, divided by the stiffness of a layer of the body's material as thick as a triangle is wide.
+#: Stiffness of the contact, divided by that of a layer of the body's material. The layer is as thick as a triangle is
+#: wide.
 HARDNESS = 100.0
-#: A point counts as touching if its distance, divided by the size of a triangle, is below this.
+#: A point counts as touching if its distance, divided by the size of a triangle, is at most this value.
 _TOUCHING = 1e-9
-#: Contact points of a triangle: weights and barycentric coordinates (3, Q) of a rule of degree 2.
+#: Weights (Q,) and barycentric coordinates (3, Q) of Q = 3 contact points of a triangle (integration rule of degree 2).
 _POINTS = np.full(3, 1 / 3), np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 
 
 @struct
 class Obstacle(Physics):
-    """A rigid obstacle that is at rest, moves by the vector `by` during the run, or follows a history."""
+    """A rigid obstacle. It is at rest, moves by the vector `by` during the run, or follows a history of T times."""
 
-    triangles: Indices = param("1", "surface triangles that may touch it: node numbers (m, 3)", lower=0)
+    triangles: Indices = param("1", "surface triangles that may touch the obstacle: node numbers (m, 3)", lower=0)
     shape: str = static(default="plane", about="plane, sphere, cylinder or cone", words=tuple(SHAPES))
     position: Numbers = param(
         "m", "point of plane or cylinder axis, centre of sphere, tip of cone (3,)", default=(0.0, 0.0, 0.0)
     )
     axis: Numbers = param(
-        "1", "outward normal of a plane; axis of a cylinder; axis of a cone, inwards (3,)", default=(0.0, 0.0, 1.0)
+        "1", "outward normal of a plane, axis of a cylinder, or inward axis of a cone (3,)", default=(0.0, 0.0, 1.0)
     )
     radius: Number = param("m", "radius of sphere, cylinder or the rounded tip of a cone", lower=0.0, default=0.0)
     half_angle: Number = param("deg", "angle between axis and side of a cone", above=0.0, default=45.0)
@@ -63,7 +64,7 @@ class Obstacle(Physics):
         "m", "displacements at these times (T, 3), or factors (T,) that multiply `by`", default=None
     )
     stiffness: Any = param(
-        "Pa/m", "pressure per depth, one number or one per triangle (m,); None: from the law", above=0.0, default=None
+        "Pa/m", "pressure per depth, one number or one per triangle (m,); None: default", above=0.0, default=None
     )
 
     section: ClassVar[str] = "obstacle"
@@ -77,17 +78,17 @@ class Obstacle(Physics):
     def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
         """Read [[obstacle]]: shape, position and dimensions. By default the whole surface may touch the obstacle."""
         if "shape" not in table:
-            raise InputError(f"{name} is without shape: give {', '.join(SHAPES)}")
+            raise InputError(f"{name} has no shape: give {', '.join(SHAPES)}")
         shape = as_word(table["shape"], f"{name} shape")
         if shape not in SHAPES:
             raise InputError(f"{name} shape = {shape!r} is not known: {hint(shape, SHAPES)}")
         for key in ("position", *SHAPES[shape]):
             if key not in table:
-                raise InputError(f"{name} is a {shape} without {key}: give it")
+                raise InputError(f"{name} is a {shape} without {key}: add this key")
         own = _numbers_of_shape(shape)
         for key in ("axis", "radius", "half_angle"):
             if key in table and key not in own:
-                raise InputError(f"{name} is a {shape}, which has no {key}: remove it")
+                raise InputError(f"{name} is a {shape}, which has no {key}: remove this key")
         whole = "where" not in table and "set" not in table
         nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
         triangles = selection.surface_of(mesh, nodes, table.get("set"))
@@ -100,17 +101,17 @@ class Obstacle(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), shape=shape, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError for numbers that do not define the shape, or for triangles that are not in the mesh."""
+        """Raise InputError if numbers do not define the shape, or if triangles are not in the mesh."""
         selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
         for key in ("radius", "half_angle", "friction"):
             if np.ndim(getattr(self, key, 0.0)):
-                raise InputError(f"{name}.{key} = {getattr(self, key)} must be one number: give one")
+                raise InputError(f"{name}.{key} = {getattr(self, key)} must be one number: give a single number")
         for key in ("position", "axis", "by"):
             bounds.check_shape(f"{name}.{key}", getattr(self, key), (3,))
         bounds.check_shape(f"{name}.stiffness", self.stiffness, (), (len(self.triangles),))
         for key, idle in (("radius", 0.0), ("half_angle", 45.0)):
             if key not in _numbers_of_shape(self.shape) and np.any(np.asarray(getattr(self, key)) != idle):
-                raise InputError(f"{name}.{key} = {getattr(self, key)} changes nothing: a {self.shape} has none")
+                raise InputError(f"{name}.{key} = {getattr(self, key)} has no effect on a {self.shape}: remove it")
         if "radius" in SHAPES[self.shape] and not np.all(np.asarray(self.radius) > 0):
             raise InputError(f"{name} radius = {self.radius} of a {self.shape} must be above 0: give it in m")
         if self.shape == "cone" and not np.all(np.asarray(self.half_angle) < 90):
@@ -123,7 +124,7 @@ class Obstacle(Physics):
         if self.history is not None and np.ndim(self.history) == 2 and self.by is not None:
             raise InputError(f"{name} has by and a history of displacements: remove one of them")
         if self.history is not None and np.ndim(self.history) == 1 and getattr(self, self.driven) is None:
-            raise InputError(f"{name} history has factors, but the vector by that they multiply is missing: give by")
+            raise InputError(f"{name} history has factors for the vector by, but by is missing: give by")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
         """Raise InputError if the obstacle is inside the body at the beginning."""
@@ -131,15 +132,17 @@ class Obstacle(Physics):
         if deepest > 1e-9 * size:
             raise InputError(
                 f"{name} position = {np.asarray(self.position).tolist()} begins {deepest:.3g} m inside the body: move "
-                "it out"
+                "it out of the body"
             )
         centre = np.asarray(self.position, float) + np.asarray(self.displacement(0, 1, 0.0))
         axis = np.asarray(self.axis, float)
         if in_body(self.shape, axis, mesh, np.asarray(mesh.points), centre[None], np.asarray(self.triangles)).any():
-            raise InputError(f"{name} position = {np.asarray(self.position).tolist()} is inside the body: move it out")
+            raise InputError(
+                f"{name} position = {np.asarray(self.position).tolist()} is inside the body: move it out of the body"
+            )
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes of triangles that touch the obstacle at the beginning, and the normals there."""
+        """Return the nodes (n,) of triangles that touch the obstacle at the beginning, and the normals (n, 3) there."""
         d = _distances(self, mesh, mesh.points, self.displacement(0, 1, 0.0))
         near = np.asarray(d.value <= 1e3 * _TOUCHING * jnp.sqrt(_triangle_areas(self, mesh))[None])
         _, touching = np.nonzero(near)
@@ -148,14 +151,14 @@ class Obstacle(Physics):
         return nodes.ravel(), np.repeat(normals, nodes.shape[1], axis=0)
 
     def in_body(self, mesh: TetMesh, law: Law) -> "Obstacle":
-        """Compute the default stiffness from the law.
+        """Return the obstacle with a default stiffness from the law, if the user gave no stiffness.
 
         The default is `HARDNESS` times the modulus K + 4/3 mu, divided by the size of the triangle. mu is the shear
         modulus. The bulk modulus K is limited to 3 mu.
         """
         if self.stiffness is not None:
             return self
-        # Material under a contact can move sideways, so a large bulk modulus would make the contact too stiff.
+        # Material under a contact can move sideways. So with a large bulk modulus, the contact would be too stiff.
         shear = law.shear_modulus()
         modulus = jnp.max(jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear))
         return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
@@ -165,18 +168,18 @@ class Obstacle(Physics):
         return replace(self, by=None) if self.history is None else self
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Obstacle":
-        """Return the obstacle for the same triangles of the mesh of higher order."""
+        """Return the obstacle with the same triangles, for the mesh with elements of higher order."""
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
-        """Displacement (3,) [m] at the end of step k; step 0 is the beginning of the run."""
+        """Return the displacement (3,) [m] at the end of step k. Step 0 is the beginning of the run."""
         zero = jnp.zeros(3)
         if self.history is not None:
             return zero + history.value_at(self.by, k * dt, self.times, self.history)
         return zero if self.by is None else jnp.asarray(self.by) * (k / steps)
 
     def freeze(self, memory: None, step: Step) -> "Touching":
-        """Force term of the obstacle, with its displacements at the beginning and at the end of the step."""
+        """Return the force term of a step. It stores the displacements of the obstacle at both ends of the step."""
         dt = 0.0 if step.dt is None else step.dt
         moved = jnp.stack([self.displacement(n, step.steps, dt) for n in (step.k - 1, step.k)])
         # Newmark's method uses only the force at the end of the step, doubled (`liverjax.physics.inertia`).
@@ -196,15 +199,15 @@ class Touching(NodalForce):
     kinked: ClassVar[bool] = True
 
     def now(self, s: Number) -> jax.Array:
-        """Displacement (3,) [m] of the obstacle at fraction s of the step, if it does not depend on the body."""
+        """Return the displacement (3,) [m] of the obstacle at fraction s of the step, without influence of the body."""
         return self.moved[0] + s * (self.moved[1] - self.moved[0])
 
     def place(self, x: jax.Array, s: Number) -> jax.Array:
-        """Displacement (3,) [m] of the obstacle for positions x (V, 3) of the body, at fraction s of the step."""
+        """Return the displacement (3,) [m] of the obstacle at fraction s of the step, with the body at x (V, 3)."""
         return self.now(s)
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Minus the forces (V, 3) [N] of the contact pressures, distributed to the nodes of the triangles."""
+        """Return the contact forces (V, 3) [N] on the nodes, times -1 (the gradient of the contact energy)."""
         return self.force_at(mesh, x, self.place(x, s))
 
     def force_at(self, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
@@ -217,10 +220,11 @@ class Touching(NodalForce):
         return 0.5 * jnp.sum(weighted_stiffness(self.obstacle, mesh) * depth**2)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of the energy: a part along the normal, plus a part due to the change of the normal."""
+        """Return the second derivative of the energy: parts along the normal, and due to the change of the normal."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
-        # A surface that just touches counts as pressed. Otherwise a body on a plane would have no support at first.
+        # A surface that just touches counts as pressed. Otherwise a body on a plane would have no support in the first
+        # iteration.
         inside = just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack(
             [
@@ -231,7 +235,10 @@ class Touching(NodalForce):
         return Attached(touching_nodes(self.obstacle, mesh), between_nodes(mesh, H))
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Stiffness along the normal. The part due to the change of the normal is never positive, so it is omitted."""
+        """Return the stiffness along the normal.
+
+        The part due to the change of the normal is omitted, since its eigenvalues are never positive.
+        """
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         k = k * just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack([jnp.stack([k * a * b for b in d.normal]) for a in d.normal])
@@ -239,9 +246,9 @@ class Touching(NodalForce):
 
 
 def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-    """Force (V, 3) [N] of each node on the obstacle at positions x (V, 3), with the obstacle displaced by `moved` (3,).
+    """Return the force (V, 3) [N] of each node on the obstacle. It is the gradient of the contact energy.
 
-    This force is the gradient of the contact energy.
+    x (V, 3) are the positions of the body. The obstacle is displaced by `moved` (3,).
     """
     d = _distances(obstacle, mesh, x, moved)
     depth = depths(d, touching_distance(obstacle, mesh))
@@ -250,67 +257,75 @@ def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
 
 
 def depths(d: Distance, near: jax.Array) -> jax.Array:
-    """Negative distances (Q, m) [m] of the points inside the obstacle, 0 for other points.
+    """Return the signed distances (Q, m) [m] of points inside the obstacle (negative), and 0 for other points.
 
-    Points nearer than `near` (m,) [m] count as pressed, also in the stiffness. At a point that just touches, the
-    function `minimum` would give half of the derivative.
+    Points nearer than `near` (m,) [m] count as pressed, so they have a stiffness. `minimum` is not used: at a point
+    that just touches, it would give half of the derivative.
     """
     pressed = d.value - jax.lax.stop_gradient(jnp.maximum(d.value, 0.0))
     return jnp.where(d.value <= near[None], pressed, 0.0)
 
 
 def shared_out(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, pushes: jax.Array) -> jax.Array:
-    """Distribute forces (3, Q, m) [N] at contact points to the nodes. Return nodal forces (V, 3) [N]."""
+    """Distribute forces (3, Q, m) [N] at Q points of m triangles to the nodes. Return the nodal forces (V, 3) [N]."""
     own = jnp.einsum("aq,iqm->ami", point_functions(mesh, x.dtype), pushes)
     return jnp.zeros_like(x).at[touching_nodes(obstacle, mesh)].add(own)
 
 
 def between_nodes(mesh: TetMesh, H: jax.Array) -> jax.Array:
-    """Stiffness (n, 3, n, 3, m) [N/m] between the nodes of triangles, from the stiffness H (3, 3, Q, m) at points."""
+    """Return the stiffness (n, 3, n, 3, m) [N/m] between the n nodes of each of m triangles.
+
+    H (3, 3, Q, m) is the stiffness at the Q contact points of each triangle.
+    """
     N = point_functions(mesh, H.dtype)
     both = jnp.einsum("aq,bq->abq", N, N)
     return jnp.einsum("abq,ijqm->aibjm", both, H)
 
 
 def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-    """Maximum depth () [m] of the surface in the obstacle at positions x (V, 3); 0 if all points are outside."""
+    """Return the maximum depth () [m] of contact points in the obstacle at positions x; 0 if all are outside."""
     deepest = -jnp.min(_distances(obstacle, mesh, x, moved).value)
-    return jnp.where(deepest >= 0, deepest, 0.0)  # `maximum` would give half the derivative at a point that touches
+    return jnp.where(deepest >= 0, deepest, 0.0)  # at a point that touches, `maximum` gives half the derivative
 
 
-@jax.jit  # compiled, since the checks of a sweep call it for each run
+@jax.jit  # compiled, since the checks of a sweep call this function for each run
 def _depth_at_beginning(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Depth () [m] of the surface in the obstacle at the beginning of a run. If body and obstacle do not touch, this is
-    minus their distance."""
+    """Return the depth () [m] of the surface in the obstacle at the beginning of a run.
+
+    If body and obstacle do not touch, the result is negative: their distance, times -1.
+    """
     return -jnp.min(_distances(obstacle, mesh, mesh.points, obstacle.displacement(0, 1, 0.0)).value)
 
 
 def touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Node numbers (n, m) of the m triangles, with n = 3 or more nodes per triangle."""
+    """Return the node numbers (n, m) of the m triangles, with n = 3 or more nodes per triangle."""
     return jnp.stack(surface.triangle_nodes(mesh, obstacle.triangles))
 
 
 def point_functions(mesh: TetMesh, dtype: DTypeLike) -> jax.Array:
-    """Shape functions (n, Q) of the n nodes of a triangle at its Q contact points."""
+    """Return the shape functions (n, Q) of the n nodes of a triangle at its Q contact points."""
     return jnp.asarray(surface.triangle_functions(mesh, _rule(mesh)[1]), dtype)
 
 
 def _rule(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Weights and barycentric coordinates of the contact points of a triangle.
+    """Return the weights (Q,) and barycentric coordinates (3, Q) of the Q contact points of a triangle.
 
-    A triangle of order 3 has more than three points. With only three points, the surface between them could enter an
-    obstacle.
+    In elements of order 3, a triangle has more than three points. With only three points, an obstacle could enter the
+    surface between them.
     """
     return triangle_rule() if mesh.order == 3 else _POINTS
 
 
 def contact_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Coordinates (3, Q, m) [m] of the contact points on the triangles, for node positions x (V, 3)."""
+    """Return the positions (3, Q, m) [m] of Q contact points on each of m triangles, for nodal positions x (V, 3)."""
     return jnp.einsum("aq,ami->iqm", point_functions(mesh, x.dtype), x[touching_nodes(obstacle, mesh)])
 
 
 def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
-    """Signed distances of points (3, Q, m) [m] from the obstacle, which is displaced by `moved` (3,) [m]."""
+    """Return the signed distances [m] from the obstacle of the points `at` (3, Q, m) [m].
+
+    These are Q contact points on each of m triangles. The obstacle is displaced by `moved` (3,) [m].
+    """
     place = jnp.asarray(obstacle.position, at.dtype) + moved
     axis, angle = jnp.asarray(obstacle.axis, at.dtype), jnp.deg2rad(jnp.asarray(obstacle.half_angle, at.dtype))
     y = [at[i] - place[i] for i in range(3)]
@@ -319,17 +334,17 @@ def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
 
 @partial(jax.jit, inline=True)
 def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> Distance:
-    """Signed distances (Q, m) [m] of the contact points from the obstacle, which is displaced by `moved` (3,) [m]."""
+    """Return the signed distances (Q, m) [m] of the contact points from the obstacle, displaced by `moved` (3,) [m]."""
     return distances(obstacle, contact_points(obstacle, mesh, x), moved)
 
 
 def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
-    """Whether points (Q, m) are inside the obstacle, or near enough to count as touching."""
+    """Return whether points (Q, m) with distances `d` are inside the obstacle, or near enough to count as touching."""
     return d.value <= touching_distance(obstacle, mesh)[None]
 
 
 def touching_distance(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Maximum distance (m,) [m] that counts as touching, for each triangle."""
+    """Return the maximum distance (m,) [m] of a point that counts as touching, for each of m triangles."""
     return _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))
 
 
@@ -339,10 +354,11 @@ _FEWEST, _MOST = 6, 24
 
 
 def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> tuple[float, float]:
-    """Return the depth [m] of a round obstacle that the contact points do not show, and its approach [m].
+    """Return the depth [m] of a round obstacle between the contact points, and the approach [m] of the obstacle.
 
-    The obstacle is displaced by `moved` (3,), and the body is at positions x (V, 3). The approach is the depth of the
-    obstacle in the undeformed body. If this depth is 0, the approach is a tenth of the radius.
+    The obstacle is displaced by `moved` (3,), and the body is at positions x (V, 3). The depth is the maximum depth on
+    a fine grid, minus that at the contact points. The approach is the maximum depth of the displaced obstacle in the
+    undeformed body. If this depth is 0, the approach is a tenth of the radius.
     """
 
     def depth(y: jax.Array) -> float:
@@ -354,9 +370,9 @@ def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Arr
 
 
 def near_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Coordinates (3, Q, m) [m] of a fine grid of points on the contact triangles, for node positions x (V, 3).
+    """Return the positions (3, Q, m) [m] of Q points of a fine grid on each of m contact triangles.
 
-    If possible, the spacing of the points is below the radius of the obstacle.
+    x (V, 3) are the nodal positions. If possible, the spacing of the points is below the radius of the obstacle.
     """
     radius, width = _radius_and_width(obstacle, mesh)
     n = int(np.clip(np.ceil(3 * width / radius), _FEWEST, _MOST))
@@ -366,13 +382,19 @@ def near_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
 
 
 def _radius_and_width(obstacle: Obstacle, mesh: TetMesh) -> tuple[float, float]:
-    """Radius [m] of the obstacle (at least a thousandth of the width), and width [m] of the largest triangle."""
+    """Return the radius [m] of the obstacle (at least a thousandth of the width), and the width [m].
+
+    The width is that of the largest triangle.
+    """
     width = float(jnp.sqrt(jnp.max(_triangle_areas(obstacle, mesh))))
     return max(float(np.max(np.asarray(obstacle.radius))), 1e-3 * width), width
 
 
 def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> bool:
-    """Whether the surface at positions x (V, 3) touches the obstacle, at its initial position, without pressure."""
+    """Return whether the surface touches the obstacle at its initial position without pressure.
+
+    x (V, 3) are the positions of the body.
+    """
     d = _distances(obstacle, mesh, x, obstacle.displacement(0, 1, 0.0))
     nothing = d.value >= -_TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
     return bool(just_touching(obstacle, mesh, d).any() & nothing.all())
@@ -380,13 +402,13 @@ def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) ->
 
 @partial(jax.jit, inline=True)
 def _triangle_areas(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Areas (m,) [m^2] of the triangles in the reference shape."""
+    """Return the areas (m,) [m^2] of the m triangles in the reference shape."""
     normal = surface.areas(mesh.points, obstacle.triangles)
     return jnp.sqrt(jnp.sum(normal * normal, axis=1))
 
 
 def weighted_stiffness(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Stiffness times reference area (Q, m) [N/m] of every contact point."""
+    """Return stiffness times reference area (Q, m) [N/m] for the Q contact points of each of m triangles."""
     whole = _triangle_areas(obstacle, mesh) * obstacle.stiffness
     return jnp.asarray(_rule(mesh)[0], whole.dtype)[:, None] * whole[None]
 
@@ -395,7 +417,7 @@ def three_numbers(value: object, name: str) -> jax.Array:
     """Convert a value of a scene file to a vector (3,).
 
     Raises:
-        InputError: the value is not three finite numbers.
+        InputError: the value does not consist of three finite numbers.
     """
     vector = bounds.array_of(value)
     if vector is None or vector.shape != (3,):
@@ -404,5 +426,5 @@ def three_numbers(value: object, name: str) -> jax.Array:
 
 
 def _numbers_of_shape(shape: str) -> tuple[str, ...]:
-    """Names of the dimensions that a shape needs or may have."""
+    """Return the names of the dimensions that a shape must have or may have."""
     return (*SHAPES[shape], "radius") if shape == "cone" else SHAPES[shape]

@@ -1,7 +1,7 @@
 """Check whether a sphere or a cylinder passes through the surface of the body within a step.
 
-Contact depends only on the distance between the surface and the obstacle. So a sphere deep inside the body touches
-nothing. If the centre of a sphere is inside the body, the contact forces point in the wrong direction.
+Contact is found only by the distance between the surface of the body and the obstacle. So no contact is found for a
+sphere deep inside the body. If the centre of a sphere is inside the body, the contact forces have the wrong direction.
 """
 
 import numpy as np
@@ -16,20 +16,24 @@ _MOST = 256
 def in_body(
     shape: str, axis: np.ndarray, mesh: TetMesh, x: np.ndarray, centres: np.ndarray, triangles: np.ndarray
 ) -> np.ndarray:
-    """Whether (n,) the centre of a sphere, or a part of a cylinder's axis, is in the body. False for other shapes.
+    """Return, for each position of an obstacle, whether the obstacle is in the body (n,).
+
+    A sphere is in the body if its centre is. A cylinder is in the body if a part of its axis is. Other shapes give
+    False.
 
     Args:
         shape: shape of the obstacle.
         axis: axis of a cylinder (3,).
         mesh: mesh of the body.
         x: positions (V, 3) [m] of the nodes.
-        centres: positions of the obstacle (n, 3) [m].
-        triangles: surface (m, 3) that may touch the obstacle. Pieces of the mesh without such triangles are ignored.
+        centres: n positions (n, 3) [m] of the obstacle.
+        triangles: node numbers (m, 3) of the triangles that may touch the obstacle. Pieces of the mesh without such
+            triangles are ignored.
     """
     found = np.zeros(len(centres), bool)
     if shape not in ("sphere", "cylinder"):
         return found
-    across = np.eye(3) if shape == "sphere" else np.linalg.svd(axis[None])[2][1:]  # a cylinder is seen along its axis
+    across = np.eye(3) if shape == "sphere" else np.linalg.svd(axis[None])[2][1:]  # cylinder: project along its axis
     places, nodes = centres @ across.T, x @ across.T
     if np.any(places.min(axis=0) > nodes.max(axis=0)) or np.any(places.max(axis=0) < nodes.min(axis=0)):
         return found
@@ -44,7 +48,7 @@ def in_body(
 
 
 def _of_touching_body(mesh: TetMesh, elements: np.ndarray, triangles: np.ndarray) -> bool:
-    """Whether one of the elements (n,) belongs to a connected piece of the mesh with one of the triangles (m, 3)."""
+    """Return whether one of the elements (n,) is connected through the mesh to one of the triangles (m, 3)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -57,15 +61,15 @@ def _of_touching_body(mesh: TetMesh, elements: np.ndarray, triangles: np.ndarray
 def passed_in_step(
     shape: str, axis: np.ndarray, mesh: TetMesh, positions: np.ndarray, centres: np.ndarray, triangles: np.ndarray
 ) -> str:
-    """Return how an obstacle passes the body within a long step: "has its centre in", "went through", or "" (no).
+    """Return how an obstacle entered or passed the body in a step: "has its centre in", "went through", or "".
 
-    The obstacle went through if a position on its path is in the body both at the beginning and at the end of the step.
-    Without a passage there is no such position: the body recovers behind an obstacle that leaves it, and moves away in
+    The obstacle went through if a position on its path is inside the body both at the beginning and at the end of the
+    step. Otherwise there is no such position: the body recovers behind an obstacle that leaves it, and moves away in
     front of an obstacle that pushes it.
 
     Args:
-        positions: (2, V, 3) [m] at the beginning and at the end of the step.
-        centres: positions of the obstacle at these times (2, 3) [m].
+        positions: nodal positions (2, V, 3) [m] at the beginning and at the end of the step.
+        centres: positions (2, 3) [m] of the obstacle at these two times.
         shape, axis, mesh, triangles: the same arguments as for `in_body`.
     """
     way = centres[1] - centres[0]

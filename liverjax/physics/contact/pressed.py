@@ -46,7 +46,7 @@ _MOST_STEPS = 200
 class PressedObstacle(Obstacle):
     """An obstacle that a given force presses into the body."""
 
-    force: Numbers = param("N", "force that presses it (3,), reached at the last step", default=(0.0, 0.0, 0.0))
+    force: Numbers = param("N", "force on the obstacle (3,), reached at the last step", default=(0.0, 0.0, 0.0))
 
     keys: ClassVar[tuple[str, ...]] = (*(key for key in Obstacle.keys if key != "by"), "force")
     driven: ClassVar[str] = "force"
@@ -58,22 +58,22 @@ class PressedObstacle(Obstacle):
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError as `Obstacle` does, also for a missing force, a prescribed motion or negative factors."""
+        """Raise InputError as `Obstacle.check`, and for a missing force, a prescribed motion or negative factors."""
         super().check(mesh, name)
         history.check_times(self.times, self.history, name, (1,))
         if self.history is not None and np.any(np.asarray(self.history) < 0):
             least = float(np.min(np.asarray(self.history)))
             raise InputError(
-                f"{name} history has the factor {least:g}: the force can only press, so give factors of 0 or above"
+                f"{name} history has the factor {least:g}, but the force can only press: give factors of 0 or more"
             )
         if self.by is not None:
             raise InputError(f"{name} has both force and by: remove one of them")
         force = np.asarray(self.force, float)
         if force.shape != (3,) or not np.all(np.isfinite(force)) or not np.any(force):
-            raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give them")
+            raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give such numbers")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError as `Obstacle` does, also for a force that moves the obstacle past the body."""
+        """Raise InputError as `Obstacle.check_place` does, and if the force moves the obstacle past the body."""
         super().check_place(mesh, name)
         if not self._meets(mesh, contact_points):
             if self._meets(mesh, near_points):
@@ -85,7 +85,7 @@ class PressedObstacle(Obstacle):
             raise InputError(f"{name} force = {force} presses the obstacle past the body: change force or position")
 
     def _meets(self, mesh: TetMesh, points: Callable[..., jax.Array]) -> bool:
-        """Whether the obstacle reaches these points of the surface when it moves along its force."""
+        """Return whether the obstacle reaches the surface at the given points when it moves along its force."""
         at = points(self, mesh, mesh.points)
         size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
         travel = 0.0
@@ -100,40 +100,44 @@ class PressedObstacle(Obstacle):
         return False
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return no nodes: the obstacle can move, so it does not constrain the body."""
+        """Return no nodes: the obstacle can move, so it does not prevent rigid motions of the body."""
         return np.zeros(0, int), np.zeros((0, 3))
 
     def at_beginning(self) -> "PressedObstacle":
-        """Return the obstacle under the force at time 0. Without a history this force is 0."""
+        """Return the obstacle under the force at time 0. If there is no history, this force is 0."""
         return self if self.history is not None else replace(self, times=jnp.zeros(1), history=jnp.zeros(1))
 
     def direction(self) -> jax.Array:
-        """Direction of the force (3,)."""
+        """Return the direction (3,) of the force, a unit vector."""
         force = jnp.asarray(self.force, float)
         return force / jnp.linalg.norm(force)
 
     def load(self, k: Number, steps: int, dt: Number) -> jax.Array:
-        """Magnitude () [N] of the force at the end of step k; step 0 is the beginning of the run."""
+        """Return the magnitude () [N] of the force at the end of step k. Step 0 is the beginning of the run."""
         whole = jnp.linalg.norm(jnp.asarray(self.force, float))
         factor = k / steps if self.history is None else history.value_at(1.0, k * dt, self.times, self.history)
         # `maximum` would give half of the derivative at a factor of 0.
         return jnp.where(factor >= 0, whole * factor, 0.0)
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
-        """Return zero, since no motion is prescribed."""
+        """Return a zero vector (3,), since no motion is prescribed."""
         return jnp.zeros(3)
 
     def begin(self, start: Start) -> jax.Array:
-        """Displacement () [m] along the force at the beginning of a run: 0."""
+        """Return the displacement () [m] along the force at the beginning of a run, which is 0."""
         return jnp.zeros((), start.x.dtype)
 
     @classmethod
     def acts_without_memory(cls) -> bool:
-        """Return True, since the force may act from time 0 on."""
+        """Return True, since the force may act already at the beginning of a run."""
         return True
 
     def freeze(self, memory: Any, step: Step) -> "Pressing":
-        """Return the force term. It stores the force at both ends of the step, and the initial displacement."""
+        """Return the force term of a step.
+
+        It stores the magnitudes of the force at both ends of the step, and the displacement of the obstacle at its
+        beginning.
+        """
         dt, dtype = 0.0 if step.dt is None else step.dt, step.x.dtype
         load = jnp.stack([jnp.asarray(self.load(n, step.steps, dt), dtype) for n in (step.k - 1, step.k)])
         return Pressing(
@@ -149,52 +153,55 @@ class PressedObstacle(Obstacle):
         )
 
     def advance(self, memory: jax.Array, acting: "Pressing", end: End) -> jax.Array:
-        """Displacement () [m] along the force at the end of the step."""
+        """Return the displacement () [m] along the force at the end of the step."""
         return acting.travel(acting.points(end.x), 1.0)
 
 
 @jax.jit
 def _gap_after(obstacle: PressedObstacle, at: jax.Array, travel: Number) -> jax.Array:
-    """Minimum distance () [m] between points (3, Q, m) and the obstacle, which is displaced by `travel` [m]."""
+    """Return the minimum distance () [m] of points (3, Q, m) from the obstacle, moved by `travel` along its force."""
     return jnp.min(distances(obstacle, at, jnp.asarray(travel * obstacle.direction())).value)
 
 
 @struct
 class Pressing(Touching):
-    """Force term of a pressed obstacle, for one step."""
+    """Force term of a pressed obstacle, for one step: Q contact points on each of m triangles with n nodes."""
 
-    load: Any = param("N", "magnitude of the force at the beginning and at the end (2,)", default=None)
+    load: Any = param("N", "magnitude of the force at the beginning and at the end of the step (2,)", default=None)
     direction: Any = param("1", "direction of the force (3,)", default=None)
-    before: Any = param("m", "displacement along the force at the beginning ()", default=None)
+    before: Any = param("m", "displacement along the force at the beginning of the step ()", default=None)
     nodes: jax.Array | None = param("1", "nodes of the triangles (n, m)", default=None)
     functions: jax.Array | None = param(
         "1", "shape functions of a triangle's nodes at its contact points (n, Q)", default=None
     )
-    hardness: Any = param("N/m", "stiffness times area of every point (Q, m)", default=None)
-    near: Any = param("m", "distance that counts as touching (m,)", default=None)
+    hardness: Any = param("N/m", "contact stiffness times area, for each contact point (Q, m)", default=None)
+    near: Any = param("m", "maximum distance of a point that counts as touching (m,)", default=None)
 
     def points(self, x: jax.Array) -> jax.Array:
-        """Contact points (3, Q, m) [m] at nodal positions x (V, 3)."""
+        """Return the positions (3, Q, m) [m] of the contact points, at nodal positions x (V, 3)."""
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
 
     def place(self, x: jax.Array, s: Number) -> jax.Array:
-        """Displacement (3,) [m] of the obstacle at positions x (V, 3) and fraction s of the step."""
+        """Return the displacement (3,) [m] of the obstacle, at positions x (V, 3) and fraction s of the step."""
         return self.travel(self.points(x), s) * self.direction
 
     def travel(self, at: jax.Array, s: Number) -> jax.Array:
-        """Displacement () [m] along the force at which the contact balances the force; NaN if none is found."""
+        """Return the displacement () [m] along the force at which contact and force balance; NaN if none is found."""
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))
-        # Newton steps from the solution change only its derivatives. One step gives the first derivative, two steps
-        # give the second.
+        # Newton steps that begin at the solution do not change its value, but they give its derivatives: one step the
+        # first derivative, two steps the second.
         for _ in range(2):
             held, slope, _ = self._resistance(at, found)
             found = found + (load - held) / jnp.where(slope > 0, slope, 1.0)
         return found
 
     def _resistance(self, at: jax.Array, travel: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Contact force [N] against the displacement `travel` along the line of the force, the derivative [N/m] of this
-        force with respect to `travel`, and the minimum distance [m] of the points `at` from the obstacle."""
+        """Return the contact force [N], its derivative [N/m], and the minimum distance [m] of `at` from the obstacle.
+
+        The obstacle is displaced by `travel` along its force. The contact force acts against this displacement, and the
+        derivative is that with respect to `travel`. `at` are the contact points.
+        """
         d = distances(self.obstacle, at, travel * self.direction)
         depth, inside = depths(d, self.near), (d.value <= self.near[None]).astype(at.dtype)
         along = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
@@ -203,17 +210,18 @@ class Pressing(Touching):
         return -jnp.sum(self.hardness * depth * along), jnp.sum(slope), jnp.min(d.value)
 
     def _found(self, at: jax.Array, load: jax.Array) -> jax.Array:
-        """Find the displacement () [m] by Newton's method, with steps of at most twice the depth; NaN if none is found.
+        """Find the displacement () [m] of the obstacle by Newton's method; NaN if none is found.
 
-        The contact force grows with the displacement.
+        The contact force grows with the displacement. A step of Newton's method is at most twice the depth.
         """
         own = jax.lax.stop_gradient(self)
         first = own._resistance(at, own.before)[0]
-        # Positions have roundoff, so the balance cannot be more accurate than hardness times this roundoff.
+        # Positions have roundoff. So the forces balance only up to `hardness` times this roundoff.
         size = jnp.max(jnp.abs(at)) + jnp.max(jnp.abs(jnp.asarray(own.obstacle.position, at.dtype)))
         rounded = size * jnp.max(own.hardness)
         enough = float(jnp.finfo(at.dtype).eps) * (16 * jnp.maximum(load, first) + rounded)
-        # Lower bound of the depth: the depth that would balance the force if all points had the same depth.
+        # `least` is a lower bound of the maximum depth: the depth that balances the force if all points have the same
+        # depth.
         least = load / jnp.sum(own.hardness)
 
         def unfinished(c: tuple) -> jax.Array:
@@ -234,16 +242,16 @@ class Pressing(Touching):
         return jnp.where(abs(held - load) <= 1e3 * enough, travel, jnp.nan)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Energy [J] of the contact minus the work of the force."""
+        """Return the energy [J] of the contact minus the work of the force."""
         at = self.points(x)
         travel = self.travel(at, 1.0)
         depth = jnp.minimum(distances(self.obstacle, at, travel * self.direction).value, 0.0)
         return 0.5 * jnp.sum(self.hardness * depth**2) - self.load[1] * travel
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay:
-        """Loss of stiffness because the obstacle can move.
+        """Return the loss of stiffness due to the free displacement of the obstacle along its force.
 
-        If `definite` is true, the change of the normals is ignored, as the method `definite` of the contact does.
+        If `definite` is true, the change of the normals is ignored, as in the method `definite` of the contact.
         """
         at = self.points(x)
         d = distances(self.obstacle, at, self.travel(at, s) * self.direction)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from liverjax.core.struct import Array, Number
 
-#: Names of the shapes in scenes, and the numbers that each shape needs.
+#: Names of the shapes in scenes, with the fields that each shape needs.
 SHAPES: dict[str, tuple[str, ...]] = {
     "plane": ("axis",),
     "sphere": ("radius",),
@@ -25,16 +25,16 @@ class Distance(NamedTuple):
     """Signed distance of points, with the first and second derivative of the distance."""
 
     value: jax.Array  # (…) [m]
-    normal: list[jax.Array]  # 3 components (…): gradient, a unit vector
-    bent: list[list[jax.Array]]  # 3 x 3 components (…) [1/m]: second derivative
+    normal: list[jax.Array]  # 3 components (…): gradient of the distance, a unit vector
+    bent: list[list[jax.Array]]  # 3 x 3 components (…) [1/m]: second derivative of the distance
 
 
 def distance(shape: str, y: list[jax.Array], axis: Any, radius: Number, half_angle: Number) -> Distance:
-    """Signed distance of points y (3 arrays of any shape) [m] from the shape.
+    """Return the signed distance [m] of points from a shape, with its first and second derivative.
 
     Args:
         shape: one of `SHAPES`.
-        y: coordinates of the points, relative to the position of the shape.
+        y: coordinates x, y, z [m] of the points relative to the position of the shape, three arrays of any shape.
         axis: unit vector (3,): the outward normal of a plane, the axis of a cylinder, or the inward axis of a cone.
         radius: radius [m] of a sphere, a cylinder, or the rounded tip of a cone. The lowest point of the rounded tip is
             at the position of the cone.
@@ -52,17 +52,17 @@ def distance(shape: str, y: list[jax.Array], axis: Any, radius: Number, half_ang
 
 
 def _normal_to(y: list[jax.Array], axis: Array) -> list[jax.Array]:
-    """Return the part of the vectors y perpendicular to the axis."""
+    """Return the components of the vectors y perpendicular to the unit vector `axis`."""
     along = sum(a * c for a, c in zip(axis, y, strict=True))
     return [c - along * a for a, c in zip(axis, y, strict=True)]
 
 
 def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Distance:
-    """Distance of the points y from a sphere centred at 0, or from a cylinder with an axis through 0.
+    """Return the distance of the points y from a sphere with centre 0, or from a cylinder with an axis through 0.
 
-    For a cylinder, pass only the part of y that is perpendicular to the axis.
+    For a cylinder, y must contain only the components perpendicular to the axis.
     """
-    # At the centre the normal is not defined; this bound avoids a division by 0.
+    # At the centre the normal is not defined. The lower bound 1e-30 avoids a division by 0.
     r = jnp.sqrt(jnp.maximum(sum(c * c for c in y), 1e-30))
     n = [c / r for c in y]
     held = [[0.0] * 3 for _ in range(3)] if axis is None else [[a * b for b in axis] for a in axis]
@@ -71,9 +71,9 @@ def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Dis
 
 
 def _cone(y: list[jax.Array], axis: jax.Array, radius: Number, half_angle: Number) -> Distance:
-    """Distance of the points y from the side or the tip of a cone.
+    """Return the distance of the points y from the side or the tip of a cone.
 
-    For a rounded tip, this is the distance from a sharp cone further inside, minus the radius.
+    For a rounded tip, this is the distance from a sharp cone that lies deeper inside, minus the radius of the tip.
     """
     c, s = jnp.cos(half_angle), jnp.sin(half_angle)
     y = [v - radius * a for v, a in zip(y, axis, strict=True)]

@@ -1,1 +1,1 @@
-"""Forms of the volume change against locking: averages at nodes, or pressures as unknowns."""
+"""Two methods against volumetric locking: volume changes averaged at nodes, or pressures as unknowns."""

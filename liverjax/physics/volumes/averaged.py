@@ -2,12 +2,14 @@
 
 The volumetric energy is the sum of V_a U(J_a) over the nodes, with the volumetric energy density U of the law. J_a is
 the mean volume ratio J of the elements around node a, weighted by their volumes. V_a is a quarter of the sum of these
-volumes. A mesh has about five times fewer nodes than elements. So there are five times fewer constraints if the bulk
-modulus is large. The pressure of a node is p_a = U'(J_a), and the pressure of an element is the mean over its nodes.
-The stiffness is the stiffness at given pressures plus G^T D^-1 G, with the derivative G of the nodal volumes and D =
-V_a/U''. A step of a porous body without flow leads to the same system of equations.
+volumes. A mesh has about five times fewer nodes than elements. So there are five times fewer volume constraints if the
+bulk modulus is large. The pressure at a node is p_a = U'(J_a), and the pressure in an element is the mean over its
+nodes. The stiffness is the stiffness at constant pressures plus G^T D^-1 G. G is the derivative of the nodal volumes
+with respect to the positions, and D is diagonal with the entries V_a/U''. A step of a porous body without flow leads to
+the same system of equations.
 
-If elements have different volumetric energies, a node has the mean of these energies, weighted by volume.
+If the elements around a node have different volumetric energies, the mean of these energies is used, weighted by
+volume.
 """
 
 from typing import Any
@@ -37,7 +39,7 @@ def _invariants(law: Law, J: jax.Array) -> Any:
 
 
 def nodal_energy(mesh: TetMesh, law: Law) -> Law:
-    """Volumetric energy of the nodes, with one bulk modulus per node (V,) if the moduli of the elements differ."""
+    """Return the volumetric energy of the nodes, with one bulk modulus per node (V,) if the moduli of elements vary."""
     U = volumetric_part(law)
     if len(U.pieces()) == 1 and all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(U)):
         return U
@@ -55,20 +57,20 @@ def nodal_energy(mesh: TetMesh, law: Law) -> Law:
 
 
 def energy(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
-    """Volumetric energy [J] of elements with volume ratios J (E,)."""
+    """Return the volumetric energy [J] of a body with volume ratios J (E,) of its elements."""
     mean, volumes = _mean(mesh, J)
     U = volumetric_part(law)
     return jnp.sum(volumes * U.strain_energy(_invariants(U, mean)))
 
 
 def averaged_pressure(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
-    """Pressures U' (V,) [Pa] of the nodes, positive in tension."""
+    """Return the pressures U' (V,) [Pa] at the nodes. They are positive in tension."""
     U = volumetric_part(law)
     return U.energy_derivatives(_invariants(U, _mean(mesh, J)[0]))[0]["J"]
 
 
 def compliance(mesh: TetMesh, law: Law, J: jax.Array, positive: bool) -> BlockMatrix:
-    """Pressure matrix D = V_a/U'' [m^3/Pa], or its absolute value if `positive` is true."""
+    """Return the pressure matrix D = V_a/U'' [m^3/Pa], or its absolute value if `positive` is true."""
     U = volumetric_part(law)
     mean, volumes = _mean(mesh, J)
     slope = U.energy_derivatives(_invariants(U, mean))[1]["J", "J"]
@@ -84,7 +86,7 @@ class AveragedVolume(Physics):
     law: Law = param("1", "law whose volumetric part is used")
 
     def freeze(self, memory: None, step: Step) -> "Averaged":
-        """Force term with the volumetric energy of the nodes, for one step."""
+        """Return the force term with the volumetric energy of the nodes, for one step."""
         return Averaged(law=nodal_energy(step.mesh, self.law))
 
 
@@ -95,22 +97,25 @@ class Averaged(VolumeStress):
     law: Law = param("1", "volumetric energy of the nodes")
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: Guess | None = None) -> jax.Array:
-        """Pressures (V,) [Pa] of the nodes, computed by `averaged_pressure`."""
+        """Return the pressures (V,) [Pa] at the nodes from the function `averaged_pressure`."""
         return averaged_pressure(mesh, self.law, J)
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
-        """First Piola-Kirchhoff stress p cof F [Pa], with the pressure p linear in every element."""
+        """Return the first Piola-Kirchhoff stress p cof F [Pa]. The pressure p is linear in every element."""
         return scale_matrix(interpolated(mesh, pressure), cofactor(F))
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """Pressure [Pa] of the elements. Its derivative with respect to J is 0, since the nodal pressures are given."""
+        """Return the pressure [Pa] in the elements, and its derivative with respect to J, which is 0.
+
+        The pressures at the nodes are constant in this derivative.
+        """
         p = interpolated(mesh, pressure)
         return Scalars({"J": p}, {("J", "J"): jnp.zeros_like(p)})
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Volumetric energy [J] of the nodes, computed by the function `energy` of this module."""
+        """Return the volumetric energy [J] from the function `energy` of this module."""
         return energy(mesh, self.law, J)
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """Pressure matrix [m^3/Pa], computed by `compliance`."""
+        """Return the pressure matrix [m^3/Pa] from the function `compliance`."""
         return compliance(mesh, self.law, J, positive)

@@ -5,16 +5,17 @@ With pressures p the energy per volume is
 
     W_isochoric + gamma g^2 / 2 + p g - p^2 / (2 (K - gamma)),
 
-with p linear in every element and continuous. If p is optimal, this energy is U with g averaged by the shape functions
-of p. So volume changes are limited only on average, not at every point. The part gamma of the bulk modulus stays in the
-displacement terms, so that their matrix is positive. gamma is min(mu, K/2), with the shear modulus mu; in linear
-elements it is a quarter of this. When the mesh is refined, the solution no longer depends on gamma. Pressures are
-unknowns together with the positions. If they were eliminated, Newton's method would not converge for large K.
+with p linear in every element and continuous. For the optimal p, this energy is U with g averaged by the shape
+functions of p. So volume changes are limited only on average, not at every point. The part gamma of the bulk modulus
+stays in the terms of the displacements, so that their matrix is positive definite. gamma is min(mu, K/2) with the shear
+modulus mu, and a quarter of this in linear elements. The finer the mesh, the less the solution depends on gamma.
+Pressures and positions are unknowns of the same system. If the pressures were eliminated, Newton's method would not
+converge for large K.
 
 In linear elements, the positions do not determine all pressures: some pressures that alternate from node to node cause
-no force. For large K they would grow without bound. So linear elements have a stabilisation term, - (p - mean of p)^2 /
-(2 mu), with the mean over the element (Bochev, Dohrmann and Gunzburger 2006). This term decreases with the square of
-the element size.
+no force. For large K these pressures would grow without bound. So linear elements have a stabilisation term, - (p -
+mean of p)^2 / (2 mu), with the mean over the element (Bochev, Dohrmann and Gunzburger 2006). This term decreases with
+the square of the element size.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,30 +39,37 @@ from liverjax.tensors.places import given, taken
 
 
 def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = 'mixed'") -> None:
-    """Check that the laws of a body allow pressures as unknowns.
+    """Check that pressures can be unknowns with the laws of a body.
 
     Raises:
-        InputError: a law without an isochoric part or bulk, or volumetric energies of several kinds.
+        InputError: a law has no isochoric part or no bulk modulus, or the laws have different kinds of volumetric
+            energy.
     """
     kinds = set()
     for law in several:
         U = volumetric_part(law)
         if isochoric_part(law) is None or U is None:
-            raise InputError(f"{name} needs a law with an isochoric part and bulk: {type(law).__name__} has none")
+            raise InputError(
+                f"{name} needs a law with an isochoric part and bulk, unlike {type(law).__name__}: use another law"
+            )
         parts = [part for own in U.pieces() for part in own.summands() if isinstance(part, Volumetric)]
         kinds |= {(part.volumetric, part.below) for part in parts}
     if len(kinds) != 1 or next(iter(kinds))[1] is not None:
-        raise InputError(f"{name} needs one kind of volumetric energy in all laws: give each the same volumetric = …")
+        raise InputError(f"{name} needs one kind of volumetric energy in all laws: give all laws the same volumetric")
 
 
 def strain(kind: str, J: jax.Array) -> jax.Array:
-    """Volumetric strain g(J) of U = K g^2 / 2: J - 1 for "quadratic", ln J for "log", a similar function for "simo"."""
+    """Return the volumetric strain g(J) of the energy U = K g^2 / 2, for the volume ratio J.
+
+    g is J - 1 for "quadratic" and ln J for "log". For "simo", U is K (J^2 - 1 - 2 ln J) / 4.
+    """
     if kind == "log":
         return jnp.log(J)
     d = J - 1
     if kind == "quadratic":
         return d
-    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-1)^n d^(n-2) / n, n = 3 …). The closed form cancels near J = 1.
+    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-1)^n d^(n-2) / n, n = 3 …). Near J = 1, the first form has
+    # roundoff.
     near = jnp.clip(d, -0.1, 0.1)
     series = 1 + sum((-1) ** n * near ** (n - 2) / n for n in range(3, 18))
     safe = jnp.where(jnp.abs(d) < 0.1, 1.0, d)
@@ -69,12 +77,12 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
     return d * jnp.sqrt(jnp.where(jnp.abs(d) < 0.1, series, whole))
 
 
-#: gamma divided by min(mu, K/2), for each element order. In linear elements gamma causes locking, so a smaller gamma is
-#: more accurate.
+#: Element order -> gamma divided by min(mu, K/2). In linear elements, gamma causes locking, so a smaller gamma gives
+#: more accurate results.
 _PART = {1: 0.25, 2: 1.0, 3: 1.0}
 
 
-#: Smallest relative residual that Newton's method reaches, divided by the machine precision.
+#: Minimum relative residual that Newton's method can reach, divided by the machine precision.
 _REACHED = 4096
 
 
@@ -85,7 +93,7 @@ class MixedVolume(Physics):
     law: Law = param("1", "law whose volumetric part is used")
 
     def begin(self, start: Start) -> jax.Array:
-        """Pressures (V,) at the beginning of a run: zeros."""
+        """Return the pressures (V,) [Pa] at the beginning of a run, which are zeros."""
         return jnp.zeros(start.mesh.number_of_vertices, start.x.dtype)
 
     def freeze(self, memory: jax.Array, step: Step) -> "Mixed":
@@ -104,19 +112,19 @@ class MixedVolume(Physics):
         return Mixed(part=part, rest=bulk - part, shear=mu, before=memory, **own)
 
     def advance(self, memory: jax.Array, acting: "Mixed", end: End) -> jax.Array:
-        """Pressures (V,) [Pa] at the end of the step."""
+        """Return the pressures (V,) [Pa] at the end of the step."""
         return end.pressure
 
 
 @struct
 class Mixed(VolumeStress):
-    """Force term with pressures as unknowns, for one step."""
+    """Force term with pressures as unknowns, for one step. Symbols (K, gamma, mu, g, p): docstring of the module."""
 
     part: Number = param("Pa", "gamma, part of K in the displacement terms")
     rest: Number = param("Pa", "K - gamma, part of K in the pressure terms")
     shear: Number = param("Pa", "shear modulus")
     before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
-    unit: jax.Array = param("N/m^3", "pressure for an unknown of 1 m; in this unit all residuals are forces")
+    unit: jax.Array = param("N/m^3", "pressure for an unknown of 1 m; with this unit, all residuals are forces")
     counted: jax.Array = param(
         "1",
         "mu/K, the fraction of all forces on which the tolerance is based. Isochoric forces count in full. In a "
@@ -128,7 +136,7 @@ class Mixed(VolumeStress):
     unknown: ClassVar[bool] = True
 
     def _slopes(self, J: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Volumetric strain g and its first two derivatives with respect to J."""
+        """Return the volumetric strain g and its first two derivatives with respect to J."""
 
         def first(J: jax.Array) -> tuple[jax.Array, jax.Array]:
             return jax.jvp(lambda J: strain(self.kind, J), (J,), (jnp.ones_like(J),))
@@ -137,35 +145,38 @@ class Mixed(VolumeStress):
         return g, g1, g2
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
-        """First Piola-Kirchhoff stress (gamma g + p) g' cof F [Pa]."""
+        """Return the first Piola-Kirchhoff stress (gamma g + p) g' cof F [Pa], with g' = dg/dJ."""
         g, g1, _ = self._slopes(determinant(F))
         return scale_matrix((self.part * g + interpolated(mesh, pressure)) * g1, cofactor(F))
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Energy [J] with the optimal pressures for volume ratios J: the integral of gamma g^2/2 + p g/2."""
+        """Return the energy [J] with the optimal pressures p at volume ratios J: integral of gamma g^2/2 + p g/2."""
         g = strain(self.kind, J)
         return jnp.sum(mesh.weights * (0.5 * self.part * g * g)) + 0.5 * jnp.vdot(
             self.settled(mesh, J), integrals(mesh, g)
         )
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """First and second derivative of the energy density with respect to J, at given pressures (V,) [Pa]."""
+        """Return the first and second derivative of the energy density with respect to J, at given pressures (V,)."""
         g, g1, g2 = self._slopes(determinant(F))
         whole = self.part * g + interpolated(mesh, pressure)
         return Scalars({"J": whole * g1}, {("J", "J"): self.part * g1 * g1 + whole * g2})
 
     def border(self, J: jax.Array) -> jax.Array:
-        """Derivative g' of the volumetric strain g with respect to J."""
+        """Return the derivative g' of the volumetric strain g with respect to J. It couples pressures and positions."""
         return self._slopes(J)[1]
 
     def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
-        """Integrals (V,) [m^3] of the shape functions of p times g - p/(K - gamma); 0 at a solution."""
+        """Return the residual (V,) [m^3] of the pressure equation, which is 0 at a solution.
+
+        It contains the integrals of the shape functions of p times g - p/(K - gamma).
+        """
         return integrals(mesh, strain(self.kind, J)) - self.compliance(mesh, pressure)
 
     def compliance(self, mesh: TetMesh, pressure: jax.Array) -> jax.Array:
-        """Integrals (V,) [m^3] of the shape functions of p times p/(K - gamma).
+        """Return the integrals (V,) [m^3] of the shape functions of p times p/(K - gamma).
 
-        In linear elements the stabilisation term is added.
+        In linear elements, the stabilisation term is added.
         """
         if mesh.order > 1:
             return gathered(mesh, mesh.weights * interpolated(mesh, pressure) / self.rest)
@@ -175,7 +186,7 @@ class Mixed(VolumeStress):
         return given(jnp.zeros_like(pressure), mesh.tetrahedra.T, jnp.stack(shares))
 
     def diagonal(self, mesh: TetMesh) -> jax.Array:
-        """Diagonal (V,) [m^3/Pa] of the matrix of `compliance`."""
+        """Return the diagonal (V,) [m^3/Pa] of the pressure matrix."""
         none = jnp.zeros_like(self.before)
         if mesh.order == 1:
             share = jnp.stack(4 * [mesh.volumes * (2 / self.rest + 0.75 / self.shear) / 20])
@@ -184,7 +195,7 @@ class Mixed(VolumeStress):
         return given(none, mesh.tetrahedra.T, share)
 
     def settled(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Pressures (V,) [Pa] at which `balance` is 0 for volume ratios J."""
+        """Return the pressures (V,) [Pa] for which `balance` is 0 at volume ratios J."""
         none, diagonal = jnp.zeros_like(self.before), self.diagonal(mesh)
 
         def solve(apply: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
@@ -196,7 +207,7 @@ class Mixed(VolumeStress):
         return jax.lax.custom_linear_solve(own, self.balance(mesh, none, J), solve, symmetric=True)
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """Pressure matrix [m^3/Pa]: `compliance` is its product with the pressures."""
+        """Return the pressure matrix [m^3/Pa]. Its product with the pressures is the result of `compliance`."""
 
         def block(a: int, b: int) -> jax.Array:
             same = float(a == b)
@@ -211,6 +222,6 @@ class Mixed(VolumeStress):
         return BlockMatrix(rows, ((given(zero, mesh.tetrahedra.T, own),),), mesh.pattern.row_nodes)
 
     def schur(self, mesh: TetMesh) -> jax.Array:
-        """Lumped approximation (V,) [m^3/Pa] of the pressure matrix after the displacements are eliminated."""
+        """Return a diagonal approximation (V,) [m^3/Pa] of the pressure matrix after the elimination of positions."""
         soft = 1 / (1.5 * self.shear + self.part) + 1 / self.rest
         return integrals(mesh, jnp.broadcast_to(soft, mesh.weights.shape))

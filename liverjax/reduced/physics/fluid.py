@@ -1,5 +1,5 @@
-"""The fluid of a porous reduced model: the pressure is a sum of a few modes. Darcy's law gives the coordinates of the
-modes.
+"""The fluid of a reduced model with a porous body. The pressure is a sum of a few modes, and Darcy's law gives the
+coordinates of the modes.
 
 The pressure is P = sum_k p_k psi_k, with modes psi_k and coordinates p_k. The discrete equation of the full model
 (`liverjax.physics.porosity`) is projected onto the same modes. Its integrals are sums over the weighted points of the
@@ -37,7 +37,7 @@ from liverjax.tensors.places import given
 
 
 class ReducedFluid(NamedTuple):
-    """State of the fluid at the end of a step, from which the next step starts."""
+    """State of the fluid at the end of a step, from which the next step starts (m pressure modes, S points)."""
 
     pressure: jax.Array  # coordinates p (m,) [Pa]
     F: jax.Array  # deformation gradients (9, S)
@@ -59,7 +59,7 @@ class ReducedSponge(NamedTuple):
 
 
 class Flowing(NamedTuple):
-    """Data of the fluid that are constant during a step."""
+    """Data of the fluid that are constant during a step (m pressure modes, S points; A and S: module docstring)."""
 
     porosity: Porosity  # with parameters at the points
     inverse: jax.Array  # inverse of A (m, m) [Pa/m^3]
@@ -173,8 +173,8 @@ def volume_blocks(model: ReducedModel, own: Flowing, F: Matrix, pairs: tuple[tup
     """Return the derivative of `volume_stress` with respect to F at constant pressures, as one block for each pair of
     axes in `pairs`.
 
-    The function `invariant_terms.blocks` computes these blocks, with unit vectors instead of the gradients of shape
-    functions.
+    `invariant_terms.blocks`, the function for the stiffness between nodes, computes these blocks, with unit vectors
+    instead of the gradients of shape functions.
     """
     scalars = _scalars(model, own.porosity, pressure_coordinates(own, determinant(F)), F)
     return invariant_terms.blocks(invariant_terms.state_of(scalars, F), list(IDENTITY), pairs)

@@ -1,14 +1,14 @@
-"""The error of a porous reduced run: the response of the linearised poroelastic body to the out-of-balance forces.
+"""Error of a reduced run with a porous body: the response of the linearised body to the out-of-balance forces.
 
 To first order, the error e of the motion and the error p of the pressure are the solution of linear equations at the
 reference shape,
 
     (K + K_p) e - B^T p = load,    A p + B (e - e_before) = S p_before,
 
-with the matrix K of stiffness and inertia of the solid, the volumetric stiffness K_p of the drained body, and the
-out-of-balance forces `load` with the forces from earlier steps. B e is the change of volume at the vertices. A and S
-are the matrices of `liverjax.reduced.physics.fluid`, here on the full mesh. The index `before` means the end of the
-previous step. The lagged scheme uses the change of volume of the previous step.
+with the matrix K of stiffness and inertia of the solid, and the volumetric stiffness K_p of the drained body. `load` is
+the sum of the negative out-of-balance forces and the forces from earlier steps. B e is the change of volume at the
+vertices. A and S are the matrices of `liverjax.reduced.physics.fluid`, here on the full mesh. The index `before` means
+the end of the previous step. The lagged scheme uses the change of volume of the previous step.
 """
 
 from collections.abc import Callable
@@ -41,11 +41,11 @@ class LinearFluid(NamedTuple):
 
 
 class ErrorBefore(NamedTuple):
-    """Errors of motion at the ends of the last two steps, and error of pressure at the end of the last step."""
+    """Errors of motion and pressure at the ends of earlier steps (f free degrees of freedom, v unknown pressures)."""
 
-    motion: np.ndarray  # (f,) [m]
-    motion_before: np.ndarray  # motion one step earlier (f,) [m]
-    pressure: np.ndarray  # (v,) [Pa]
+    motion: np.ndarray  # error of motion at the end of the last step (f,) [m]
+    motion_before: np.ndarray  # error of motion one step earlier (f,) [m]
+    pressure: np.ndarray  # error of pressure at the end of the last step (v,) [Pa]
 
 
 def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:

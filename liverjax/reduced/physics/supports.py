@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def refuse_other_physics(scene: Scene) -> None:
-    """Raise InputError if the scene has physics objects other than these supports.
+    """Raise InputError if `scene.physics` contains other objects than these supports.
 
     Raises:
         InputError: the scene has membranes, ligaments, vessels, obstacles, springs with a history, or sliding nodes in
@@ -36,9 +36,11 @@ def refuse_other_physics(scene: Scene) -> None:
                     "plane of [[support]] is normal to an axis, or run the full model"
                 )
         elif not isinstance(own, ElasticSupport):
-            raise InputError(f"a reduced model cannot have [[{own.section}]]: remove it, or run the full model")
+            raise InputError(f"a reduced model cannot have [[{own.section}]]: remove this entry, or run the full model")
         elif own.history is not None:
-            raise InputError("a reduced model cannot have a history of [[support]]: remove it, or run the full model")
+            raise InputError(
+                "a reduced model cannot have a history of [[support]]: remove history, or run the full model"
+            )
 
 
 def identity_of_supports(scene: Scene) -> list[object]:
@@ -54,7 +56,7 @@ def identity_of_supports(scene: Scene) -> list[object]:
 
 
 def _springs(scene: Scene) -> list[NodalForce]:
-    """Return the forces of all elastic supports, one physics object for each support."""
+    """Return one `NodalForce` for each elastic support."""
     points = scene.mesh.points
     step = Step(scene.mesh, points, 1, 1, None, False, None, Free(jnp.ones_like(points)))
     return [own.freeze(None, step) for own in scene.physics if isinstance(own, ElasticSupport)]
@@ -72,7 +74,10 @@ def forces_of_springs(scene: Scene, u: jax.Array) -> jax.Array:
 
 
 def reduced_springs(modes: jax.Array, scene: Scene) -> jax.Array | None:
-    """Return the reduced stiffness (n, n) [N/m] of all springs for the modes (n, V, 3). Return None without springs."""
+    """Return the reduced stiffness (n, n) [N/m] of all springs for the modes (n, V, 3).
+
+    Return None if the scene has no springs.
+    """
     if not has_springs(scene):
         return None
     return jnp.tensordot(jax.lax.map(lambda mode: forces_of_springs(scene, mode), modes), modes, axes=((1, 2), (1, 2)))

@@ -1,1 +1,1 @@
-"""Checks of a scene. Each file answers one question, and `liverjax.scenes.scene_checks` calls all of them."""
+"""Checks of a scene. Each file contains the checks of one kind. `liverjax.scenes.scene_checks` calls all of them."""

@@ -1,4 +1,4 @@
-"""Are the choices of the scene known and compatible? Numbers are not checked, and may be unknown inside jit."""
+"""Check that the choices (words) of a scene are known and compatible. Its numbers are not checked here."""
 
 import numpy as np
 
@@ -27,8 +27,8 @@ def check_choices(scene: Scene) -> None:
     """Check that the choices are known and compatible. Numbers are not checked, and may be unknown inside jit.
 
     Raises:
-        InputError: a choice is unknown or incompatible; a load or a motion is given twice, not at all or in a wrong
-            shape.
+        InputError: a choice is unknown, or cannot be combined with another one; a load or a motion is given twice, not
+            at all or in a wrong shape.
     """
     check_kinds(scene)
     for key, allowed in CHOICES.items():
@@ -63,13 +63,13 @@ def check_choices(scene: Scene) -> None:
 
 
 def _refuse_what_moves_in_time(scene: Scene) -> None:
-    """Raise InputError, for harmonic motion, if an entry of the scene has a history or if an obstacle moves."""
+    """Raise InputError if, for harmonic motion, an entry of the scene has a history or an obstacle moves."""
     for name in histories(scene):
         raise InputError(f"{name}.history cannot be used with kind = 'harmonic': give only the amplitudes")
     for name, part in named_physics(scene):
         if getattr(part, "by", None) is not None:
             raise InputError(
-                f"{name}.by cannot be used with kind = 'harmonic': write the place of the obstacle in position"
+                f"{name}.by cannot be used with kind = 'harmonic': remove by, and give the displaced position"
             )
 
 
@@ -100,4 +100,6 @@ def _own_volumes(scene: Scene) -> None:
                 "another law, or volumetric = 'element'"
             )
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":
-        raise InputError(f"{name} has no relaxation of volumes: use part = 'isochoric' in [viscosity] or [springpots]")
+        raise InputError(
+            f"{name} allows no relaxation of volumes: use part = 'isochoric' in [viscosity] or [springpots]"
+        )

@@ -1,4 +1,4 @@
-"""Do two entries of the scene prescribe the motion of one node?"""
+"""Check that different entries of a scene do not prescribe the motion of the same node along the same direction."""
 
 import jax
 import numpy as np
@@ -9,18 +9,22 @@ from liverjax.physics.prescribed import free_places
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.scene import Scene, named_physics
 
-#: A motion smaller than this fraction of the largest one counts as zero: it is roundoff, for example of a rotation.
+#: A displacement component smaller than this fraction of the largest one counts as 0: it is roundoff, e.g. of a
+#: rotation.
 _NO_MOTION = 1e-12
 
 
 def check_moved_where_fixed(scene: Scene) -> None:
-    """Raise InputError if a node is moved (not by 0) and fixed along one axis. Arrays inside jit are not checked."""
+    """Raise InputError if a node is fixed and moved (not by 0) along the same axis.
+
+    Arrays inside jit are not checked.
+    """
     for k, motion in enumerate(scene.displaced):
         by = motion.history if motion.by is None else motion.by
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((by, motion.nodes))):
             continue
         numbers, vectors = np.asarray(motion.nodes).ravel(), np.asarray(by, float)
-        if motion.by is None or vectors.ndim == 1:  # one motion of all its nodes
+        if motion.by is None or vectors.ndim == 1:  # all nodes of `motion` have the same displacement
             vectors = np.broadcast_to(np.abs(vectors.reshape(-1, 3)).max(axis=0), (len(numbers), 3))
         nothing = _NO_MOTION * float(np.abs(vectors).max(initial=0.0))
         for n, hold in enumerate(scene.fixed):
@@ -37,7 +41,7 @@ def check_moved_where_fixed(scene: Scene) -> None:
 
 
 def check_plates_alone(scene: Scene) -> None:
-    """Raise InputError if nodes of a rigid plate have other supports or motions. Arrays inside jit are not checked."""
+    """Raise InputError if nodes of a rigid plate have another support or motion. Arrays inside jit are not checked."""
     named = [(f"{kind}.{k}", part) for kind in ("fixed", "displaced") for k, part in enumerate(getattr(scene, kind))]
     every = named_physics(scene)
     plates = [(name, physics) for name, physics in every if physics.ties]
@@ -56,9 +60,10 @@ def check_plates_alone(scene: Scene) -> None:
 
 
 def check_normals(scene: Scene) -> None:
-    """Raise InputError if a node slides in two oblique planes, or is fixed along only some axes of its normal.
+    """Raise InputError if a node slides in two planes that are not normal to x, y or z (oblique planes).
 
-    Arrays inside jit, grad or vmap are not checked.
+    An error is also raised if a node is fixed along only some of the axes in which the normal of its oblique plane has
+    a component. Arrays inside jit, grad or vmap are not checked.
     """
     slides = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, SlidingSupport)]
     nodes = [*(f.nodes for f in scene.fixed), *(d.nodes for d in scene.displaced), *(s.nodes for _, s in slides)]
@@ -91,7 +96,10 @@ def check_normals(scene: Scene) -> None:
 
 
 def check_prescribed_once(scene: Scene) -> None:
-    """Raise InputError if a node is moved along an axis along which it is fixed or moved already. Not for jit."""
+    """Raise InputError if a node is moved along an axis along which it is already fixed or moved.
+
+    Not for use inside jit.
+    """
     taken: dict[tuple[int, str], str] = {}
     for kind in ("fixed", "displaced"):
         for k, condition in enumerate(getattr(scene, kind)):
@@ -108,7 +116,7 @@ def check_motion_in_planes(scene: Scene) -> None:
     """Check that prescribed motions do not move nodes out of their sliding planes. Not for use inside jit.
 
     Raises:
-        InputError: the message begins with the name of the motion.
+        InputError: a motion moves a node out of its plane. The message begins with the name of the motion.
     """
     for name, physics in named_physics(scene):
         if not isinstance(physics, SlidingSupport):

@@ -1,4 +1,4 @@
-"""Does every entry of the scene have the right type?"""
+"""Check that every entry of a scene has the right type."""
 
 from liverjax import laws
 from liverjax.core.errors import InputError
@@ -12,7 +12,8 @@ from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.springpots import SpringpotSeries
 
-#: Types of the entries of a scene: of each type in PARTS at most one entry, of each type in SEVERAL any number.
+#: Types of the entries of a scene. A scene has at most one entry of each type in PARTS, and any number of those in
+#: SEVERAL.
 PARTS = {
     "mesh": TetMesh,
     "law": laws.Law,
@@ -41,6 +42,6 @@ def check_kinds(scene: Scene) -> None:
 
 
 def _remedy(kind: type) -> str:
-    """Return words for a message that show how a user writes a value of this type."""
+    """Return words that tell a user what to give for an entry of this type, for example "an lj.Body"."""
     families: dict[object, str] = {laws.Law: "a law of lj.laws", Physics: "a physics object, such as lj.Obstacle"}
     return families.get(kind, f"an lj.{kind.__name__}")

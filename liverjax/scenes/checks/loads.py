@@ -1,4 +1,4 @@
-"""Are all loads, weight, motions and supports given once and in the right shape? Values are not checked here."""
+"""Check that all loads, weight, motions and supports are given once and in the right shape. Values are not checked."""
 
 from typing import Any
 
@@ -15,10 +15,10 @@ MASSES = ("lumped", "consistent")
 
 
 def check_loads(scene: Scene) -> None:
-    """Check that loads and motions are given once and in the right shape, and that axes are known.
+    """Check that loads and motions are given once and in the right shape, and that the names of axes are known.
 
     Raises:
-        InputError: the message begins with the name of the load, motion or support.
+        InputError: an entry is wrong. The message begins with the name of the load, motion or support.
     """
     for k, load in enumerate(scene.traction):
         _check_traction(load, f"traction.{k}")

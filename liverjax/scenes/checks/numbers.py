@@ -1,4 +1,7 @@
-"""Is every number of the scene within its bounds, and are the numbers compatible? The mesh is checked elsewhere."""
+"""Check that every number of a scene is within its bounds, and that the numbers are compatible.
+
+The mesh is not checked.
+"""
 
 from liverjax.core import bounds
 from liverjax.physics import porosity, viscosity
@@ -9,12 +12,13 @@ from liverjax.scenes.springpots import check_springpots
 
 
 def check_bounds(scene: Scene) -> None:
-    """Check that numbers are within their bounds, and that directions do not have length 0. Nothing is compiled.
+    """Check that numbers are within their bounds, and that directions do not have length 0. The check compiles nothing.
 
-    Numbers inside jit, grad or vmap are not checked. `check_mesh` checks the mesh.
+    Numbers inside jit, grad or vmap are not checked. The mesh is not checked here, but by `check_mesh`.
 
     Raises:
-        InputError: the message contains the dotted name of the number, its value, its bound and a remedy.
+        InputError: a number is outside its bounds, or a direction has length 0. For a number outside its bounds, the
+            message contains its name (for example law.mu), its value, its bound and a remedy.
     """
     bounds.check_fields(scene, leave=("mesh", "physics"))
     for name, physics in named_physics(scene):
@@ -30,10 +34,10 @@ def check_bounds(scene: Scene) -> None:
 
 
 def check_numbers(scene: Scene) -> None:
-    """Check that the numbers, each and in combination, can be used. The mesh is not checked. Not for use inside jit.
+    """Check that all numbers can be used, also in combination. The mesh is not checked. Not for use inside jit.
 
     Raises:
-        InputError: numbers are out of bounds, or contradict each other in law, viscosity or porosity.
+        InputError: a number is out of bounds, or numbers of law, viscosity or porosity contradict each other.
     """
     check_bounds(scene)
     for law in laws_of(scene.law, scene.region):

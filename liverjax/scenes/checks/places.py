@@ -1,4 +1,4 @@
-"""Are the nodes and triangles of every entry of the scene in the mesh, and does every inlet have an effect?"""
+"""Check that the nodes and triangles of every entry of a scene are in the mesh, and that every inlet has an effect."""
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from liverjax.scenes.scene import Scene
 
 
 def check_known_nodes(scene: Scene) -> None:
-    """Raise InputError if nodes are not in the mesh, or if elements are inverted. Arrays inside jit are not checked."""
+    """Raise InputError if nodes are not in the mesh, or elements are inverted. Arrays inside jit are not checked."""
     mesh = scene.mesh
     named: dict[str, object] = {f"fixed.{k}.nodes": hold.nodes for k, hold in enumerate(scene.fixed)}
     named |= {f"displaced.{k}.nodes": motion.nodes for k, motion in enumerate(scene.displaced)}
@@ -26,7 +26,7 @@ def check_known_nodes(scene: Scene) -> None:
     if not isinstance(mesh.volumes, jax.core.Tracer):
         wrong = int(np.sum(~(np.asarray(mesh.volumes) > 0)))
         if wrong:
-            raise InputError(f"mesh has {wrong} elements that are inverted or without volume: correct their vertices")
+            raise InputError(f"mesh has {wrong} elements that are inverted or have no volume: correct their vertices")
 
 
 def check_places(scene: Scene) -> None:
@@ -52,20 +52,26 @@ def check_places(scene: Scene) -> None:
 
 
 def _has_vertices(mesh: TetMesh, nodes: object, name: str) -> None:
-    """Raise InputError if `nodes` of a drained surface or an inlet has no vertex: only vertices have pressures."""
+    """Raise InputError if `nodes` of a drained region or an inlet contain no vertex.
+
+    Only vertices have pressures.
+    """
     if not np.any(np.asarray(nodes, int) < mesh.number_of_vertices):
         raise InputError(f"{name} contains only midside nodes, which have no pressure: select a region with vertices")
 
 
 def _inlets_that_act(sponge: Porosity) -> None:
-    """Raise InputError if the pressure is already given at all nodes of an inlet. Inlets may share some nodes."""
+    """Raise InputError if an inlet has no effect, because the pressure is already given at all of its nodes.
+
+    Inlets may have some nodes in common.
+    """
     given = [] if sponge.drained is None else [set(np.asarray(sponge.drained).tolist())]
     pressures = [(k, inlet) for k, inlet in enumerate(sponge.inlet) if inlet.nodes is not None]
     for k, inlet in pressures:
         own = set(np.asarray(inlet.nodes).tolist())
         if any(own <= place for place in given):
             raise InputError(
-                f"porosity.inlet.{k} gives a pressure where nodes are drained or have a given pressure: select "
+                f"porosity.inlet.{k} gives a pressure where all nodes are drained or have a given pressure: select "
                 "different nodes"
             )
         given.append(own)

@@ -1,4 +1,4 @@
-"""Checks of the regions of a scene: one function checks the parameters, another one the elements."""
+"""Checks of the regions of a scene. One function checks their parameters, another one checks their elements."""
 
 import jax
 import numpy as np
@@ -19,8 +19,8 @@ def check_region_numbers(scene: Scene) -> None:
     """Check the parameters of all regions. Parameters inside jit, grad or vmap are not checked.
 
     Raises:
-        InputError: the scene has no [viscosity] or [porosity]; an unknown name; values out of bounds; a wrong number
-            of modes.
+        InputError: a region changes [viscosity] or [porosity], but the scene has none; a name is unknown; a value is
+            out of bounds; or the number of modes is wrong.
     """
     for k, region in enumerate(scene.region):
         _check_law(scene.law, region, f"region.{k}")
@@ -38,7 +38,7 @@ def check_region_elements(scene: Scene) -> None:
     for k, region in enumerate(scene.region):
         elements = np.asarray(region.elements)
         if elements.size == 0 or elements.min() < 0 or elements.max() > last:
-            raise InputError(f"region.{k} has element numbers outside 0 to {last}: correct the numbers")
+            raise InputError(f"region.{k} has no elements, or element numbers outside 0 to {last}: correct the numbers")
         if not region.law and not region.viscosity and not region.porosity:
             raise InputError(f"region.{k} changes nothing: give e.g. law = {{mu = 2000.0}}")
     _check_own_laws(scene.region)
@@ -56,14 +56,14 @@ def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> No
     """Check the viscous parameters of a region. Parameters inside jit, grad or vmap are not checked.
 
     Raises:
-        InputError: the scene has no [viscosity]; a wrong number of modes; values out of bounds.
+        InputError: the scene has no [viscosity], the number of modes is wrong, or a value is out of bounds.
     """
     own = region.viscosity
     if not own:
         return
     if prony is None:
         raise InputError(
-            f"{name}: viscosity needs [viscosity] in the scene; add it, with ratios = [0.0] if the rest is elastic"
+            f"{name}: viscosity needs [viscosity] in the scene. Add it, with ratios = [0.0] if the rest is elastic"
         )
     unknown = sorted(set(own) - set(VISCOUS))
     if unknown:
@@ -86,18 +86,18 @@ def check_region_porosity(porosity: Porosity | None, region: Region, name: str) 
     """Check the porous parameters of a region. Parameters inside jit, grad or vmap are not checked.
 
     Raises:
-        InputError: the scene has no [porosity]; an unknown name; values out of bounds.
+        InputError: the scene has no [porosity], a name is unknown, or a value is out of bounds.
     """
     own: Content = dict(region.porosity or {})
     if not own:
         return
     if porosity is None:
-        raise InputError(f"{name}: porosity needs [porosity] in the scene; add it")
+        raise InputError(f"{name}: porosity needs [porosity] in the scene. Add [porosity]")
     for key, value in own.items():
         if key not in POROUS:
             raise InputError(f"{name}: porosity has {key}, which cannot differ in a region: {hint(key, POROUS)}")
         if np.ndim(value):
-            raise InputError(f"{name}: porosity.{key} has {np.size(value)} numbers: give one")
+            raise InputError(f"{name}: porosity.{key} has {np.size(value)} numbers: give one number")
     numbers = (*own.values(), *(getattr(porosity, key) for key in POROUS))
     if any(isinstance(value, jax.core.Tracer) for value in numbers):
         return
@@ -108,16 +108,16 @@ def check_region_porosity(porosity: Porosity | None, region: Region, name: str) 
 
 
 def _check_hidden(regions: tuple[Region, ...], elements: int) -> None:
-    """Raise InputError if a region has no effect: later regions replace its parameters in all of its elements."""
+    """Raise InputError if a region has no effect, because later regions replace its parameters in all its elements."""
     taken: dict[str, np.ndarray] = {}
     nothing = np.zeros(elements, bool)
     for k, region in reversed(list(enumerate(regions))):
         own, names = np.asarray(region.elements), _names_of(region)
-        law = taken.get("law", nothing)[own]  # a complete law replaces all parameters
+        law = taken.get("law", nothing)[own]  # a complete law of a later region replaces all parameters
         if all(np.all(taken.get(n, nothing)[own] | (law if n.startswith("law.") else False)) for n in names):
             raise InputError(
                 f"region.{k} changes nothing, because later regions set the same parameters in all of its elements: "
-                "remove it, or select other elements"
+                "remove this region, or select other elements"
             )
         for name in names:
             taken.setdefault(name, nothing.copy())[own] = True
@@ -131,7 +131,7 @@ def _names_of(region: Region) -> set[str]:
 
 
 def _check_own_laws(regions: tuple[Region, ...]) -> None:
-    """Raise InputError if the regions do not clearly determine the law of an element."""
+    """Raise InputError if the regions give contradictory laws for an element, or contain an element twice."""
     for k, region in enumerate(regions):
         if not isinstance(region.law, Law):
             continue

@@ -1,4 +1,4 @@
-"""Is every connected piece of the body supported against rigid motions?"""
+"""Check that every connected piece of the body is supported against rigid motions."""
 
 from collections.abc import Callable, Container
 
@@ -12,13 +12,18 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
-    """Return {name of a further physics: number of nodal directions that it fixes at the beginning of the run}."""
+    """Return the number of nodal directions that each object in `scene.physics` fixes at the beginning of the run.
+
+    The keys are the names of the objects, for example support.0. If `only` is given, only these names are included.
+    """
     named = [(name, physics) for name, physics in named_physics(scene) if only is None or name in only]
     return {name: len(physics.holds(scene.mesh)[0]) for name, physics in named}
 
 
 def check_hold(scene: Scene, before: dict[str, int]) -> None:
-    """Check that a static body is still supported if, with changed numbers, a physics fixes fewer nodal directions.
+    """Check that a static body with changed numbers is still supported against rigid motions.
+
+    The check is needed only if an object in `scene.physics` now fixes fewer nodal directions than `before`.
 
     Args:
         scene: `Scene` with the changed numbers.
@@ -33,7 +38,7 @@ def check_hold(scene: Scene, before: dict[str, int]) -> None:
 
 
 def check_held(scene: Scene) -> None:
-    """Raise InputError if a connected piece is not supported, because then no static solution exists."""
+    """Raise InputError if a connected piece of the body has no sufficient support. Then no static solution exists."""
     loose = loose_piece(scene, lambda physics: physics.holds(scene.mesh))
     if loose:
         doubled = doubled_vertices(scene.mesh)
@@ -43,11 +48,12 @@ def check_held(scene: Scene) -> None:
 
 
 def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.ndarray]]) -> str:
-    """Describe the first connected piece with a free rigid motion. Return "" if there is none.
+    """Describe the first connected piece of the body that has a free rigid motion. Return "" if there is no such piece.
 
     Args:
         scene: `Scene`.
-        holds: function that returns the node numbers (n,) and the directions (n, 3) that a further physics fixes.
+        holds: function of an object in `scene.physics`. It returns n node numbers (n,) and the directions (n, 3) in
+            which the object fixes these nodes.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -69,9 +75,13 @@ def loose_piece(scene: Scene, holds: Callable[[Physics], tuple[np.ndarray, np.nd
 
 
 def _rigid_rank(points: np.ndarray, directions: np.ndarray, size: float) -> int:
-    """Return the rank of the six rigid motions, projected on fixed directions (n, 3) at points (n, 3) of a body."""
+    """Return the rank of the six rigid motions of a body, projected on n fixed directions (n, 3) at points (n, 3).
+
+    The rank is 6 if the fixed directions prevent all rigid motions. `size` is the length of the body.
+    """
     if not len(points):
         return 0
-    # A rotation about e moves x by cross(e, x). The component of this motion along d is cross(x, d) . e.
+    # A rotation about an axis e moves a point x by cross(e, x). The component of this motion along a direction d is
+    # cross(x, d) . e.
     motions = np.concatenate([directions, np.cross(points / max(size, 1e-300), directions)], axis=1)
     return int(np.linalg.matrix_rank(motions, tol=1e-6))

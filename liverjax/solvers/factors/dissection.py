@@ -3,8 +3,8 @@
 The elements are divided into two parts repeatedly. The nodes that both parts share are eliminated after the others. The
 work grows with the cube of the number of shared nodes. Planes normal to nine directions are tried, and the plane with
 the least estimated work is used. In a mesh without layers, the elements on the two sides of a plane share many nodes.
-There the smallest set of nodes that separates both sides is better. This set is the minimum cut of a graph (Ford and
-Fulkerson 1956, Can. J. Math. 8, 399).
+In such a mesh it is better to use the smallest set of nodes that separates both sides. This set is the minimum cut of a
+graph (Ford and Fulkerson 1956, Can. J. Math. 8, 399).
 """
 
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ DIRECTIONS = np.array(
 
 
 class _Part(NamedTuple):
-    """A part of the elements, the nodes that are eliminated inside it, and its nodes that are eliminated later."""
+    """A part with n elements, the k nodes that are eliminated inside it, and its m nodes that are eliminated later."""
 
     elements: np.ndarray  # (n,)
     nodes: np.ndarray  # (k,), in ascending order
@@ -35,7 +35,7 @@ class _Part(NamedTuple):
 
 
 class _Cut(NamedTuple):
-    """A division of elements into two sides: in `order`, the first `first` elements are on one side."""
+    """A division of n elements into two sides: in `order`, the first `first` elements are on one side."""
 
     work: float
     order: np.ndarray  # (n,)
@@ -47,16 +47,16 @@ class _Cut(NamedTuple):
 
 def work(own: Any, border: Any) -> Any:
     """Number of multiplications to eliminate `own` unknowns that are coupled with `border` other unknowns."""
-    return own * (own * own / 3 + own * border + border * border)  # `**` would take most of the dissection's time
+    return own * (own * own / 3 + own * border + border * border)  # `**` would be slow
 
 
 def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, list[int]]]:
     """Return groups of nodes in the order of elimination, each with the indices of its child groups.
 
-    A group comes after its children.
+    The child groups of a group are eliminated first, so they come before it in the list.
 
     Args:
-        elements: nodes (n, E) of every element; an element with fewer nodes repeats one of them.
+        elements: node numbers (n, E), n for each element; an element with fewer nodes repeats one of its nodes.
         points: positions (V, 3).
     """
     centres, taken = points[elements].mean(axis=0), np.zeros(len(points), bool)
@@ -111,7 +111,7 @@ def _best_cut(elements: np.ndarray, centres: np.ndarray, part: _Part, V: int) ->
 
 
 def _first_and_last(nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray]) -> None:
-    """Write the first and the last element of each node into `span`. `nodes` (n, E) belong to elements in an order."""
+    """Write the first and last element of each node into `span`. `nodes` (n, E): nodes of E ordered elements."""
     number = np.repeat(np.arange(nodes.shape[1]), len(nodes))
     every = nodes.T.ravel()
     span[0][every[::-1]] = number[::-1]
@@ -119,10 +119,11 @@ def _first_and_last(nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray]) -> N
 
 
 def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.ndarray], at: slice) -> np.ndarray:
-    """Estimate the work of cuts. A cut divides elements in an order, with nodes (n, E), after one of the elements `at`.
+    """Estimate the work of cuts. A cut divides E ordered elements after one of the elements `at`.
 
-    The estimate is the work for the nodes that both sides share, plus twice the work of the next cut on each side. The
-    next cut of a side with n nodes is assumed to contain n^(2/3) nodes, as in a cube.
+    `nodes` (n, E) are the n nodes of each element. The estimate is the work for the nodes that both sides share, plus
+    twice the work of the next cut on each side. The next cut of a side with n nodes is assumed to contain n^(2/3)
+    nodes, as in a cube.
     """
     n, m = nodes.shape[1], len(part.border)
     _first_and_last(nodes, span)
@@ -140,7 +141,7 @@ def _smallest_cuts(
     """Return, for the first and the last of all minimum cuts, which elements (h,) are on the first side.
 
     Args:
-        near: nodes (n, h) of the h elements from low to high - 1 of an order.
+        near: nodes (n, h) of the h elements from low to high - 1, in the order of the elements; n nodes each.
         nodes: (k,) nodes, in ascending order, through which a cut may pass. Other nodes do not connect the parts.
         span: first and last element of each node in this order.
         ends: low and high. Elements before low are on the first side. Elements from high on are on the second.
@@ -158,7 +159,8 @@ def _smallest_cuts(
     into, element = at[known], 2 * k + np.broadcast_to(np.arange(h), near.shape)[known]
     first, last = np.flatnonzero(span[0][own] < low), np.flatnonzero(span[1][own] >= high)
     source, sink, inside = 2 * k + h, 2 * k + h + 1, np.arange(k)
-    # Paths enter mesh node i at vertex i of the graph and leave it at i + k. Only the edge between both has capacity 1.
+    # In the graph, a path enters mesh node i at vertex i and leaves it at vertex i + k. Only the edge between both
+    # vertices has the capacity 1.
     lines = np.concatenate([inside, k + into, element, np.full(len(first), source), k + last])
     columns = np.concatenate([k + inside, element, into, first, np.full(len(last), sink)])
     wide = np.where(np.arange(len(lines)) < k, 1, k + 1).astype(np.int32)
@@ -171,7 +173,7 @@ def _smallest_cuts(
 
 
 def _neighbours_together(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the nodes in an order in which nodes that are near in space follow each other."""
+    """Sort the nodes so that nodes which are near in space follow each other."""
     if len(nodes) <= 8:
         return nodes
     side = points[nodes, np.argmax(np.ptp(points[nodes], axis=0))]

@@ -3,9 +3,9 @@
 `liverjax.solvers.factors.dissection` gives the order of elimination. Each group of nodes is eliminated in a dense
 matrix of the group and its border: the later unknowns that are coupled with the group (Duff and Reid 1983, ACM TOMS 9,
 302). `PIVOTS` unknowns are eliminated at a time, so that nearly all work is in matrix products. By symmetry the lower
-triangles are enough. Groups are eliminated in parallel, one per core, as soon as their children are done. If only one
-piece can run, the parts of its matrix products (tiles) run in parallel instead. Pivots are chosen only among unknowns
-that are eliminated together.
+triangles are enough. Groups are eliminated in parallel, one per core, as soon as their children are done. While cores
+are idle, the matrix products of a group are divided into parts (tiles) that run in parallel on these cores. Pivots are
+chosen only among unknowns that are eliminated together.
 
 Large matrices are factorised in single precision, and solutions are refined iteratively. This needs half the time and
 memory, and the solution has the same number of digits. If the refinement does not converge, double precision is used.
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 SINGLE_FROM = 20_000
 #: PIVOTS: number of unknowns of a group that are eliminated together. TILE: number of columns of a tile.
 PIVOTS, TILE = 128, 192
-#: A group and its descendants are eliminated in one piece if their work is less than this fraction of all work.
+#: A group and its descendants are eliminated one after the other, as one piece, if their work is less than this
+#: fraction of all work.
 PIECE = 1 / 32
 #: STEPS: maximum number of refinement steps. ENOUGH: backward error at which they end. WRONG: a solution with a larger
 #: backward error is wrong.
@@ -39,7 +40,7 @@ STEPS, ENOUGH, WRONG = 12, 4e-16, 1e-11
 
 
 class Front(NamedTuple):
-    """A group of unknowns, and the later unknowns that are coupled with it."""
+    """A group of n unknowns, and the m later unknowns that are coupled with it."""
 
     own: np.ndarray  # (n,)
     border: np.ndarray  # (m,)
@@ -47,7 +48,7 @@ class Front(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """Result for unknowns that were eliminated together: their matrix is A, and B couples them with later unknowns."""
+    """Result for n unknowns that were eliminated together: A is their matrix, B couples them with m later unknowns."""
 
     own: np.ndarray  # (n,)
     after: np.ndarray  # (m,)
@@ -69,7 +70,7 @@ class Eliminated(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """Result of a factorisation."""
+    """Result of the factorisation of a matrix with N unknowns."""
 
     matrix: "scipy.sparse.csr_array"  # with scaled rows and columns
     scale: np.ndarray  # (N,) factors that multiply rows and columns
@@ -183,7 +184,7 @@ class _Elimination(NamedTuple):
             rest = np.zeros((m, m), self.kind, order="F")  # much of its upper triangle is never written
             for c in front.children:
                 left = self.rests[c]
-                if left is not None:  # None: a part of the body that is not coupled with the others
+                if left is not None:  # None: the child is not coupled with later unknowns
                     _add(own, rest, place[self.plan[c].border], left)
                     self.rests[c] = None
             place[front.own] = place[front.border] = -1
@@ -247,7 +248,7 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
 
     A = A.tocsr()
     size, scale, in_row = abs(A.data), np.ones(A.shape[0]), np.diff(A.indptr)
-    known, other = np.flatnonzero(in_row), np.empty(A.nnz)  # new memory would take longer than the arithmetic
+    known, other = np.flatnonzero(in_row), np.empty(A.nnz)  # new arrays would take longer than the arithmetic
     for _ in range(3):
         largest = np.zeros(len(scale))
         if len(known):
@@ -261,7 +262,7 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
 
 
 def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
-    """Columns (n + m, n) of A for the unknowns of the group, with 0 above the diagonal.
+    """Columns (n + m, n) of A for the n unknowns of the group, with 0 above the diagonal. The border has m unknowns.
 
     The row of each unknown of the group and its border is written into `place`.
     """
@@ -279,7 +280,7 @@ def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) ->
 def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) -> None:
     """Add the lower triangle `left` of a child to the group's own columns and to the rest, at ascending indices `at`.
 
-    Consecutive indices are added together.
+    Entries with consecutive indices are added as one block.
     """
     n = own.shape[1]
     ends = np.unique([0, *(np.flatnonzero(np.diff(at) != 1) + 1), np.searchsorted(at, n), len(at)])
@@ -291,10 +292,12 @@ def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) ->
 
 
 def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[[], int]) -> list[Eliminated]:
-    """Eliminate a group with the columns `own` (n + m, n). Subtract its part from the lower triangle of `rest` (m, m).
+    """Eliminate a group with the columns `own` (n + m, n). Subtract its term from the lower triangle of `rest` (m, m).
 
-    The own columns are updated after each `PIVOTS` unknowns. The rest is updated once at the end, since large matrix
-    products are the fastest.
+    The group has n unknowns, and its border has m unknowns.
+
+    `own` is updated after each `PIVOTS` unknowns. `rest` is updated once at the end, since large matrix products are
+    the fastest.
     """
     n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
     X = np.empty((n, len(rest)), own.dtype)
