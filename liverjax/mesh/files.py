@@ -15,6 +15,7 @@ from liverjax.core.did_you_mean import as_word
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.mesh.adjacency import PAIRS, node_numbers
+from liverjax.mesh.formats.abaqus import read_abaqus
 from liverjax.mesh.promotion import quadratic
 from liverjax.mesh.tetrahedra import UNITS, TetMesh, check_mesh, tet_mesh
 
@@ -155,6 +156,8 @@ def _read_quietly(path: Path) -> Any:
     for mark, sentence in _FOREIGN.items():
         if re.search(mark, beginning):
             raise InputError(f"mesh file {path}: {sentence}")
+    if path.suffix.lower() == ".inp":
+        return read_abaqus(path)
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):

@@ -18,7 +18,8 @@ def check_known_nodes(scene: Scene) -> None:
     named |= {f"traction.{k}.triangles": load.triangles for k, load in enumerate(scene.traction)}
     if scene.porosity is not None:
         named["porosity.drained"] = scene.porosity.drained
-        named |= {f"porosity.inlet.{k}.nodes": inlet.nodes for k, inlet in enumerate(scene.porosity.inlet)}
+        for key in ("nodes", "triangles"):
+            named |= {f"porosity.inlet.{k}.{key}": getattr(i, key) for k, i in enumerate(scene.porosity.inlet)}
     for name, nodes in named.items():
         if nodes is not None and not isinstance(nodes, jax.core.Tracer):
             numbers = np.asarray(nodes)

@@ -1,0 +1,1 @@
+"""Readers of mesh formats that meshio does not read correctly."""

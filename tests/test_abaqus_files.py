@@ -1,0 +1,100 @@
+"""Abaqus input files: sets over several cards, names of sets in data lines, blocks, and files that cannot be used.
+
+The expected members are those of the keyword reference of Abaqus (``*NSET``, ``*ELSET``), written down by hand.
+"""
+
+import meshio
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.mesh.files import meshio_cells
+
+HEAD = """*HEADING
+two elements
+** a comment
+*Node, nset=all
+11, 0, 0, 0
+12, 0.1, 0, 0
+13, 0, 0.1, 0
+14, 0, 0, 0.1
+15, 0.1, 0.1, 0.1
+*Element, type=c3d4
+101, 11, 12, 13, 14
+*ELEMENT, TYPE=C3D4H,
+ ELSET=right
+102, 12, 15, 13,
+14
+*ELEMENT, TYPE=S3, ELSET=skin
+1, 11, 12, 13
+"""
+
+
+def sets_of(tmp_path, cards):
+    (tmp_path / "m.inp").write_text(HEAD + cards)
+    mesh = lj.read_mesh(tmp_path / "m.inp")
+    found = {**mesh.node_sets, **mesh.element_sets}
+    return {name: sorted(np.asarray(members).tolist()) for name, members in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("cards", "members"),
+    [
+        ("*ELSET, ELSET=hard\n101,\n*ELSET, ELSET=hard\n102,\n", {"hard": [0, 1]}),
+        ("*NSET, NSET=foot\n11, 12\n*NSET, NSET=FOOT\n13,\n", {"foot": [0, 1, 2]}),
+        ("*NSET, NSET=a\n11, 12\n*NSET, NSET=foot\na, 13\n", {"a": [0, 1], "foot": [0, 1, 2]}),
+        ("*ELSET, ELSET=hard\nright, 101\n", {"hard": [0, 1]}),
+        ("*Nset, nset=odd, generate\n11, 15, 2\n", {"odd": [0, 2, 4]}),
+        ("*NSET, NSET=foot, GENERATE\n11, 13\n*ELSET, ELSET=both, GENERATE\n101, 102\n", {"foot": [0, 1, 2]}),
+        ("*NSET, NSET=foot, INSTANCE=Part-1-1\n11\n*NSET, NSET=tip\nPart-1-1.15\n", {"foot": [0], "tip": [4]}),
+        ("*NODE PRINT, NSET=foot\nU\n*NSET, NSET=foot\n11\n", {"foot": [0]}),
+    ],
+)
+def test_sets_have_the_members_of_all_their_cards(tmp_path, cards, members):
+    found = sets_of(tmp_path, cards)
+    assert members.items() <= found.items()
+    assert found["all"] == [0, 1, 2, 3, 4] and found["right"] == [1] and found["skin"] == [0, 1, 2]
+
+
+def test_several_blocks_of_one_set_give_the_sets_of_one_block(tmp_path):
+    """meshio writes one card of a set for each block of cells. Read by meshio, the sets lost members."""
+    mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
+    sole = lj.boundary.boundary_triangles(mesh, np.asarray(mesh.node_sets["z_min"]))
+    tets = meshio_cells(mesh)[1]
+    blocks = [("triangle", sole[:3]), ("tetra", tets[:20]), ("triangle", sole[3:]), ("tetra", tets[20:])]
+    sets = {"sole": [np.arange(3), [], np.arange(5), []], "hard": [[], np.arange(5, 20), [], np.arange(10)]}
+    meshio.Mesh(np.asarray(mesh.points), blocks, cell_sets=sets).write(tmp_path / "m.inp")
+    read = lj.read_mesh(tmp_path / "m.inp")
+    assert np.array_equal(read.element_sets["hard"], np.arange(5, 30))
+    assert np.array_equal(np.sort(read.node_sets["sole"]), np.sort(np.asarray(mesh.node_sets["z_min"])))
+    assert len(read.triangle_sets["sole"]) == 8
+
+
+def test_quadratic_elements_and_included_files(tmp_path):
+    mesh = lj.quadratic(lj.shapes.box((1, 1, 1), (1, 1, 1)))
+    meshio.Mesh(np.asarray(mesh.points), [meshio_cells(mesh)]).write(tmp_path / "inner.inp")
+    (tmp_path / "m.inp").write_text("*INCLUDE, INPUT=inner.inp\n*NSET, NSET=one\n1\n")
+    read = lj.read_mesh(tmp_path / "m.inp")
+    assert read.order == 2 and np.allclose(read.points, mesh.points) and read.node_sets["one"].tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("cards", "message"),
+    [
+        ("*NODE\n11, 1, 1, 1\n", "two nodes have the same number, as in a file of several parts"),
+        ("*ELEMENT, TYPE=C3D4\n101, 11, 12, 13, 15\n", "two elements have the same number"),
+        ("*ELEMENT, TYPE=C3D4\n103, 11, 12, 13\n", r"lines of \*ELEMENT, TYPE=C3D4 are not complete"),
+        ("*ELEMENT, TYPE=C3D4\n103, 11, 12, 13, 99\n", "contains node 99, but"),
+        ("*ELEMENT, TYPE=C3D8\n103, 11, 12, 13, 14, 11, 12, 13, 14\n", "contains hexahedron in addition"),
+        ("*NODE\n16, 1, one, 1\n", "contains a wrong number"),
+        ("*NSET, NSET=foot\nnobody\n", "contains nobody, which is no earlier set"),
+        ("*NSET, NSET=foot, ELSET=right\n", "selects the nodes of an element set"),
+        ("*NSET, NSET=foot, GENERATE\n1, 2, 0\n", "give first, last, step"),
+        ("*NGEN\n11, 15\n", r"\*NGEN changes or makes the mesh"),
+        ("*INSTANCE, NAME=one, PART=two\n0, 0, 5\n", r"\*INSTANCE changes or makes the mesh"),
+        ("*INCLUDE, INPUT=none.inp\n", "none.inp cannot be read"),
+    ],
+)
+def test_files_that_cannot_be_used_get_one_sentence(tmp_path, cards, message):
+    with pytest.raises(lj.InputError, match=message):
+        sets_of(tmp_path, cards)
