@@ -243,7 +243,7 @@ def test_a_frequency_sweep_and_few_points_are_refused(tmp_path, tanned, capsys):
     (tmp_path / "two.csv").write_text("\n".join(lines))
     with pytest.raises(InputError, match="a strain sweep at one frequency"):
         strain_sweep.read_strain_sweep(tmp_path / "two.csv")
-    with pytest.raises(InputError, match="points of strain are left"):
+    with pytest.raises(InputError, match="different strains are left"):
         strain_sweep.read_strain_sweep(path, max_strain=0.012)
     (tmp_path / "per_cent.csv").write_text(path.read_text().replace("strain_%", "strain_1"))
     with pytest.raises(InputError, match="write it in %"):

@@ -188,7 +188,7 @@ def _spring(**given) -> dict:
             {"fixed": (lj.Fixed(nodes=jnp.array([999])),)},
             "fixed.0.nodes contains node 999, but the mesh has only the nodes 0 to 26: give node numbers in this range",
         ),
-        ({"fixed": (lj.Fixed(nodes=jnp.array([0.0, 1.0])),)}, "fixed.0.nodes has numbers of type float64: give whole"),
+        ({"fixed": (lj.Fixed(nodes=jnp.array([0.0, 1.0])),)}, "fixed.0.nodes has numbers of type float64: give a list"),
         ({"fixed": (lj.Fixed(nodes=TOP),)}, "fixed.0.nodes has shape (2, 3): give a list (n,) of whole node numbers"),
         (
             {"displaced": (lj.Displaced(nodes=jnp.array([27]), by=jnp.zeros(3)),)},

@@ -304,7 +304,7 @@ def test_users_laws_pass_or_are_refused_in_one_sentence(tmp_path, capsys):
     file.write_text(USERS_FILE)
     assert main(["check", f"{file}:Whole", "--out", str(tmp_path)]) == 0
     assert "not stated" in capsys.readouterr().out
-    for name, sentence in (("Forgets", "list every invariant"), ("Shapeless", "has shape")):
+    for name, sentence in (("Forgets", "List all invariants"), ("Shapeless", "has shape")):
         assert main(["check", f"{file}:{name}", "--out", str(tmp_path)]) == 2
         error = capsys.readouterr().err
         assert sentence in error and error.count("\n") == 1

@@ -192,6 +192,16 @@ def test_rows_without_a_stress_are_left_out_and_counted(tmp_path):
     assert notes == ["c.csv: rows without a stress are ignored: 1"]
 
 
+@pytest.mark.parametrize("last", ["uniaxial,1.2,570,Mean", "Mean,1.2,570,", "Mean,,570,"])
+def test_a_summary_below_a_curve_is_no_point(last, tmp_path):
+    """The mean of the stresses was fitted as a point of the curve."""
+    rows = [f"uniaxial,{a:.2f},{1000 * (a - a**-2):.4f}," for a in np.linspace(1.05, 1.4, 8)]
+    (tmp_path / "a.csv").write_text("\n".join(["test,stretch,nominal_stress_Pa,remark", *rows, last]))
+    (curve,), notes = curves.read_curves([tmp_path / "a.csv"])
+    assert len(curve.stress) == 8
+    assert notes == ["a.csv: data row 9 is a summary of other rows (Mean) and is ignored"]
+
+
 def test_headings_with_capitals_and_without_a_unit_are_read(tmp_path):
     rows = "".join(f"uniaxial,{1 + 0.1 * k},{k}\n" for k in range(6))
     (tmp_path / "c.csv").write_text(f"Test,Stretch [-],Nominal stress [kPa]\n{rows}")

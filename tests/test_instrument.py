@@ -181,7 +181,7 @@ def test_the_command_fits_friction_and_refuses_it_without_a_size(tmp_path, capsy
     assert abs(found["friction_off_by_N_m_s"]) < 4 * found["friction_standard_error"]
     assert main(words) == 2 and "give a positive number, e.g. 1e-7, and --radius" in capsys.readouterr().err
     sized = [*words, "--radius", "0.01", "--height", "0.004"]
-    assert main([*sized, "--model", "auto"]) == 2 and "remove --model auto" in capsys.readouterr().err
+    assert main([*sized, "--model", "auto"]) == 2 and "or --model auto" in capsys.readouterr().err
 
 
 def test_without_raw_columns_nothing_happens():

@@ -429,7 +429,7 @@ def test_foreign_and_damaged_files_are_one_sentence(trained, tmp_path):
     damaged = {
         "slopes has shape": replace(whole, weights=whole.weights[:-1]),
         "points has shape": replace(whole, points=whole.points[1:]),
-        "modes has values that are not numbers": replace(whole, modes=whole.modes.at[0, 0, 0].set(jnp.nan)),
+        "modes has values that are not finite": replace(whole, modes=whole.modes.at[0, 0, 0].set(jnp.nan)),
         "inverse has shape": replace(whole, correction=replace(learnt, inverse=learnt.inverse[1:])),
     }
     for sentence, spoiled in damaged.items():

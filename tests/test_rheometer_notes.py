@@ -129,9 +129,8 @@ def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):
     notes("temperature_C", (20, 37))  # users who shift sweeps by temperature read them separately, without this advice
     ((_, apart),) = read_all_sweeps(tmp_path / "s.csv")
     assert not any("--master" in note for note in apart.notes)
-    assert notes("temperature_C", (20, 21)).endswith("counts as a separate measurement") == notes(
-        "strain_%", (1, 1.2)
-    ).endswith("own")
+    for column, values in (("temperature_C", (20, 21)), ("strain_%", (1, 1.2))):  # nearly the same conditions
+        assert "each line counts as a separate measurement" in notes(column, values)
 
 
 @pytest.mark.parametrize("wrong", [1.0, 1.1])

@@ -147,7 +147,10 @@ def test_workbooks_that_cannot_be_read_are_one_sentence(tmp_path, monkeypatch):
 BELOW = "Point,Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)\n1,0.1,1000,100\n2,0.5,1100,120\n3,1,1200,150\n"
 
 
-@pytest.mark.parametrize("word", ["Mean", "±SD", "Average:", "Std. Dev.", "Mean (n=3)", "CV [%]", "n"])
+@pytest.mark.parametrize(
+    "word",
+    ["Mean", "±SD", "Average:", "Std. Dev.", "Mean (n=3)", "CV [%]", "n", "Stdabw.", "CI95", "95% CI", "STDEV.S"],
+)
 def test_a_summary_below_a_table_is_no_point(tmp_path, word):
     """A row "Mean" was fitted as a sixth point, at the mean of the frequencies."""
     s = read_sweep(_write(tmp_path, f"{BELOW}4,5,1400,200\n{word},1.65,1175,142\n"))
@@ -157,6 +160,18 @@ def test_a_summary_below_a_table_is_no_point(tmp_path, word):
 def test_a_summary_may_stand_in_the_column_of_the_frequency(tmp_path):
     text = "Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)\n0.1,1000,100\n1,1200,150\n10,1500,260\n"
     s = read_sweep(_write(tmp_path, text + "Mean,1233,170\nSD,200,60\n"))
+    assert list(s.storage) == [1000, 1200, 1500] and len(s.notes) == 2
+
+
+def test_all_labelled_rows_below_a_mean_are_summaries(tmp_path):
+    """Below "Mean", a label that is not known made both rows points of the sweep."""
+    s = read_sweep(_write(tmp_path, f"{BELOW}4,5,1400,200\nMean,1.65,1175,142\nHalf width,1,100,20\n"))
+    assert list(s.storage) == [1000, 1100, 1200, 1400] and len(s.notes) == 2
+
+
+def test_the_label_of_a_summary_may_be_in_the_last_column(tmp_path):
+    text = "Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa),remark\n0.1,1000,100,\n1,1200,150,\n10,1500,260,\n"
+    s = read_sweep(_write(tmp_path, text + "5,1233,170,Mean\n4,200,60,SD\n"))
     assert list(s.storage) == [1000, 1200, 1500] and len(s.notes) == 2
 
 

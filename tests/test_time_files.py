@@ -96,15 +96,15 @@ BAD = {
     "ramp in rows": (
         "time_s,strain,stress_Pa\n0,0,0\n1,0.5,7\n2,1,6\n3,1,5\n",
         ["--ramp", "1"],
-        "since the rows show how the load rose: remove it",
+        "since the rows show how the load rose: remove this setting",
     ),
     "ramp too long": (
         "time_s,strain,stress_Pa\n0,0,0\n1,1,7\n2,1,6\n3,1,5\n",
         ["--ramp", "2"],
-        "since the load rose between 0 and 1 s: remove it",
+        "since the load rose between 0 and 1 s: remove this setting",
     ),
     "late": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "5"], "2 usable responses remain"),
-    "early": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "-1"], "--min-time -1 must be 0 or more"),
+    "early": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "-1"], "--min-time -1 must be a finite number"),
     "modes": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--modes", "9"], "--modes 9 is out of range"),
     "radius": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--radius", "4"], "--radius 4 cannot be"),
 }

@@ -175,6 +175,7 @@ def test_wrapped_phases_that_are_no_radians_get_a_sentence(tmp_path, monkeypatch
         ({"displacement": np.ones((2, 5, 5, 5, 3))}, "no imaginary part"),
         ({"displacement": np.ones((5, 5)) + 1j}, "frequencies first, components last"),
         ({"displacement": np.full((2, 5, 5, 5, 3), 0j)}, "zero or not a number everywhere"),
+        ({"displacement": np.full((2, 5, 5, 5, 3), 1e-300 + 1e-300j)}, "the largest displacement is 1.41e-300"),
         ({"displacement": None}, "store the waves as displacement"),
         ({"mask": np.zeros((5, 5, 5), int)}, "no voxel of the mask"),
         ({"mask": np.ones((4, 5, 5), int)}, "use the same voxels"),
@@ -253,6 +254,11 @@ def test_units_in_the_headings_of_a_table_are_read(tmp_path):
     path.write_text(path.read_text().replace("y [mm]", "y_m", 1))
     with pytest.raises(InputError, match="heading y_m has a unit other than mm"):
         wave_field.read_waves(path)
+    for name, bare in (("y_m", "y"), ("u_im_y_um", "u_im_y")):  # y was read in mm too
+        path.write_text(path.read_text().replace("y_m" if bare == "y" else name, bare, 1))
+        with pytest.raises(InputError, match=f"heading {bare} has no unit"):
+            wave_field.read_waves(path)
+        path.write_text(path.read_text().replace(f",{bare},", ",y [mm]," if bare == "y" else f",{name},", 1))
 
 
 def test_a_table_with_semicolons_and_decimal_commas_is_read(tmp_path):

@@ -34,7 +34,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
 
     Args:
         path: path of the file. The name of its strain column is strain, with the unit % or 1.
-        table: name of the table, or a part of its name, if the file has several tables.
+        table: name of the table, a part of its name, or its number (from 1), if the file has several tables.
         max_strain: maximum strain [1]; points with a larger strain are ignored. None: all points are used.
 
     Raises:
@@ -66,7 +66,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are ignored as requested")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:
         raise InputError(
-            f"{path}: {kept.sum()} points of strain are left: give points at {FEWEST_POINTS} or more strains"
+            f"{path}: points at {len(np.unique(strain[kept]))} different strains are left: give {FEWEST_POINTS} or more"
         )
     if np.ptp(omega[kept]) > 0.01 * omega[kept].mean():
         low, high = omega[kept].min() / 2 / np.pi, omega[kept].max() / 2 / np.pi

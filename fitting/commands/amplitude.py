@@ -26,7 +26,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--model", type=Path, metavar="fit.json", help="Prony series of a frequency sweep")
     command.add_argument("--plates", choices=("parallel", "cone"), help="plates (default parallel)")
     command.add_argument("--max-strain", type=float, metavar="X", help="ignore larger strains; 0.1 is 10 %%")
-    command.add_argument("--table", metavar="NAME", help="table to read if there are several: a part of its name")
+    command.add_argument(
+        "--table", metavar="NAME", help="table to read if there are several: its name, a part of it, or its number"
+    )
     command.add_argument(
         "--out", type=Path, default=Path("amplitude"), metavar="DIR", help="folder of the results (amplitude)"
     )

@@ -59,10 +59,10 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 def _problem(options: argparse.Namespace) -> Problem:
     """Read and check the scenes and displacements of the command line."""
-    for name in ("length", "noise", "iterations"):
+    for name, example in (("length", "0.02"), ("noise", "1e-5"), ("iterations", "30")):
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError(f"--{name} {value:g} must be above 0: give a larger number")
+            raise InputError(f"--{name} {value:g} must be a finite number above 0: give e.g. --{name} {example}")
     if len(options.files) % 2:
         raise InputError(f"{len(options.files)} files were given: give a scene and its displacements, in pairs")
     scenes, data = [], []

@@ -311,10 +311,12 @@ def _check_friction(options: argparse.Namespace) -> None:
         (f"--model {options.model}", options.model != "prony"),
         ("--with", bool(options.others)),
         ("--master", options.master is not None),
-        (f"{len(options.sweep)} samples", len(options.sweep) > 1),
+        ("all samples but one", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(f"--friction-error works only with the Prony modes of one sample: remove it, or {name}")
+            raise InputError(
+                f"--friction-error works only with the Prony modes of one sample: remove --friction-error, or {name}"
+            )
 
 
 def _check_precompression(options: argparse.Namespace) -> None:
@@ -324,7 +326,7 @@ def _check_precompression(options: argparse.Namespace) -> None:
     from fitting.rigs import compression
 
     compression.check_strain(options.precompression)
-    for name, asked in (("--with", bool(options.others)), (f"{len(options.sweep)} samples", len(options.sweep) > 1)):
+    for name, asked in (("--with", bool(options.others)), ("all samples but one", len(options.sweep) > 1)):
         if asked:
             raise InputError(f"--precompression works for a single sweep only: remove {name}, or --precompression")
     for name, asked in (("--profile", options.profile), ("--samples", options.samples is not None)):
@@ -379,7 +381,7 @@ def _check_together(options: argparse.Namespace) -> None:
         ("--report", options.report),
         ("--predict", bool(options.predict)),
         ("--gap-error", options.gap_error is not None),
-        (f"{len(options.sweep)} samples", len(options.sweep) > 1),
+        ("all samples but one", len(options.sweep) > 1),
     ):
         if asked:
             raise InputError(f"--with fits modes or springpots to one sample in closed form: remove {name}")

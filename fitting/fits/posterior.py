@@ -41,8 +41,8 @@ BEYOND = 10.0
 MODULI_BEYOND = 1e3
 PRIORS = {
     "prony": "G0 log-uniform from the smallest measured modulus to 1000 times the largest; relaxation times "
-    "log-uniform from a tenth of the shortest to ten times the longest that the data resolve; ratios uniform, together "
-    "with the equilibrium part, among all that add up to one",
+    "log-uniform from a tenth of the shortest to ten times the longest that the data resolve; ratios and the "
+    "equilibrium fraction uniform among all values with the sum 1",
     "fractional": "moduli at the middle of the band log-uniform within a factor of 1000 of the measured ones; "
     "exponents uniform",
 }
@@ -166,7 +166,13 @@ class Modes(NamedTuple):
     fluid: bool
     modulus: tuple[float, float]  # lower and upper bound of log G0
     times: tuple[float, float]  # lower and upper bound of the logs of the relaxation times
-    words: str = PRIORS["prony"]
+
+    @property
+    def words(self) -> str:
+        """Description of the prior in words. A fluid has no equilibrium fraction."""
+        return (
+            PRIORS["prony"].replace("ratios and the equilibrium fraction", "ratios") if self.fluid else PRIORS["prony"]
+        )
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
         """Return the log prior (W,) of W vectors u (W, P), up to a constant."""

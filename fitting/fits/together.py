@@ -26,8 +26,8 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
 #: ROUNDS: number of rounds; each round is a fit, and then new weights of the tests. QUIETEST: minimum relative noise of
-#: a test. STARTS: number of starting points.
-ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
+#: a test. STARTS: number of starting points. FIRST: noise of every test in the first round, relative to its values.
+ROUNDS, QUIETEST, STARTS, FIRST = 3, 1e-5, 6, 0.03
 #: The tests contradict each other if the noise of a test in the common fit, divided by its noise in a fit to this test
 #: alone, exceeds this ratio.
 APART = 1.5
@@ -116,6 +116,12 @@ def least_noise(test: Measured) -> float:
     """Return the lower bound of the noise of a test, divided by its scales. The bound is 1 if standard deviations are
     given, because given standard deviations are not reduced."""
     return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
+
+
+def first_noise(test: Measured) -> float:
+    """Return the noise in the first round, divided by the scales of the test. All tests begin with the same relative
+    noise, also if the scales are standard deviations."""
+    return max(least_noise(test), FIRST * float(np.median(np.abs(sizes_of(test)) / reported_numbers(test)[2])))
 
 
 def tests_evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> tuple[np.ndarray, np.ndarray]:
@@ -209,7 +215,7 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
     """Fit a given number of modes to all tests. After each fit, the tests get new weights from their residuals."""
     parts = [reported_numbers(t) for t in tests]
     begin, evaluate = time.perf_counter(), partial(tests_evaluated, list(map(name_of, tests)), kind)
-    starts, noise = starts_of_all(tests, band, modes, kind), np.full(len(tests), 0.03)
+    starts, noise = starts_of_all(tests, band, modes, kind), np.array([first_noise(t) for t in tests])
     for _ in range(ROUNDS):
         used = noise
         data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]

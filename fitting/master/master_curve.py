@@ -53,7 +53,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
     if reference is not None and not T.min() - 10 <= reference <= T.max() + 10:
         raise InputError(
             f"--master {celsius(reference):.4g}: the sweeps are from {celsius(T[0]):.4g} to {celsius(T[-1]):.4g} °C; "
-            "give a temperature in this range"
+            "give a temperature in this range, or at most 10 K outside it"
         )
     untold: list[str] = []
     if data.shift_factors is not None:

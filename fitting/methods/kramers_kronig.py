@@ -118,7 +118,7 @@ def _breach(omega, storage, loss, noise) -> str:
     step = math.log(omega[1] / omega[0])
     # Upper bound of the rise of G' between the two points, for the largest G'' that is possible between them:
     # |d ln G''/d ln omega| is at most 1.
-    most = step * min(max(loss) * math.exp(step / 2), math.inf)
+    most = step * max(loss) * math.exp(step / 2)
     rise, sd = storage[1] - storage[0], noise[0] * math.hypot(*storage)
     margin = max(SIGNIFICANT * sd, NEGLIGIBLE * max(storage))
     if rise > most + margin:

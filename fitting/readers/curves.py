@@ -7,7 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.tables.text_tables import EMPTY, decimal_sign, find_delimiter, split_cells, text_of, to_number
+from fitting.readers.tables.text_tables import (
+    EMPTY,
+    decimal_sign,
+    find_delimiter,
+    is_summary,
+    split_cells,
+    summary_rows,
+    text_of,
+    to_number,
+)
 from fitting.readers.units import STRESS_UNITS
 from liverjax.core.errors import InputError
 from liverjax.laws import homogeneous
@@ -62,7 +71,10 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
     """
     curves, notes = [], []
     for file in files:
-        rows = _rows_of_curves(file)
+        rows, summaries = _rows_of_curves(file)
+        notes += [
+            f"{file.name}: data row {k} is a summary of other rows ({own}) and is ignored" for k, own in summaries
+        ]
         rows, left_out = _measured_rows(rows)
         notes += [f"{file.name}: rows without a stress are ignored: {left_out}"] if left_out else []
         spreads = [name for name in rows[0] if _SPREAD.search(name)]
@@ -90,7 +102,8 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
     return curves, notes
 
 
-def _rows_of_curves(file: Path) -> list[dict[str, str]]:
+def _rows_of_curves(file: Path) -> tuple[list[dict[str, str]], list[tuple[int, str]]]:
+    """Return the rows of a file, and the numbers and labels of rows such as "Mean", which are not among them."""
     text = text_of(file, "curves")
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     cells = [[c.strip('" ') for c in split_cells(line, _delimiter_of_curves(line))] for line in lines]
@@ -99,7 +112,11 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     if end < first + 2:
         raise InputError(f"{file} contains no rows: give a CSV file of curves")
     names, between = _documented(cells[first]), _delimiter_of_curves(lines[first])
-    rows = [_row_under(names, own, file) for own in cells[first + 1 : end]]
+    every = cells[first + 1 : end]
+    tests = [k for k, name in enumerate(names) if name == "test"]  # these cells are never numbers
+    labelled = [[cell for k, cell in enumerate(own) if k not in tests or is_summary(cell)] for own in every]
+    summaries = summary_rows(labelled)
+    rows = [_row_under(names, own, file) for k, own in enumerate(every) if k not in summaries]
     if between != ",":  # then numbers may have a decimal comma
         sign = decimal_sign(cell for row in rows for cell in row.values())
         rows = [{k: _with_point(v, between, sign) for k, v in row.items()} for row in rows]
@@ -111,7 +128,7 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
             f"{file} has columns {', '.join(names)[:100]}: give F11 … F33, P11 … P33, "
             "or test, stretch, shear, nominal_stress_kPa"
         )
-    return rows
+    return rows, [(k + 1, own) for k, own in summaries.items()]
 
 
 def _measured_rows(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
@@ -163,6 +180,9 @@ def _with_point(cell: str, between: str, sign: str | None) -> str:
 
 def _column(file: Path, rows: list[dict], name: str, default: float | None = None) -> np.ndarray:
     values = []
+    if name not in rows[0] and default is None:
+        headings = ", ".join(key for key in rows[0] if key != "row")
+        raise InputError(f"{file} has no column {name}, only {headings}: give {name} without a unit (1 is undeformed)")
     for row in rows:
         text = row.get(name, "")
         if not text and default is not None:

@@ -1,6 +1,10 @@
-"""The noise of a series of values, estimated from these values."""
+"""Noise, typical sizes and single wrong values of a series of values, estimated from these values."""
 
 import numpy as np
+
+#: A single value is far from its neighbours if the distance is above these multiples of the changes beside it and of
+#: the noise, and above this fraction of the largest value.
+_FAR, _NOISES, _OF_LARGEST = 10.0, 20.0, 0.02
 
 
 def noise_of_series(values: np.ndarray) -> float:
@@ -11,3 +15,36 @@ def noise_of_series(values: np.ndarray) -> float:
     """
     steps = np.abs(np.diff(values, 3))
     return float(np.median(steps)) / 0.6745 / np.sqrt(20) if len(steps) else 0.0
+
+
+def sizes_of_series(values: np.ndarray) -> np.ndarray:
+    """Return the absolute values (n,), at least the median of each value and its two neighbours.
+
+    With these sizes as scales of the residuals, a single value near 0 has no larger weight than its neighbours.
+    """
+    from scipy.ndimage import median_filter
+
+    sizes = np.abs(values)
+    return np.maximum(sizes, median_filter(sizes, 3, mode="nearest"))
+
+
+def far_values(values: np.ndarray) -> np.ndarray:
+    """Return the indices of single values that lie far from both neighbours, on the same side. The change between these
+    neighbours, and between them and the next values, must be much smaller."""
+    if len(values) < 5:
+        return np.zeros(0, int)
+    own, steps = values[2:-2], np.abs(np.diff(values))
+    before, after = own - values[1:-3], own - values[3:-1]
+    off = np.where(before * after > 0, np.minimum(np.abs(before), np.abs(after)), 0.0)
+    beside = np.max([steps[:-3], steps[3:], np.abs(before - after)], axis=0)
+    least = max(_NOISES * noise_of_series(values), _OF_LARGEST * float(np.max(np.abs(values))))
+    return 2 + np.flatnonzero(off > np.maximum(_FAR * beside, least))
+
+
+def told_of_far_values(time: np.ndarray, values: np.ndarray) -> list[str]:
+    """Return a note for each of the `far_values` of a series. `time`: times (n,) [s]."""
+    return [
+        f"the response {values[k]:.4g} at {time[k]:.4g} s is far from its neighbours {values[k - 1]:.4g} and "
+        f"{values[k + 1]:.4g}: if it is a fault of the measurement, remove this row"
+        for k in far_values(values)
+    ]

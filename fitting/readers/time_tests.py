@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.noise_of_series import noise_of_series
+from fitting.readers.noise_of_series import noise_of_series, sizes_of_series, told_of_far_values
 from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.time_columns import FORMS, beyond_small, read_columns
 from liverjax.core.errors import InputError
@@ -48,7 +48,7 @@ class TimeTest(NamedTuple):
     def _sizes_of_answers(self) -> np.ndarray:
         answer = self.answer[self.used]
         floor = max(noise_of_series(answer) / RELATIVE, CYCLIC * float(np.max(np.abs(answer))) if self.cyclic else 0.0)
-        return np.hypot(answer, floor)
+        return np.hypot(sizes_of_series(answer), floor)
 
     @property
     def cyclic(self) -> bool:
@@ -119,7 +119,9 @@ def read_time_test(
         InputError: the file cannot be used; the message names the column or line, the value and the remedy.
     """
     if not (np.isfinite(start) and start >= 0):
-        raise InputError(f"--min-time {start:g} must be 0 or more: give the time after the load in seconds")
+        raise InputError(
+            f"--min-time {start:g} must be a finite number of seconds after the load, 0 or more: give e.g. 0.5"
+        )
     columns, notes = read_columns(path)
     time = columns["time"]
     form = next((f for f in FORMS if set(f) <= set(columns)), None)
@@ -493,7 +495,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         raise InputError(
             f"{test.source}: most responses of the {test.kind} test have the wrong sign for its load; correct the signs"
         )
-    notes = (*test.notes, *told)
     if np.sum(test.time <= test.begun) > 2:
-        notes = (*notes, f"the load begins at {test.begun:.3g} s: the rows before it are not fitted")
-    return test._replace(driven=driven, answer=answer, used=used, notes=notes, offset_error=error)
+        told = [*told, f"the load begins at {test.begun:.3g} s: the rows before it are not fitted"]
+    told = [*told, *told_of_far_values(test.time[used], answer[used])]
+    return test._replace(driven=driven, answer=answer, used=used, notes=(*test.notes, *told), offset_error=error)

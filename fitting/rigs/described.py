@@ -185,7 +185,8 @@ def _description(path: Path) -> Described:
             raise InputError(f"{path}: {test} has no key {key!r}: {hint(key, known)}")
     for key in ("data", *needed):
         if key not in table:
-            raise InputError(f"{path}: {test} needs {key}: give it{'' if key == 'data' else ' in metres'}")
+            unit = {"data": "", "half_angle": " in degrees"}.get(key, " in metres")
+            raise InputError(f"{path}: {test} needs {key}: give {key}{unit}")
     sizes = {key: _number_of(path, key, table[key]) for key in needed}
     bad = next((key for key, value in sizes.items() if not 0 < value < (90 if key == "half_angle" else 1)), None)
     if bad:

@@ -210,6 +210,9 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
         raise InputError(f"{name}: displacement has shape {shape}: give {_layout(name)}")
     if not np.any(np.isfinite(U) & (U != 0)):
         raise InputError(f"{name}: displacement is zero or not a number everywhere: check the file")
+    largest = float(np.max(np.abs(U[np.isfinite(U)])))
+    if not 1e-100 < largest < 1e100:
+        raise InputError(f"{name}: the largest displacement is {largest:.3g}: check the numbers and their unit")
     if not np.iscomplexobj(U) or not np.any(np.isfinite(U) & (U.imag != 0)):
         raise InputError(
             f"{name}: displacement has no imaginary part: give complex amplitudes, or phases over a period"

@@ -257,7 +257,7 @@ def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
     spans, parts = spans_of(tests), [together.reported_numbers(t) for t in tests]
     out = []
     for case, starts in zip(FRACTIONAL, _starts_near(near, spans), strict=True):
-        begin, noise = perf_counter(), np.full(len(tests), 0.03)
+        begin, noise = perf_counter(), np.array([together.first_noise(t) for t in tests])
         for _ in range(together.ROUNDS):
             used, data = noise, [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
             minimum = _minimum_of_case(case, tests, starts, data)

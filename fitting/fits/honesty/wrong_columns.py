@@ -28,8 +28,8 @@ class _Cause(NamedTuple):
     function `driven` computes the true driven quantity from (driven column, number). The function `column` computes the
     values in the stress column from (nominal stress, true driven quantity, number).
 
-    During the fit, the number is divided by the range of the driven column, or by the stress scale of the curve if the
-    number is a stress.
+    The number is the same for all curves. During the fit, it is divided by the stress scale of the first curve if it is
+    a stress, otherwise by the range of the driven column of this curve.
     """
 
     words: str
@@ -98,8 +98,7 @@ def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
             continue
         refit = _criterion(fit.law, curves, odd, cause)
         if refit.value < limit and refit.chance > _RANDOM:
-            number = refit.number * (odd[0].scale if cause.of_stress else np.ptp(odd[0].driven))
-            words = cause.words.format(driven="stretch", number=number)
+            words = cause.words.format(driven="stretch", number=refit.number)
             modulus = _slope_at_rest(refit.law)
             found.append(
                 (refit, f"the same law would fit the curve {words}, with G0 {modulus:.4g} Pa: check the columns")
@@ -110,7 +109,7 @@ def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
 class _Refit(NamedTuple):
     value: float  # Akaike's criterion, corrected for few points
     chance: float  # smallest probability of the order of residuals, of all curves with a structured misfit
-    number: float
+    number: float  # fitted number of the cause, in the unit of its column; 0 if no number is fitted
     law: Law
 
 
@@ -122,6 +121,7 @@ def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | 
     start = every[every != 0]
     free = cause is not None and cause.free
     labels = {c.label for c in odd}
+    unit = odd[0].scale if cause is not None and cause.of_stress else np.ptp(odd[0].driven)
 
     def law_of(x: np.ndarray) -> Law:
         values = every.copy()
@@ -134,7 +134,7 @@ def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | 
             if cause is None or c.label not in labels:
                 out.append((_model(own, c) - c.stress) / c.scale)
                 continue
-            q = (float(x[-1]) if free else 0.0) * (c.scale if cause.of_stress else np.ptp(c.driven))
+            q = float(x[-1]) * unit if free else 0.0
             driven = cause.driven(c.driven, q)
             F = c.F if cause.of_stress else np.asarray(homogeneous.deformation_gradient(c.test, driven))
             out.append((cause.column(_model(own, c, F), driven, q) - c.stress) / c.scale)
@@ -150,7 +150,7 @@ def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | 
     value = n * np.log(max(2 * found.cost / n, 1e-300)) + 2 * k * n / max(n - k - 1, 1)
     own = [r for c, r in zip(curves, parts(found.x), strict=True) if c.label in labels]
     chance = min(runs_probability(r)[1] for r in own)
-    return _Refit(float(value), chance, float(found.x[-1]) if free else 0.0, law_of(found.x))
+    return _Refit(float(value), chance, float(found.x[-1] * unit) if free else 0.0, law_of(found.x))
 
 
 def _slope_at_rest(law: Law) -> float:

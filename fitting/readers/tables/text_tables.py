@@ -169,23 +169,40 @@ def means_nothing(cells: Iterable[str]) -> bool:
     return not any(re.match(r"[-+]?[.,]?\d|nan|[-+]?inf", cell.strip('" ').lower()) for cell in cells)
 
 
-#: Words at the beginning of a row that mark the row as a summary of other rows, for example "Mean (n = 3)".
-_SUMMARY = re.compile(
-    r"±? ?(mean|average|avg|median|s\.?d|std|st\.? ?dev|std\.? ?dev|standard deviation|s\.?e\.?m|s\.?e|std\.? ?error"
-    r"|standard error|min|max|minimum|maximum|range|cv|rsd|variance|n|count|mw|mittelwert|mittel|standardabweichung"
-    r"|moyenne|.cart[- ]type|media|promedio)( value)?\.?( ?± ?\w+)?( ?%)?( ?[(\[][^)\]]*[)\]])?:?",
-    re.I,
+#: Labels of rows with means of other rows, for example "Mean (n = 3)", and labels of other summaries.
+_MEAN = r"mean|average|avg|mw|mittelwert|mittel|moyenne|media|promedio|gemiddelde"
+_OTHER = (
+    r"median|mediane?|s\.?d|std|st\.? ?dev|std\.? ?dev|stdev\.?[sp]?|stdabw\.?|std\.?[- ]?abw\.?|standardabweichung"
+    r"|standard[ -]deviation|s\.?e\.?m|s\.?e|std\.? ?error|standard[ -]error|min|max|minimum|maximum|range|cv|rsd"
+    r"|variance|varianz|n|count|.cart[- ]type|(95 ?%? ?)?c\.?i\.?( ?95 ?%?)?|confidence( interval)?"
 )
+_AROUND = r"±? ?({})( value)?\.?( ?± ?\w+)?( ?%)?( ?[(\[][^)\]]*[)\]])?:?"
+_OF_MEANS, _OF_SUMMARIES = (re.compile(_AROUND.format(each), re.I) for each in (_MEAN, f"{_MEAN}|{_OTHER}"))
+
+
+def is_summary(label: str) -> bool:
+    """Return whether a cell is the label of a summary of rows, such as "Mean" or "SD"."""
+    return bool(_OF_SUMMARIES.fullmatch(label))
 
 
 def summary_rows(rows: list[list[str]]) -> dict[int, str]:
-    """Return the indices of rows such as "Mean" and "SD" at the end of a table, and the first word of each row.
+    """Return the indices of rows such as "Mean" and "SD" at the end of a table, and the label of each row.
 
-    A row that repeats the word of another row is no summary: the word may be the name of a sample or of a range.
+    The label is the first cell that is no number. A mean and all labelled rows below it are summaries, unless a label
+    is that of another row too: such a label may be the name of a sample or of a range.
     """
-    firsts = [next((cell.strip('" ') for cell in row if cell.strip('" ')), "") for row in rows]
+    labels = [_label(row) for row in rows]
     end = len(rows)
-    while end and _SUMMARY.fullmatch(firsts[end - 1]):
+    while end and is_summary(labels[end - 1]):
         end -= 1
-    words = firsts[end:]
-    return dict(enumerate(words, end)) if end and len(set(words)) == len(words) else {}
+    means = [k for k, label in enumerate(labels) if _OF_MEANS.fullmatch(label) and all(labels[k:])]
+    end = min([end, *means])
+    own = labels[end:]
+    distinct = len(set(own)) == len(own) and not set(own) & set(labels[:end])
+    return dict(enumerate(own, end)) if end and distinct else {}
+
+
+def _label(row: list[str]) -> str:
+    """Return the first cell that is no number, or an empty string."""
+    cells = (cell.strip('" ') for cell in row)
+    return next((cell for cell in cells if cell.lower() not in EMPTY and to_number(cell, ";") is None), "")

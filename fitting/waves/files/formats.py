@@ -203,6 +203,11 @@ def _without_units(path: Path, head: list[str]) -> tuple[list[str], dict[str, st
             raise InputError(
                 f"{path}: heading {name} has a unit other than {units[kind]}: use the same unit in all these headings"
             )
+    bare = next((name for name in head if name in COLUMNS and ("u" if name[0] == "u" else "x") in units), None)
+    if bare is not None:
+        raise InputError(
+            f"{path}: heading {bare} has no unit, but similar headings have one: give all of them the same unit"
+        )
     return plain, units
 
 

@@ -1,0 +1,50 @@
+"""Noise, sizes and single wrong values of series: estimates against known noise, and series without wrong values."""
+
+import numpy as np
+import pytest
+
+from fitting.fits import time_tests
+from fitting.readers.noise_of_series import far_values, noise_of_series, sizes_of_series
+from fitting.readers.time_tests import read_time_test
+
+pytestmark = pytest.mark.quick_to_compile
+TIME = np.geomspace(0.01, 100, 60)
+MODULUS = 780 + 1040 * np.exp(-TIME / 12) + 780 * np.exp(-TIME / 0.8)
+
+
+def test_the_noise_of_a_smooth_series_is_found():
+    smooth = np.interp(np.linspace(0, 100, 400), TIME, MODULUS)
+    found = noise_of_series(smooth + 5 * np.random.default_rng(0).normal(size=400))
+    assert 4 < found < 6  # the median of 400 values has a standard deviation of 7 %, counting their correlation
+
+
+@pytest.mark.parametrize("value", [0.0, 500.0, 20000.0, -2000.0])
+@pytest.mark.parametrize("row", [2, 30, 57])
+def test_a_single_wrong_value_is_found(value, row):
+    noisy = MODULUS * (1 + 0.003 * np.random.default_rng(1).normal(size=60))
+    assert far_values(noisy).size == 0
+    noisy[row] = value
+    assert far_values(noisy).tolist() == [row]
+
+
+def test_true_courses_have_no_wrong_values():
+    triangle = np.abs((np.linspace(0, 5, 101) + 1) % 2 - 1)
+    steps = np.repeat([0.0, 1.0, 0.4, 2.0], 8)
+    one_peak = np.concatenate([np.linspace(0, 1, 6), 0.7 + 0.3 * np.exp(-np.linspace(0.3, 3, 9))])
+    for series in (triangle, steps, one_peak, np.sin(np.linspace(0, 20, 60)), MODULUS[::10]):
+        assert far_values(series).size == 0
+        assert np.all(sizes_of_series(series) >= np.abs(series))
+    assert np.array_equal(sizes_of_series(steps), steps)
+
+
+@pytest.mark.parametrize("value", [0.0, 100.0])
+def test_a_row_near_zero_does_not_rule_a_fit(tmp_path, value):
+    """The low value had more than 100 times the weight of its neighbours: G_inf was 400 Pa instead of 780 Pa."""
+    answer = MODULUS * (1 + 0.003 * np.random.default_rng(2).normal(size=60))
+    answer[30] = value
+    rows = [f"{t:.7g},{g:.7g}" for t, g in zip(TIME, answer, strict=True)]
+    (tmp_path / "r.csv").write_text("\n".join(["time [s],G(t) [Pa]", *rows]))
+    test = read_time_test(tmp_path / "r.csv", "relaxation", ramp=0.0)
+    assert any(f"the response {value:g} at {TIME[30]:.4g} s is far from its neighbours" in note for note in test.notes)
+    model = time_tests.fit(test).model
+    assert abs(model.equilibrium_modulus - 780) < 0.05 * 780 and abs(model.shear_modulus - 2600) < 0.05 * 2600
