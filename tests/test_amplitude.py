@@ -192,7 +192,10 @@ def test_strains_below_one_percent_may_be_fractions(tmp_path, tanned):
     law, memories, shares = tanned
     for part, told in ((0.01, True), (1.0, False)):
         sweep = strain_sweep.read_strain_sweep(written(tmp_path / "s.csv", law, memories, 0.0, shares, part * STRAIN))
-        assert any("if they are fractions, name the column strain_1" in n for n in sweep.notes) == told
+        assert (
+            any("if the numbers of the column are fractions, name the column strain_1" in n for n in sweep.notes)
+            == told
+        )
 
 
 def test_two_temperatures_and_deviations(tmp_path, tanned):
@@ -246,7 +249,7 @@ def test_a_frequency_sweep_and_few_points_are_refused(tmp_path, tanned, capsys):
     with pytest.raises(InputError, match="different strains are left"):
         strain_sweep.read_strain_sweep(path, max_strain=0.012)
     (tmp_path / "per_cent.csv").write_text(path.read_text().replace("strain_%", "strain_1"))
-    with pytest.raises(InputError, match="write it in %"):
+    with pytest.raises(InputError, match="write the strains in %"):
         strain_sweep.read_strain_sweep(tmp_path / "per_cent.csv")
     assert command.main(["amplitude", "fung_demiray", str(path), "--max-strain", "-1"]) == 2
     assert command.main(["amplitude", "fung_demiray", str(path), "--model", str(path), "--out", str(tmp_path)]) == 2
@@ -258,7 +261,7 @@ def test_a_strain_without_a_unit_several_tables_and_a_gap(tmp_path, tanned):
     path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
     text, whole = path.read_text(), strain_sweep.read_strain_sweep(path)
     path.write_text(text.replace("strain_%", "strain"))
-    with pytest.raises(InputError, match="write it in %"):
+    with pytest.raises(InputError, match="write the strains in %"):
         strain_sweep.read_strain_sweep(path)
     lines = text.splitlines()
     parts = [lines[0].replace("strain_%", "strain")]
@@ -266,7 +269,7 @@ def test_a_strain_without_a_unit_several_tables_and_a_gap(tmp_path, tanned):
     path.write_text("\n".join(parts))
     found = strain_sweep.read_strain_sweep(path)
     np.testing.assert_allclose(found.strain, whole.strain, rtol=1e-12)
-    assert "states no unit: the unit 1" in found.notes[0]
+    assert "states no unit, so the unit 1" in found.notes[0]
     path.write_text(f"sample A\n{text}\nsample B\n" + "\n".join(lines[:-1]))
     first, second = (strain_sweep.read_strain_sweep(path, table) for table in (None, "2"))
     assert "holds 2 tables" in first.notes[0] and len(first.strain) == len(whole.strain) == len(second.strain) + 1

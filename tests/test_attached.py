@@ -166,7 +166,7 @@ def test_a_tie_between_two_points_changes_no_balance():
             {"to": [0, 0, 0.2], "where": {"z_min": SIDE}, "stiffness": 1.0, "pre_tension": 50.0},
             "N: give a smaller tension",
         ),
-        ({"to": [0, 0, 0.1], "where": {"z_min": SIDE}, "stiffness": 1.0, "rest_length": 0.1}, "fibre without length"),
+        ({"to": [0, 0, 0.1], "where": {"z_min": SIDE}, "stiffness": 1.0, "rest_length": 0.1}, "fibre of length 0"),
         ({"points": [[0, 0, 0], [0, 0, 1]], "stiffness": 1.0, "rest_length": 0.1}, "is outside the body"),
         ({"points": [[0, 0, 0]], "stiffness": 1.0, "rest_length": 0.1}, "must be two points of the body"),
     ],
@@ -269,14 +269,14 @@ def test_a_vessel_stiffens_as_one_of_elements(verified):
         ({"line": [[0, 0, 0], [0, 0, "1"]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}}, "needs line"),
         (
             {"line": [[0, 0, 0], [0, 0, 1]], "radius": True, "law": {"name": "neo_hookean", "mu": 1e5}},
-            "radius one number",
+            "radius as one number",
         ),
         ({"line": [[0, 0, 0], [0, 0, 10**400]], "radius": 1, "law": {"name": "neo_hookean", "mu": 1e5}}, "needs line"),
         (
             {"line": [[0, 0, 0], [0, 0, np.nan]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}},
-            "one number or one per point: give finite numbers",
+            "one number per point: correct line and radius",
         ),
-        ({"line": [[0, 0, 0]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}}, "two points or more"),
+        ({"line": [[0, 0, 0]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}}, "two or more points"),
         (
             {"line": [[0, 0, 0]] * 2, "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}},
             "the same point twice in succession",

@@ -137,7 +137,7 @@ def test_structs_of_a_users_own_are_read_alike():
 
 
 def test_a_bound_that_is_misspelt_is_no_bound():
-    with pytest.raises(TypeError, match="param has no 'lowest': use lower, upper, above, nonzero"):
+    with pytest.raises(TypeError, match="param has no argument 'lowest': use lower, upper, above, nonzero"):
         lj.param("Pa", lowest=0.0)
 
 
@@ -147,7 +147,7 @@ def test_parts_of_a_scene_checked_alone_use_the_same_place():
         viscosity.check_viscosity(prony, SOUND.law)
     with pytest.raises(lj.InputError, match=r"porosity\.bulk = 0 must be above 0 Pa"):
         porosity.check_porosity(replace(SOUND.porosity, bulk=0))
-    with pytest.raises(lj.InputError, match="2 mu and 1 alpha"):
+    with pytest.raises(lj.InputError, match="2 values of mu and 1 values of alpha"):
         lj.check_scene(replace(SOUND, region=(), law=lj.laws.Ogden(mu=(1.0, 2.0), alpha=(2.0,), bulk=10.0)))
 
 
@@ -318,11 +318,11 @@ MEANINGLESS = (
     ({"solve": lj.Solve(steps=2)}, "[solve] has no dt, which viscosity needs"),
     ({"solve": lj.Solve(steps=2, kind="dynamic", dt=0.05)}, "[solve] kind = 'dynamic' needs mass"),
     ({"solve": lj.Solve(steps=2, kind="dynamic"), "viscosity": None}, "[solve] kind = 'dynamic' needs dt"),
-    (_moved(by=jnp.array([0.01, 0.02])), "displaced.0 by has shape (2,): give three numbers in m, or three per node"),
-    (_moved(by=jnp.zeros(4)), "displaced.0 by has shape (4,)"),
-    (_moved(by=[0.01, 0.02]), "displaced.0 by has shape (2,)"),
-    (_moved(by=0.01), "displaced.0 by has shape ()"),
-    (_moved(by=jnp.zeros((3, 3))), "displaced.0 by has shape (3, 3)"),
+    (_moved(by=jnp.array([0.01, 0.02])), "displaced.0 'by' has shape (2,): give three numbers in m, or three per node"),
+    (_moved(by=jnp.zeros(4)), "displaced.0 'by' has shape (4,)"),
+    (_moved(by=[0.01, 0.02]), "displaced.0 'by' has shape (2,)"),
+    (_moved(by=0.01), "displaced.0 'by' has shape ()"),
+    (_moved(by=jnp.zeros((3, 3))), "displaced.0 'by' has shape (3, 3)"),
     (_moved(nodes=jnp.array([4, 700])), "displaced.0.nodes contains node 700, but the mesh has only the nodes 0 to 7"),
     (_moved(axes="XYZ"), "displaced.0 axes = 'XYZ' is not known: give some of the letters xyz"),
     ({"fixed": (lj.Fixed(nodes=jnp.array([0, 1]), axes=""),)}, "fixed.0 axes = '' is not known"),
@@ -362,7 +362,7 @@ def test_runs_refuse_what_means_nothing(change, sentence):
         ),
         (
             {"displaced.0.by": [[0.01, 0.02], [0.0, 0.01]]},
-            "parameter set 0 (counted from 0): displaced.0 by has shape (2,)",
+            "parameter set 0 (counted from 0): displaced.0 'by' has shape (2,)",
         ),
     ],
 )

@@ -84,26 +84,26 @@ def test_volumes_name_how_many_which_and_when():
 def test_long_bodies_and_slivers():
     long = lj.shapes.box((6.0, 3.0, 3.0), (2, 1, 1))
     assert cautions_of_run(scene(long), run(long, [np.eye(3)], [1.0])) == [
-        "the body is 6 m long: check the mesh's unit, e.g. write unit = 'mm'"
+        "the body is 6 m long: check the unit of the mesh, e.g. write unit = 'mm'"
     ]
     # Four corners of a square, one lifted by h: volume a^2 h / 6, mean square edge (4 + 2 * 2)/6 a^2 apart from h.
     a, h = 0.1, 1e-4
     flat = lj.tet_mesh([[0, 0, 0], [a, 0, 0], [a, a, h], [0, a, 0]], [[0, 1, 3, 2]])
     quality = 6 * np.sqrt(2) * a * a * h / 6 / ((4 / 3) ** 0.5 * a) ** 3  # up to order (h/a)^2
     (found,) = cautions_of_run(scene(flat), run(flat, [np.eye(3)], [1.0]))
-    assert found.startswith("1 of 1 elements are slivers, of quality below 0.01 (worst: element 0, ")
-    assert f"{quality:.2g}; regular: 1)" in found
+    assert found.startswith("1 of 1 elements are slivers, with a quality below 0.01 (worst: element 0 with ")
+    assert f"{quality:.2g}; a regular tetrahedron has 1)" in found
 
 
 def test_short_bodies_and_nodes_in_one_place():
     short = lj.shapes.box((2e-4, 1e-4, 1e-4), (1, 1, 1))
     assert cautions_of_run(scene(short), run(short, [np.eye(3)], [1.0])) == [
-        "the body is 0.0002 m long: check its size; if its coordinates are in m, remove unit"
+        "the body is 0.0002 m long: check this size, and remove unit if the coordinates of the mesh are in m"
     ]
     x, tets = np.asarray(BOX.points), np.asarray(BOX.tetrahedra)
     two = lj.tet_mesh(np.concatenate([x, x + np.array([0.1, 0, 0])]), np.concatenate([tets, tets + len(x)]))
     (found,) = cautions_of_run(scene(two), run(two, [np.eye(3)], [1.0]))
-    assert found.startswith("4 nodes have the same coordinates as another node: the body is not connected there")
+    assert found.startswith("4 nodes have the same coordinates as another node, so the body is not connected there")
 
 
 def test_waves_without_a_mass_are_told():
@@ -150,12 +150,16 @@ def test_they_stand_in_the_report_and_in_the_results(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("times", "history", "told"),
     [
-        ([0.1, 0.15, 0.3], [0.0, 1.0, 0.0], "has a peak at 0.15 s between two steps, and the run misses 33 % of it"),
+        (
+            [0.1, 0.15, 0.3],
+            [0.0, 1.0, 0.0],
+            "has a peak at 0.15 s between two steps, and the run misses 33 % of this peak",
+        ),
         ([0.1, 0.2, 0.3], [0.0, 1.0, 0.0], None),
         (
             [0.0, 0.19, 0.191],
             [1.0, 1.0, 0.0],
-            "bends within steps, but the run uses only its values at the ends of steps",
+            "bends within steps, but the run uses only the values at the ends of steps",
         ),
         ([0.0, 0.001], [0.0, 1.0], "bends within steps"),
         ([0.0, 0.1], [0.0, 1.0], None),
@@ -184,7 +188,7 @@ def test_a_sphere_between_the_points_of_contact_is_told(cells, told):
         by=np.array([0.0, 0.0, -0.005]),
     )
     said = cautions_of_run(replace(scene(mesh), physics=(sphere,)), run(mesh, [np.eye(3)], [1.0]))
-    assert any("in the body between the points at which contact is tested" in sentence for sentence in said) == told
+    assert any("m between the points at which contact is tested" in sentence for sentence in said) == told
 
 
 @pytest.mark.parametrize(
@@ -307,4 +311,4 @@ def test_a_body_whose_estimate_is_not_found_is_not_said_to_be_at_rest():
     nothing = replace(error, positions=np.zeros((1, 8, 3)), found=np.array([True]))
     assert "the body does not move" in mesh_sentence(scene(BOX), replace(result, mesh_error=nothing))
     failed = replace(result, status=np.array([status.NOT_FINITE]))
-    assert mesh_sentence(scene(BOX), failed).startswith("mesh error: unknown, because the last step failed")
+    assert mesh_sentence(scene(BOX), failed).startswith("the mesh error is unknown, because the last step failed")

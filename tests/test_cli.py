@@ -116,13 +116,13 @@ def test_the_density_of_the_command_reaches_the_rig(density, tmp_path, monkeypat
 
 HEADER = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n"
 BAD = {
-    "no file": (None, [], "no such file"),
+    "no file": (None, [], "does not exist"),
     "column": ("frequency_Hz,storage_modulus_Pa\n1,2\n2,3\n", [], "no column for loss"),
     "nan": (HEADER + "1,300,30\n2,nan,40\n", [], "is empty"),
     "negative loss": (HEADER + "1,300,30\n2,310,-40\n", [], "is not positive"),
     "too many modes": (HEADER + "1,300,30\n2,310,40\n3,320,50\n", ["--modes", "3"], "use at most --modes 2"),
     "zero modes": (HEADER + "1,300,30\n2,310,40\n", ["--modes", "0"], "at least 1"),
-    "exchanged": (HEADER + "0.1,30,300\n1,60,400\n10,90,500\n", [], "are the two columns exchanged"),
+    "exchanged": (HEADER + "0.1,30,300\n1,60,400\n10,90,500\n", [], "the two columns are exchanged"),
     "law": (HEADER + "1,300,30\n2,310,40\n", ["--law", "neohookean"], "did you mean neo_hookean"),
     "radius in mm": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "4"], "give e.g. --radius 0.004"),
     "radius": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "-1"], "--radius -1.0 cannot be"),

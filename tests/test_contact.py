@@ -243,9 +243,12 @@ SCENE = {
         ({"shape": "sphere", "radius": 0.0, "position": [0, 0, 1]}, "must be above 0"),
         (
             {"shape": "sphere", "radius": 0.1, "position": [0, 0, 0.15]},
-            "begins 0.0[0-9]* m inside the body: move it out of the body",
+            "the obstacle is 0.0[0-9]* m inside the body; move the obstacle out of the body",
         ),
-        ({"shape": "sphere", "radius": 0.01, "position": [0.05, 0.05, 0.05]}, "is inside the body: move it out"),
+        (
+            {"shape": "sphere", "radius": 0.01, "position": [0.05, 0.05, 0.05]},
+            "is inside the body: move the obstacle out",
+        ),
         ({"shape": "cylinder", "radius": 0.01, "axis": [1, 0, 0], "position": [9, 0.05, 0.05]}, "inside the body"),
         ({"shape": "plane", "axis": [0, 0, 0], "position": [0, 0, -1]}, "must be of length 1"),
         ({"shape": "cone", "half_angle": 95.0, "axis": [0, 0, 1], "position": [0, 0, 1]}, "must be below 90"),

@@ -228,7 +228,7 @@ def test_the_commands_take_a_description(tmp_path):
     [
         ({"test": "bending"}, "test = 'bending' is not known"),
         ({"test": "sphere"}, "sphere has no key 'height'"),
-        ({"height": None}, "tension needs height: give it in metres"),
+        ({"height": None}, "tension needs height; give this key in metres"),
         ({"radius": "wide"}, "radius = 'wide' is not a number"),
         ({"radius": 10.0}, "radius = 10 cannot be the size of a sample"),
         (
@@ -241,8 +241,8 @@ def test_the_commands_take_a_description(tmp_path):
         ({"drive": "torque"}, "use displacement or force"),
         ({"height": 1e-4}, "more than half of the height"),
         ({"data": 3}, "must name a file"),
-        ({"ramp": 0.5}, "ramp = 0.5 cannot be used: remove ramp"),
-        ({"min_time": -3.0}, "min_time = -3 is negative: give the time after the load"),
+        ({"ramp": 0.5}, "ramp = 0.5 cannot be used; remove ramp"),
+        ({"min_time": -3.0}, "min_time = -3 is negative; give the time after the load"),
         ({"data": "none.csv"}, "none.csv"),
         ({"data": "shear.csv"}, "needs columns of time, displacement and force"),
         ({"data": "still.csv"}, "displacement is zero throughout"),

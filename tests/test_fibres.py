@@ -117,8 +117,8 @@ def test_derivative_by_the_fibre_angle():
 @pytest.mark.parametrize(
     ("directions", "sentence"),
     [
-        ({"sheet": [2.0, 0.0, 0.0]}, "sheet is parallel to fibre"),
-        ({"fibre": [0.0, 0.0, 0.0]}, "one of the two is zero"),
+        ({"sheet": [2.0, 0.0, 0.0]}, "'fibre' and 'sheet' are parallel"),
+        ({"fibre": [0.0, 0.0, 0.0]}, "one of them is zero"),
         ({"fibre": [1.0, 0.0]}, r"give \(3,\)"),
         ({"fibre": 1.0}, "a list of numbers"),
     ],

@@ -20,20 +20,20 @@ _BAD = {
     "ux,uy,uz\n0,0,0": "either a column node or columns x,y,z",
     "node,ux,uy,uz\n900,0,0,0": "node 900 is not in the mesh",
     "node,ux,uy,uz\n1.5,0,0,0": "node 1.5 is not in the mesh",
-    "x,y,z,ux,uy,uz\n60,40,40,0,0,0": "is --unit right",
+    "x,y,z,ux,uy,uz\n60,40,40,0,0,0": "check --unit",
     "x,y,z,ux,uy,uz\n,0,0,0,0,0": "position x,y,z is not finite",
     "node,ux,uy,uz\n1,,,": "no displacement is measured",
-    "node,ux,uy,uz\n1,inf,0,0": "row 1 is infinite",
-    "\ufeffnode,ux,uy,uz\n2,-inf,0,0": "row 1 is infinite",
-    "node,ux,uy,uz\n1,0,-999,0": "row 1: uy = -999 m in a body of 0.0",
+    "node,ux,uy,uz\n1,inf,0,0": "row 1 contains an infinite displacement",
+    "\ufeffnode,ux,uy,uz\n2,-inf,0,0": "row 1 contains an infinite displacement",
+    "node,ux,uy,uz\n1,0,-999,0": "row 1 has uy = -999 m in a body of 0.0",
     "x,y,z,ux,uy,uz" + "\n0.071,0.02,0.02,0,0,0" * 4: "4 of 4 points lie outside of the mesh",
     "node,ux,uy,uz,sd\n1,0,0,0,0": "sd must be positive",
     "node,ux,uy,uz,time\n1,0,0,0,1": "has no dt",
     "node,ux,uy,uz,kind\n1,0,0,0,1": "column 'kind' is not known",
-    "node,ux,uy,uz\n5,1e-3,0,O.001\n6,1e-3,,0": "row 1: uz = 'O.001' is not a number: correct it, or leave it empty",
+    "node,ux,uy,uz\n5,1e-3,0,O.001\n6,1e-3,,0": "row 1: uz = 'O.001' is not a number; correct this cell, or",
     "node,ux,uy,uz\n# points\n5,1e-3,,0\n\n6,0.001mm,0,0": "row 2: ux = '0.001mm' is not a number",
     "node,ux,uy,uz\n5,1e-3,,0\n6,1e-3,0,0\n5,1e-3,,0\n6,1e-3,0,0": "row 3 repeats row 1 (2 of 4 rows are copies)",
-    "": "is empty: export it again",
+    "": "is empty: export the file again",
     "node;ux;uy;uz\n5;1e-3;0;0;7": "row 1 has 5 cells under 4 headings",
 }
 
@@ -55,7 +55,7 @@ def test_bad_displacements_are_one_sentence(tmp_path, content, capsys):
         ([], "no column sd"),
         (["--noise", "1e-4", "--name", "law.nu"], "not a number of the scene"),
         (["--noise", "1e-4", "--parameters", "law.mu,law.x"], "not a number of the scene"),
-        (["--noise", "1e-4", "--name", "body.gravity"], "needs one number"),
+        (["--noise", "1e-4", "--name", "body.gravity"], "can multiply only one number"),
         (["--noise", "1e-4", "--unit", "mile"], "--unit 'mile' is not known"),
         (["--noise", "1e-4", "--length", "-1"], "--length -1 must be above 0"),
     ],
@@ -91,7 +91,7 @@ def test_places_in_another_unit_than_the_displacements_are_refused(tmp_path):
     points = np.asarray(scene.mesh.points)
     rows = np.column_stack([points, 1e3 * 1e-3 * points])  # only the displacements in mm
     np.savetxt(tmp_path / "u.csv", rows, delimiter=",", header="x,y,z,ux,uy,uz", comments="")
-    with pytest.raises(lj.InputError, match=r"all points lie within .* --unit mm applies to x, y, z and ux"):
+    with pytest.raises(lj.InputError, match=r"all points lie within .* --unit mm applies to x, y, z and to ux"):
         displacements.read_displacements(tmp_path / "u.csv", scene, 1e-5, "mm")
 
 
@@ -119,5 +119,5 @@ def test_scenes_of_two_orders_have_different_meshes(tmp_path):
     """The scenes have as many elements, but not as many nodes. NumPy ended with a traceback."""
     scenes = [_scene(tmp_path)]
     scenes.append(replace(scenes[0], mesh=lj.quadratic(scenes[0].mesh)))
-    with pytest.raises(lj.InputError, match="a field needs one mesh in all scenes"):
+    with pytest.raises(lj.InputError, match="use one mesh in all scenes"):
         field.start_of(scene_numbers.Problem(tuple(scenes), ()), "law.mu")

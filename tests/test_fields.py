@@ -180,7 +180,7 @@ def test_a_field_of_a_result_is_drawn(tmp_path, capsys):
     with h5py.File(tmp_path / "reduced.h5", "w") as out:
         out["modes"] = np.zeros((2, 4, 3))
     assert main(["plot", str(tmp_path / "reduced.h5")]) == 2
-    assert "contains a reduced model: run it" in capsys.readouterr().err
+    assert "contains a reduced model: run this model" in capsys.readouterr().err
     (tmp_path / "other.h5").write_text("no")
     assert main(["plot", str(tmp_path / "other.h5")]) == 2
     assert "is not a result of liverjax simulate" in capsys.readouterr().err

@@ -344,7 +344,7 @@ def test_better_than_pyvisco_on_the_noise_free_table_2_sweep():
     assert np.all(np.abs(ours) < 1e-6 * np.abs(theirs))
     # It also reports 'converged' for exchanged columns. For a NaN and a negative modulus, see test_rheometer.
     s = sweep()
-    with pytest.raises(InputError, match="are the two columns exchanged"):
+    with pytest.raises(InputError, match="the two columns are exchanged"):
         viscoelastic.closed_form(s._replace(storage=s.loss, loss=s.storage), 2)
 
 
@@ -461,14 +461,14 @@ def test_a_point_without_derivatives_is_not_gone_to():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"storage": [1.0, 2.0]}, "storage is of type list: give an array"),
-        ({"loss": np.ones(3)}, r"loss has shape \(3,\): give one number per frequency"),
+        ({"storage": [1.0, 2.0]}, "storage is of type list; give an array"),
+        ({"loss": np.ones(3)}, r"loss has shape \(3,\); give one number per frequency"),
         ({"loss": np.append(np.ones(15), -1.0)}, r"loss\[15\] = -1 must be above 0"),
         ({"storage": np.append(np.ones(15), np.nan)}, r"storage\[15\] = nan must be above 0"),
         ({"storage_sd": np.ones(16)}, "only one of storage_sd and loss_sd is given"),
         ({"storage_sd": np.zeros(16), "loss_sd": np.ones(16)}, r"storage_sd\[0\] = 0 must be above 0"),
         ({"angular_frequency": OMEGA[::-1]}, "angular_frequency must be in ascending order"),
-        ({"angular_frequency": OMEGA * 1j}, "angular_frequency is of type ndarray: give an array of real"),
+        ({"angular_frequency": OMEGA * 1j}, "angular_frequency is of type ndarray; give an array of real"),
     ],
 )
 def test_sweeps_made_in_python_are_refused_in_one_sentence(change, words):

@@ -227,12 +227,12 @@ SPOILED = {
     "turns": (changed("bohlin, phase", ("°", "turn")), "unit 'turn' of column Phase Angle.*use deg or rad"),
     "rpm": (changed("bohlin, phase", ("Hz", "rpm")), "unit 'rpm'.*use Hz or rad_s"),
     "percent": (changed("rheowin, bars and commas", ("in -", "in %")), r"unit '%' of column tan\(δ\)"),
-    "per second": (changed("swiss", ("f / Hz", "f / s-1")), "in s-1 may be in Hz or rad/s; name it"),
-    "per second, long": (changed("bohlin, phase", ("Hz", "1/s")), "in 1/s may be in Hz or rad/s; name it"),
-    "angular in Hz": (changed("rheowin, complex", ("rad/s", "Hz")), "is an angular frequency in Hz; name it"),
+    "per second": (changed("swiss", ("f / Hz", "f / s-1")), "in s-1 may be in Hz or rad/s; name this column"),
+    "per second, long": (changed("bohlin, phase", ("Hz", "1/s")), "in 1/s may be in Hz or rad/s; name this column"),
+    "angular in Hz": (changed("rheowin, complex", ("rad/s", "Hz")), "is an angular frequency in Hz; name this column"),
     "phase without unit": (
         HEAD.replace("_deg", "") + "1,10,0.2\n2,11,0.3\n3,12,0.3\n",
-        "column phase may be in degrees or radians; name it",
+        "column phase may be in degrees or radians; name this column",
     ),
     "no angle": ("frequency_Hz,complex_modulus_Pa\n1,2\n2,3\n", "no column for loss.*phase_angle_deg or tan_delta"),
     "no modulus": ("frequency_Hz,phase_deg\n1,2\n2,3\n", "no column for storage.*add storage_modulus_Pa"),
@@ -252,9 +252,12 @@ SPOILED = {
     "size of 0": (column("plain, radians", 1, "0"), "complex_modulus_Pa = 0 is not positive"),
     "all empty": (
         column("plain, tan_delta", 2, ""),
-        r"line 2: tan_delta is empty.*5 more points.*fill it in or remove",
+        r"line 2: tan_delta is empty.*5 more points.*fill this cell, or remove",
     ),
-    "all dashes": (column("plain, tan_delta", 1, "---"), "line 2: storage_modulus_Pa is empty.*fill it in or remove"),
+    "all dashes": (
+        column("plain, tan_delta", 1, "---"),
+        "line 2: storage_modulus_Pa is empty.*fill this cell, or remove",
+    ),
     "all nan": (column("plain, tan_delta", 0, "NaN"), "line 2: frequency_Hz is empty"),
     "infinite": (column("plain, radians", 1, "inf"), "complex_modulus_Pa = inf is not finite.*remove the line"),
     "too large": (column("plain, radians", 1, "1e200"), "beyond any measurement.*check the unit"),
@@ -269,9 +272,12 @@ SPOILED = {
     "unit in cell": (column("plain, radians", 1, "400 Pa"), "= '400 Pa' is not a number"),
     "bare decimal commas": (
         HEAD + "0,5,337,8,34,7\n1,5,337,8,34,7\n",
-        "line 2: 6 cells under 3 headings; write decimals",
+        "line 2: there are 6 cells under 3 headings; write decimals",
     ),
-    "an extra cell": (changed("plain, radians", (r"\n0.0795", "\n9,0.0795")), "line 3: 4 cells under 3 headings"),
+    "an extra cell": (
+        changed("plain, radians", (r"\n0.0795", "\n9,0.0795")),
+        "line 3: there are 4 cells under 3 headings",
+    ),
     "cut after the header": (HEAD, "line 1: there are no numbers below the header; give two"),
     "cut in the first row": (HEAD + "0.1,30", "line 2: phase_deg is empty|at least two"),
     "cut in the header": (HEAD[:20], "no column for|no header names"),
@@ -279,11 +285,11 @@ SPOILED = {
     "header in words": ("speed,hardness,lag\n" + rows("fcp"), "no header names.*add that header"),
     "columns disagree": (
         "frequency_Hz,angular_frequency_rad_s,complex_modulus_Pa,phase_deg\n1,1,5,6\n2,2,5,6\n3,3,5,6\n",
-        "columns angular_frequency_rad_s and frequency_Hz disagree; remove the wrong one",
+        "columns angular_frequency_rad_s and frequency_Hz disagree; remove the wrong column",
     ),
     "sizes disagree": (
         "f [Hz],|G*| [Pa],|G*| [kPa],δ [°]\n1,5,5,6\n2,5,5,6\n3,5,5,6\n",
-        r"disagree; remove the wrong one",
+        r"disagree; remove the wrong column",
     ),
     "one deviation": (
         "frequency_Hz,storage_modulus_Pa,storage_sd_Pa,loss_modulus_Pa\n1,4,1,2\n2,4,1,2\n3,4,1,2\n",
@@ -291,15 +297,15 @@ SPOILED = {
     ),
     "json without results": (
         json.dumps({"Rows": JSON["Results"]["Rows"]}),
-        "is JSON, but not the export of TRIOS.*give CSV",
+        "is JSON, but not an export of TRIOS.*give CSV",
     ),
     "json without angle": (json.dumps(JSON).replace("Phase angle", "Torque"), "no column for loss"),
-    "json cut": (json.dumps(JSON)[:300], "is JSON, but not the export of TRIOS"),
+    "json cut": (json.dumps(JSON)[:300], "is JSON, but not an export of TRIOS"),
     "empty": ("", "is empty: export"),
     "blank": ("\n \n\t\n", "is empty: export"),
     "prose": ("Dear colleague,\nthe data are attached.\n", "no header names.*add that header"),
     "picture": (b"\x89PNG\r\n\0\0\0\0", "not a text file: export"),
-    "broken workbook": (b"PK\x03\x04xl/" + bytes(99), "cannot be read.*save it again, or export"),
+    "broken workbook": (b"PK\x03\x04xl/" + bytes(99), "cannot be read.*save the file again, or export"),
     "creep": ("time_s,strain,stress_Pa\n0,1,2\n1,1,3\n", "no header names frequency_Hz"),
     "most points bad": (
         HEAD + "".join(f"{k},10,{5 if k < 3 else -5}\n" for k in range(1, 9)),
@@ -343,4 +349,4 @@ def test_a_file_of_another_test_names_its_command(tmp_path, capsys, text, comman
     file.write_text(text)
     assert main([str(file), "--method", "closed-form", "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and f"holds no frequency sweep: give it to `python -m fitting {command}`" in said
+    assert said.count("\n") == 1 and f"contains no frequency sweep: give it to `python -m fitting {command}`" in said

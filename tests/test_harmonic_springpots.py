@@ -112,7 +112,7 @@ def test_springpots_of_a_scene_file(tmp_path):
             "[viscosity]\nratios = [0.1]\nrelaxation_times = [0.1]\n[springpots]",
             "remove one of them",
         ),
-        ('kind = "harmonic"\nfrequencies = [40.0]', 'kind = "static"', "need kind = 'harmonic'"),
+        ('kind = "harmonic"\nfrequencies = [40.0]', 'kind = "static"', "needs kind = 'harmonic'"),
     ],
 )
 def test_springpots_that_cannot_be_are_refused(tmp_path, old, new, words):

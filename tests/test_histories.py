@@ -148,7 +148,7 @@ def test_bad_histories_are_refused(table, words):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"", "is empty: give columns time,factor or time,x,y,z"),
+        (b"", "is empty: give a CSV file with columns time,factor or time,x,y,z"),
         (b"# alone\n\n", "is empty"),
         (
             b"time;factor\n0,0;0,5\n1,0;1,0\n",
@@ -160,7 +160,7 @@ def test_bad_histories_are_refused(table, words):
         (b"\xff\xfe\x00", "is not a text file"),
         (b"time,force\n0,0\n1,1\n", "has columns"),
         (b"time,factor\n0,zero\n1,1\n", "must have finite numbers"),
-        (None, r"cannot be read \(No such file or directory\): give columns"),
+        (None, r"cannot be read \(No such file or directory\): give a CSV file with columns"),
     ],
 )
 def test_files_that_are_no_table_are_one_sentence(tmp_path, content, words):

@@ -124,7 +124,7 @@ def test_the_mark_is_called_by_the_bound_that_it_breaks():
     loss[-1] *= 4
     found = of_data(s._replace(storage=storage, loss=loss))
     told = kramers_kronig.sentences(found, s)
-    assert found.breaches[-1][2].startswith("G''") and "(G' falls): the mark of the instrument" in told[0]
+    assert found.breaches[-1][2].startswith("G''") and "(G' falls). This is the mark of the instrument" in told[0]
 
 
 def test_a_drift_is_called_one():

@@ -52,7 +52,7 @@ def test_what_is_corrected_comes_nearer_and_has_an_honest_error():
         z.append((fit.uncertainty.values - values) / fit.uncertainty.standard_errors)
         assert (
             "larger than the value that was subtracted" in better.notes[-1]
-            and "are corrected for it" in better.notes[-1]
+            and "are corrected for this error" in better.notes[-1]
         )
     assert np.mean(mended) < 0.7 * np.mean(plain)
     assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.5
@@ -72,7 +72,7 @@ def test_a_misfit_that_poses_as_inertia_is_not_corrected():
     s = Sweep(OMEGA, G.real, G.imag, inertia=SHARE)
     fit, same = corrected(s)
     assert same is s and fit.details["instrument"]["moves_with_the_band"]
-    assert "poses as inertia, so this error is not corrected" in fit.warnings[-1]
+    assert "poses as inertia, and this error is not corrected" in fit.warnings[-1]
 
 
 FRICTION = 0.4 * OMEGA  # [Pa] for one standard deviation: 40 Pa at the end, half of the loss modulus
@@ -265,4 +265,4 @@ def test_the_command_widens_the_errors_by_the_gap(tmp_path, capsys):
     assert errors[1]["ratios"] == pytest.approx(errors[0]["ratios"])
     for wrong in ("0.005", "-1"):
         assert main([*plain, "--gap-error", wrong, "--out", str(tmp_path)]) == 2
-        assert "is the gap's standard deviation in metres" in capsys.readouterr().err
+        assert "must be in metres, and below --height" in capsys.readouterr().err

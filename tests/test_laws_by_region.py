@@ -260,7 +260,7 @@ def test_scene_files_name_a_law_for_a_region():
         ({"region": [{"where": {"z_min": 0.01}, "law": [{"mu": 1.0}]}]}, "region.0: law needs name"),
         (
             {"region": [{"where": {"z_min": 0.01}, "law": OGDEN}, {"where": {"z_min": 0.0}, "law": {"mu": 1.0}}]},
-            "region.1 changes the law of elements that have a separate law from region.0",
+            "region.1 changes parameters of elements whose whole law is given by region.0",
         ),
         (
             {
@@ -339,7 +339,7 @@ def test_volumes_of_several_kinds_are_not_mixed():
     """
     own = {"name": "neo_hookean", "mu": 800.0, "bulk": 3000.0, "volumetric": "log"}
     region = {"region": [{"where": {"z_min": 0.01}, "law": own}]}
-    with pytest.raises(lj.InputError, match="one kind of volumetric energy in all laws"):
+    with pytest.raises(lj.InputError, match="the same kind of volumetric energy in all laws"):
         scene_from(CONTENT | region | {"solve": {"volumetric": "mixed"}})
     mesh = {"mesh": CONTENT["mesh"] | {"order": 2}}
     scene = scene_from(CONTENT | region | mesh | {"solve": {"volumetric": "auto"}})

@@ -99,7 +99,10 @@ def test_factors_of_the_moduli_are_told_where_only_frequencies_are_shifted(verti
     """These factors changed log a by seven of its standard errors, although the curves deviated by 2.4 %."""
     data = temperature_sweeps.AtTemperatures(sweeps(0.01, 2, vertical), TEMPERATURES, None)
     notes = master_curve.master_curve(data, None).sweep.notes
-    assert any("the moduli have factors too" in n and "give --vertical" in n for n in notes) == vertical
+    assert (
+        any("the moduli also change with the temperature by factors" in n and "give --vertical" in n for n in notes)
+        == vertical
+    )
     assert not any("factors too" in n for n in master_curve.master_curve(data, None, vertical=True).sweep.notes)
 
 
@@ -170,7 +173,7 @@ def test_given_factors_and_vertical_ones_do_not_go_together(tmp_path):
     write_rows(tmp_path / "a.csv", factors=True)
     data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
     (note,) = (n for n in master_curve.master_curve(data, None, vertical=True).sweep.notes if "--vertical" in n)
-    assert "its column shift_factor" in note
+    assert "the column shift_factor" in note
     assert not any("--vertical finds" in n for n in master_curve.master_curve(data, None).sweep.notes)
 
 

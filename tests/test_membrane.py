@@ -245,7 +245,7 @@ def test_a_membrane_of_a_scene_file():
             },
             "membrane.0.law has directions",
         ),
-        ({"thickness": 5e-5, "law": LAW, "where": {"z_min": 0.1, "x_min": 0.1}}, "no boundary triangle"),
+        ({"thickness": 5e-5, "law": LAW, "where": {"z_min": 0.1, "x_min": 0.1}}, "no triangle of the boundary"),
     ],
 )
 def test_bad_membranes_are_refused(table, words):

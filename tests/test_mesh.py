@@ -144,13 +144,13 @@ def test_refusals(tmp_path):
     _refused("largest number 7, number of nodes", lambda: lj.check_mesh(lj.tet_mesh(points, [[0, 1, 2, 7]])))
     _refused("no tetrahedron", lambda: lj.check_mesh(lj.tet_mesh(np.vstack([points, [5, 5, 5]]), tets)))
     _refused("finite coordinates", lambda: lj.check_mesh(lj.tet_mesh(points * np.nan, tets)))
-    _refused("no such file", lambda: lj.read_mesh(tmp_path / "none.vtu"))
+    _refused("does not exist", lambda: lj.read_mesh(tmp_path / "none.vtu"))
     _refused("is a folder", lambda: lj.read_mesh(tmp_path))
     _refused("unit = 'inch'", lambda: lj.read_mesh(tmp_path / "none.vtu", unit="inch"))
     (tmp_path / "junk.vtu").write_text("not a mesh")
-    _refused("cannot read it", lambda: lj.read_mesh(tmp_path / "junk.vtu"))
+    _refused("cannot be read by meshio", lambda: lj.read_mesh(tmp_path / "junk.vtu"))
     (tmp_path / "junk.xyz").write_text("not a mesh")
-    _refused("cannot read it", lambda: lj.read_mesh(tmp_path / "junk.xyz"))
+    _refused("cannot be read by meshio", lambda: lj.read_mesh(tmp_path / "junk.xyz"))
     _refused("radius = -1", lambda: lj.shapes.cylinder(-1.0, 1.0, 0.1))
     _refused("cells", lambda: lj.shapes.box((1.0, 1.0, 1.0), (1, 0, 1)))
     import meshio
@@ -170,7 +170,7 @@ def test_copies_other_cells_and_millimetres_are_told(tmp_path):
     with pytest.raises(lj.InputError, match="contains hexahedron in addition to linear tetrahedra"):
         lj.read_mesh(tmp_path / "mixed.vtk")
     meshio.Mesh(280 * points, [("tetra", tets), ("triangle", tets[:1, :3])]).write(tmp_path / "large.vtk")
-    with pytest.warns(UserWarning, match="280 m long: if its coordinates are in millimetres, write unit = 'mm'"):
+    with pytest.warns(UserWarning, match="280 m long: if the coordinates are in millimetres, write unit = 'mm'"):
         lj.read_mesh(tmp_path / "large.vtk")
     assert np.isclose(float(lj.read_mesh(tmp_path / "large.vtk", "mm").volumes.sum()), 0.28**3)
 
@@ -209,7 +209,7 @@ FOREIGN = {
         "VTK polygons.*fill the surface with tetrahedra",
     ),
     "surface.vtp": ('<?xml version="1.0"?>\n<VTKFile type="PolyData" version="0.1"/>\n', "VTK polygons"),
-    "junk.msh": ("not a mesh\n", r"its content is not in the format of \.msh files"),
+    "junk.msh": ("not a mesh\n", r"the content is not in the format of \.msh files"),
 }
 
 
@@ -396,7 +396,7 @@ def test_sets_of_triangles_in_other_files_and_names_that_collide(tmp_path):
         read = lj.read_mesh(tmp_path / "m.vtu")
         assert sorted(np.asarray(read.node_sets[name]).tolist()) == below.tolist() and len(read.node_sets["b"]) == 3
     meshio.Mesh(np.asarray(mesh.points), blocks, own, {"set:b": mask}).write(tmp_path / "m.vtu")
-    with pytest.raises(lj.InputError, match="'b' is a set of 3 nodes and a group of triangles with 9 nodes: rename"):
+    with pytest.raises(lj.InputError, match="'b' is a set of 3 nodes and a group of triangles with 9 nodes; rename"):
         lj.read_mesh(tmp_path / "m.vtu")
     sets = {"sole": [np.arange(8), []], "half": [[], np.arange(24)]}
     meshio.Mesh(np.asarray(mesh.points), blocks, cell_sets=sets).write(tmp_path / "m.inp")

@@ -339,8 +339,8 @@ def test_the_command_writes_the_model(model, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--model", "spectrum", "--modes", "3"], "--modes 3 works with --model prony only: remove it"),
-        (["--model", "auto", "--profile"], "--profile works with --model prony only"),
+        (["--model", "spectrum", "--modes", "3"], "--modes 3 works only with --model prony: remove this option"),
+        (["--model", "auto", "--profile"], "--profile works only with --model prony"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(options, sentence, tmp_path, capsys):
@@ -363,7 +363,7 @@ def test_a_sweep_of_no_maxwell_solid_is_refused_for_every_model(tmp_path, capsys
     file = tmp_path / "sweep.csv"
     file.write_text("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n0.1,30,300\n1,60,400\n10,90,500\n")
     assert main([str(file), "--model", "auto", "--out", str(tmp_path / "fit")]) == 2
-    assert "are the two columns exchanged" in capsys.readouterr().err
+    assert "the two columns are exchanged" in capsys.readouterr().err
     with pytest.raises(InputError):
         generalised_maxwell.refuse_impossible(read_sweep(file))
 

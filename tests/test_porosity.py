@@ -322,7 +322,7 @@ def test_a_drained_layer_thinner_than_the_elements_is_told():
     scene = column(6, 3, 1e-9 * DIFFUSION_TIME)
     result = lj.simulate(scene)
     (said,) = [s for s in cautions_of_run(scene, result) if "the fluid leaves a layer" in s]
-    assert f"the elements there are {HEIGHT / 6:.2g} m thick" in said and "the mesh error shows by how much" in said
+    assert f"the elements there are {HEIGHT / 6:.2g} m thick" in said and "the mesh error shows how much" in said
     moves = np.asarray(result.positions[-1] - scene.mesh.points)[:, 2].min()
     undrained = LOAD * HEIGHT / (400.0 + 4 / 3 * SHEAR + 2200.0)
     assert 1.04 < moves / undrained < 1.2  # the effect that the warning is about

@@ -153,5 +153,5 @@ def test_scenes_without_porosity_refuse_it():
     with pytest.raises(lj.InputError, match=r"needs \[porosity\] in the scene"):
         check_region_porosity(None, region, "region.0")
     several = lj.Region(elements=jnp.array([0]), porosity={"permeability": jnp.array([1e-9, 1e-9])})
-    with pytest.raises(lj.InputError, match="has 2 numbers: give one"):
+    with pytest.raises(lj.InputError, match="has 2 numbers; give one"):
         lj.simulate(column(region=(several,)))

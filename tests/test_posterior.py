@@ -206,7 +206,11 @@ def test_a_prior_without_its_slopes_is_found_out(monkeypatch):
 def test_the_command_writes_draws_and_their_summary(tmp_path, capsys):
     assert main([str(LION), "--method", "closed-form", "--modes", "1", "--samples", "200", "--out", str(tmp_path)]) == 0
     content = json.loads((tmp_path / "fit.json").read_text())["posterior"]
-    assert content["chains"] == 4 and content["draws_per_chain"] == 200 and "ratios uniform" in content["prior"]
+    assert (
+        content["chains"] == 4
+        and content["draws_per_chain"] == 200
+        and "are uniform on the simplex" in content["prior"]
+    )
     rows = np.genfromtxt(tmp_path / "posterior.csv", delimiter=",", names=True, deletechars="")
     assert rows.shape == (800,) and rows.dtype.names == ("chain", *content["numbers"])
     fit = json.loads((tmp_path / "fit.json").read_text())
@@ -237,7 +241,7 @@ def test_a_springpot_has_the_errors_of_its_curvature():
     fit = types.SimpleNamespace(kind=viscoelastic.Kind(model.name, values=values), solution=found, details={})
     draws = posterior.of_sweep(fit, sweep, 500)
     flat = draws.draws.reshape(-1, 2)
-    assert draws.names == p.names and "exponents uniform" in draws.prior
+    assert draws.names == p.names and "exponents are uniform" in draws.prior
     assert np.all(np.abs(flat.mean(axis=0) - p.values) < 0.1 * p.standard_errors)
     # The size of 22 errors is unknown. Student's t with 20 degrees of freedom is 5 % wider.
     assert np.allclose(flat.std(axis=0), p.standard_errors * np.sqrt(20 / 18), rtol=0.1)
@@ -288,8 +292,8 @@ def test_the_posterior_through_the_simulation_is_checked_by_simulating(tmp_path)
     ("arguments", "sentence"),
     [
         (["--samples", "5"], "--samples 5 is out of range: give 100 to 100000"),
-        (["--samples", "1000", "--model", "spectrum"], "remove it for --model spectrum"),
-        ([str(PORCINE), "--samples", "1000"], "is for one sample only, and 2 files are given"),
+        (["--samples", "1000", "--model", "spectrum"], "remove --samples for --model spectrum"),
+        ([str(PORCINE), "--samples", "1000"], "works only for one sample, and 2 files are given"),
     ],
 )
 def test_what_cannot_be_sampled_is_refused(arguments, sentence, tmp_path, capsys):

@@ -163,7 +163,7 @@ def test_scene_files_press_an_obstacle():
         ({"force": [0, 0, -1], "by": [0, 0, 1]}, "obstacle.0 has force together with by: remove one"),
         ({"force": [0, 0, -1], "friction": 0.5}, "obstacle.0 has force together with friction: remove one"),
         ({"history": [[0, 0, 0, 1]]}, "history"),
-        ({"history": [[0, 1], [1, -0.5]]}, "factor -0.5, but the force can only press"),
+        ({"history": [[0, 1], [1, -0.5]]}, "factor -0.5, but the force of an obstacle can only press"),
     ],
 )
 def test_obstacles_that_cannot_be_pressed_get_one_sentence(change, words):
@@ -185,7 +185,7 @@ def test_a_ball_between_the_contact_points_is_told():
     }
     scene = scene_from(table)
     said = cautions_of_run(scene, lj.simulate(scene).check())
-    assert any("obstacle.0 is 0.0036 m in the body between the points" in sentence for sentence in said)
+    assert any("obstacle.0 penetrates the body by 0.0036 m between the points" in sentence for sentence in said)
     small = {"shape": "sphere", "radius": 0.006, "position": [0.0333, 0.0333, 0.106], "force": [0, 0, -0.02]}
     with pytest.raises(lj.InputError, match="passes between the points at which contact is tested"):
         scene_from(table | {"obstacle": [small]})

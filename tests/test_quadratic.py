@@ -216,7 +216,7 @@ def test_a_curved_file_is_made_straight_and_said(tmp_path):
     data = meshio.read(tmp_path / "body.vtu")
     data.points[-1] += [0, 0, 1e-4]
     data.write(tmp_path / "curved.vtu")
-    with pytest.warns(UserWarning, match="1 middles of edges lie up to 0.0001 m off the straight edge"):
+    with pytest.warns(UserWarning, match="1 midside nodes lie up to 0.0001 m off their straight edges"):
         found = lj.read_mesh(tmp_path / "curved.vtu")
     assert np.allclose(found.points, MESH.points, atol=1e-15)
 

@@ -349,7 +349,7 @@ def test_errors_are_not_stated_for_numbers_that_no_row_has_shown(trained, tmp_pa
     own = lj.with_parameters(scene, inside)
     for changed, sentence in (
         ({"integrator": "euler"}, "solve.integrator = euler, but the reduced model was trained with newmark"),
-        ({"steps": 2 * scene.solve.steps}, "solve.dt x solve.steps = .* so its error is unknown"),
+        ({"steps": 2 * scene.solve.steps}, "solve.dt x solve.steps = .* so the error of the model is unknown"),
     ):
         with pytest.raises(lj.InputError, match=sentence):
             lj.stated_error(model, replace(own, solve=replace(own.solve, **changed)), None)
@@ -393,7 +393,7 @@ def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
     bare = replace(model, correction=None)
     with pytest.raises(lj.InputError, match="has no correction"):
         lj.stated_error(bare, scene, lj.simulate_reduced(bare, scene))
-    with pytest.raises(lj.InputError, match="runs = 3 must be 6 to 9, the number of rows"):
+    with pytest.raises(lj.InputError, match=r"runs = 3 must be from 6 to 9 \(the number of rows\)"):
         lj.reduce_scene(scene, {"law.mu": np.linspace(700, 900, 9)}, runs=3)
     with pytest.raises(lj.InputError, match=r"was made for scene .* run python -m liverjax reduce"):
         lj.simulate_reduced(again, _bar((1, 1, 1)))

@@ -41,7 +41,10 @@ def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, ca
     (tmp_path / "rows.csv").write_text("law.mu,body.gravity.2\n700,-1.2\n900,-0.8\n800,-0.4\n800,-1.0\n")
     model = ["--out", str(tmp_path / "model.h5")]
     assert main(["reduce", str(tmp_path / "scene.toml"), str(tmp_path / "rows.csv"), *model, "--modes", "3"]) == 0
-    assert "3 modes" in (said := capsys.readouterr().out) and "no correction: too few training runs" in said
+    assert (
+        "3 modes" in (said := capsys.readouterr().out)
+        and "no correction, because there were too few training runs" in said
+    )
     found = {}
     for name, lines in (("full", ""), ("used", 'reduced = "model.h5"'), ("refused", REFUSED)):
         (tmp_path / f"{name}.toml").write_text(SCENE + lines)
@@ -78,7 +81,10 @@ def test_one_row_makes_a_model_without_correction(tmp_path, capsys):
     (tmp_path / "row.csv").write_text("law.mu\n800\n")
     arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path / "model.h5")]
     assert main(["reduce", *arguments]) == 0
-    assert "1 modes" in (said := capsys.readouterr().out) and "no correction: too few training runs" in said
+    assert (
+        "1 modes" in (said := capsys.readouterr().out)
+        and "no correction, because there were too few training runs" in said
+    )
     assert lj.load_reduced(tmp_path / "model.h5").correction is None
 
 

@@ -195,7 +195,7 @@ def test_bad_files_get_one_sentence(tmp_path, name):
 
 
 def test_missing_file_and_folder(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="does not exist"):
         read_sweep(tmp_path / "none.csv")
     with pytest.raises(InputError, match="is a folder"):
         read_sweep(tmp_path)

@@ -21,12 +21,12 @@ def test_moduli_beside_columns_of_a_dma_may_be_those_of_tension(tmp_path):
     ):
         s = read_sweep(_write(tmp_path, head.format(own, own, beside) + rows))
         assert np.allclose(s.storage, [9000, 10000])
-        told[own + beside] = [n for n in s.notes if "if these are moduli E, three times as large" in n]
+        told[own + beside] = [n for n in s.notes if "if the numbers are moduli E, three times as large" in n]
     assert [len(said) for said in told.values()] == [1, 1, 0, 0, 0]
 
 
 def test_viscosities_are_named_as_not_read(tmp_path):
-    with pytest.raises(InputError, match=r"viscosities are not read: \|G\*\| is omega \|eta\*\|"):
+    with pytest.raises(InputError, match=r"viscosities are not read \(convert them to \|G\*\| = omega \|eta\*\|"):
         read_sweep(_write(tmp_path, "frequency_Hz,complex viscosity (Pa.s),tan(delta)\n1,9,0.1\n2,8,0.1\n"))
 
 
@@ -110,7 +110,9 @@ def test_one_modulus_of_tension_makes_the_other_one_too(tmp_path):
 def test_degrees_that_look_like_radians_are_told(tmp_path):
     rows = "".join(f"{f},1000,{a}\n" for f, a in ((0.1, 0.2), (1.0, 0.3), (10.0, 0.4)))
     (tmp_path / "s.csv").write_text("frequency_Hz,complex_modulus_Pa,phase_angle_deg\n" + rows)
-    assert any("if these are radians, name it phase_rad" in n for n in read_sweep(tmp_path / "s.csv").notes)
+    assert any(
+        "if the numbers are radians, name the column phase_rad" in n for n in read_sweep(tmp_path / "s.csv").notes
+    )
 
 
 def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):

@@ -83,7 +83,7 @@ def test_trios_json(tmp_path):
     older = TRIOS_JSON | {"Results": TRIOS_JSON["Results"]["Processed"]}
     assert len(read_sweep(_write(tmp_path, json.dumps(older), "older.json")).storage) == 3
     for text in ('{"Results": []}', '{"a": 1}', "{", '{"Results": {"ColumnHeaders": {}, "Rows": [1]}}'):
-        with pytest.raises(InputError, match="is JSON, but not the export of TRIOS"):
+        with pytest.raises(InputError, match="is JSON, but not an export of TRIOS"):
             read_sweep(_write(tmp_path, text, "other.json"))
 
 

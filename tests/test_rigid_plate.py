@@ -200,7 +200,7 @@ def test_a_factorisation_is_refused(rig):
         physics=(_plate(rig),),
         solve=lj.Solve(linear_solver="direct"),
     )
-    with pytest.raises(lj.InputError, match="cannot be used with a rigid plate: use cg"):
+    with pytest.raises(lj.InputError, match="cannot be used with a rigid plate: use linear_solver = 'cg'"):
         lj.simulate(scene)
 
 

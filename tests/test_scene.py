@@ -189,14 +189,20 @@ REFUSED = {
     "steps": (lambda c: c["solve"].update(steps=0), "whole number above 0"),
     "kind": (lambda c: c["solve"].update(kind="quasistatic"), "use static or dynamic"),
     "loose body": (lambda c: (c.pop("fixed"), c.pop("displaced")), "do not prevent every rigid motion of the body"),
-    "no triangle": (lambda c: c["traction"][0].update(where={"y_max": 0.0, "x_max": 0.0}), "no boundary triangle"),
+    "no triangle": (
+        lambda c: c["traction"][0].update(where={"y_max": 0.0, "x_max": 0.0}),
+        "no triangle of the boundary",
+    ),
     "steps without end": (lambda c: c["solve"].update(steps=10**24), "solve.steps must be at most 2147483647"),
     "hundreds of digits": (lambda c: c["law"][0].update(mu=10**400), "hundreds of digits"),
     "text in a history": (
         lambda c: c["displaced"][0].update(history=[["0", "0", "0", "0"]]),
         "is not a table of numbers",
     ),
-    "an empty obstacle": (lambda c: c.update(obstacle=[{}]), "obstacle.0 has only where or set: give shape, position"),
+    "an empty obstacle": (
+        lambda c: c.update(obstacle=[{}]),
+        "obstacle.0 contains only where or set: also give shape, position",
+    ),
     "history is missing": (lambda c: c["displaced"][0].update(history="none.csv"), "cannot be read"),
 }
 
@@ -233,7 +239,7 @@ def test_a_piece_that_hangs_on_doubled_nodes_is_told_so():
     low = np.flatnonzero(np.asarray(both.points)[:, 0] == 0)
     held = (lj.Fixed(nodes=jnp.asarray(low)),)
     scene = lj.Scene(mesh=both, law=lj.laws.NeoHookean(mu=1.0, bulk=10.0), fixed=held)
-    with pytest.raises(lj.InputError, match="merge the 4 nodes that coincide with another node, if"):
+    with pytest.raises(lj.InputError, match="merge the 4 nodes that coincide with another node "):
         lj.check_scene(scene)
 
 
@@ -269,7 +275,7 @@ def test_scenes_made_in_python_are_refused_alike():
         ({"solve": lj.Solve(precision="single")}, "precision = 'single' is not known"),
         ({"traction": (lj.Traction(triangles=triangles),)}, "either value"),
         ({"traction": (lj.Traction(triangles=triangles, pressure=jnp.ones(3)),)}, "shape"),
-        ({"displaced": (lj.Displaced(nodes=jnp.array([7])),)}, "either by"),
+        ({"displaced": (lj.Displaced(nodes=jnp.array([7])),)}, "either 'by'"),
     ):
         with pytest.raises(lj.InputError, match=re.escape(sentence)):
             lj.simulate(replace(scene, **change))
@@ -308,10 +314,10 @@ def test_density_is_one_number_or_one_a_node():
     for body, sentence in (
         (
             of(np.full(mesh.number_of_elements, 1000.0)),
-            "body density has shape (18,): give one number or one per node (16,)",
+            "[body] density has shape (18,): give one number or one per node (16,)",
         ),
-        (of(np.full((len(share), 1), 1000.0)), "body density has shape (16, 1)"),
-        (of(1000.0, (0.0, -9.81)), "body gravity has shape (2,): give three numbers in m/s^2"),
+        (of(np.full((len(share), 1), 1000.0)), "[body] density has shape (16, 1)"),
+        (of(1000.0, (0.0, -9.81)), "[body] gravity has shape (2,): give three numbers in m/s^2"),
     ):
         for refused in (lj.simulate, lj.check_scene):
             with pytest.raises(lj.InputError, match=re.escape(sentence)):

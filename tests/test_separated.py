@@ -125,7 +125,7 @@ def test_what_cannot_be_separated_gets_a_sentence(scene, ranges, more, words):
 def test_scenes_with_time_and_values_outside_are_refused(scene, model):
     with pytest.raises(lj.InputError, match="static solution"):
         lj.separate(replace(scene, solve=lj.Solve(kind="dynamic", dt=0.1)), RANGES)
-    with pytest.raises(lj.InputError, match="outside of 600 to 900"):
+    with pytest.raises(lj.InputError, match="outside of the training range 600 to 900"):
         lj.separated_displacement(model, {"law.mu": 500.0, "body.gravity.2": -1.0})
     with pytest.raises(lj.InputError, match=r"add or remove body\.gravity\.2"):
         lj.separated_displacement(model, {"law.mu": 700.0})

@@ -284,7 +284,10 @@ TOP, LIFT = {"where": {"z_min": 0.1}}, [0, 0, 0.01]
 IDLE = {
     "newmark at rest": ({"solve": {"integrator": "newmark"}}, "'newmark' needs kind = 'dynamic', but kind = 'static'"),
     "reduced": ({"solve": {"reduced_tolerance": 0.1}}, "reduced_tolerance needs a reduced model"),
-    "obstacle": ({"obstacle": [PLANE | {"history": VECTORS}], "solve": {"dt": 0.1}}, "has by and a history of displ"),
+    "obstacle": (
+        {"obstacle": [PLANE | {"history": VECTORS}], "solve": {"dt": 0.1}},
+        "has both 'by' and a history of displ",
+    ),
     "gravity": (
         {"body": {"density": 1.0, "gravity": [0, 0, 1], "history": VECTORS}, "solve": {"dt": 0.1}},
         "gravity and a history of gravity",
@@ -336,7 +339,7 @@ def test_settings_that_would_change_nothing_are_refused(case, tmp_path):
     ],
 )
 def test_meshes_that_no_memory_holds_are_refused(mesh):
-    with pytest.raises(lj.InputError, match=r"would give about .* tetrahedra"):
+    with pytest.raises(lj.InputError, match=r"would have about .* tetrahedra"):
         scene_from(CUBE | {"mesh": mesh})
 
 

@@ -37,7 +37,7 @@ def test_a_slow_mode_hides_nothing(tmp_path):
 def test_a_power_law_has_no_bound(tmp_path):
     """The stress t^-0.2 grows without bound towards the load. G0 of the modes had a stated error of 3 %."""
     fit = fitted(tmp_path, lambda t: 800 * t**-0.2 * noise(len(t)))
-    assert any("is unknown how much relaxed before 0.01 s" in w for w in fit.warnings)
+    assert any("is unknown which part relaxed before 0.01 s" in w for w in fit.warnings)
 
 
 def test_what_a_stretched_exponential_lost_before_its_record_is_in_the_total_error(tmp_path):

@@ -132,7 +132,7 @@ def test_a_sweep_and_a_relaxation_test_together(tmp_path, capsys):
 def test_what_springpots_do_not_have_is_refused(more, tmp_path, capsys):
     (tmp_path / "a.csv").write_text("time_s,relaxation_modulus_Pa\n1,2\n2,1.5\n3,1.2\n4,1.1\n")
     assert main(["relaxation", str(tmp_path / "a.csv"), "--model", "auto", *more]) == 2
-    assert f"{more[0]} works with --model prony only" in capsys.readouterr().err
+    assert f"{more[0]} works only with --model prony" in capsys.readouterr().err
 
 
 RECORDS = [

@@ -262,7 +262,7 @@ def test_supports_of_a_scene_file():
     [
         (
             {"where": {"z_max": 0.0}},
-            "support.0 has only where or set: give normal, tangential, stiffness, history or sliding",
+            "support.0 contains only where or set: also give normal, tangential, stiffness, history or sliding",
         ),
         ({"where": {"z_max": 0.0}, "normal": -1.0}, "support.0.normal = -1.0 must be at least 0 Pa/m"),
         ({"where": {"z_max": 0.0}, "normal": "soft"}, "support.0.normal = 'soft' is not a number"),

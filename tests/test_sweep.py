@@ -208,7 +208,7 @@ def test_failed_rows_are_listed_and_run_again_alone(files, capsys):
     (files / "rows.csv").write_text("law.mu,body.density\n700,1000\n700,1e12\n720,1000\n")
     assert main(command(files)) == 1
     said = capsys.readouterr()
-    assert "1 failed" in said.out and "failed: row 2: " in said.err and "again: --rows 2 --out" in said.err
+    assert "1 failed" in said.out and "failed: row 2: " in said.err and "again, use --rows 2 --out" in said.err
     assert main(command(files, "--rows", "3", "--out", str(files / "again.h5"))) == 0
     with h5py.File(files / "rows.h5") as all_rows, h5py.File(files / "again.h5") as again:
         assert again["row"][:].tolist() == [3] and np.allclose(again["parameters"][0], all_rows["parameters"][2])
@@ -276,7 +276,7 @@ pre_tension = 0.05
     "column, value, words",
     [
         ("obstacle.0.axis.2", -2.0, "of length 1"),
-        ("obstacle.0.position.2", 0.05, "begins 0.05 m inside the body"),
+        ("obstacle.0.position.2", 0.05, "the obstacle is 0.05 m inside the body"),
         ("vessel.0.wall", 0.005, "thicker than the radius"),
         ("obstacle.0.radius", 0.02, "has no effect on a plane"),
         # A fibre is at least 5 cm long. At 20 N/m times that, its rest length is zero.
@@ -406,7 +406,7 @@ def test_writes_that_fail_keep_what_was_computed(processor, files):
 
     run = subprocess.run(call, capture_output=True, text=True, timeout=300, preexec_fn=limited, env=small)
     assert run.returncode == 1 and len(run.stderr.splitlines()) == 1
-    assert "File too large: finished chunks are kept, continue with --resume" in run.stderr
+    assert "(File too large). Finished chunks are kept: continue with --resume" in run.stderr
     assert sorted(files.glob("rows.h5.parts/part_*")) == finished and len(finished) == 2
     assert main(command(files, "--resume")) == 0
 
@@ -414,7 +414,7 @@ def test_writes_that_fail_keep_what_was_computed(processor, files):
 def test_no_room_for_the_joined_file_keeps_the_parts(files, monkeypatch, capsys):
     monkeypatch.setattr(sweep.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     assert main(command(files)) == 1
-    assert "No space left on device: finished chunks are kept, continue with --resume" in capsys.readouterr().err
+    assert "(No space left on device). Finished chunks are kept: continue with --resume" in capsys.readouterr().err
     monkeypatch.undo()
     assert main(command(files, "--resume")) == 0
 

@@ -141,7 +141,9 @@ def test_a_strain_in_percent_without_a_unit_is_told(tmp_path):
     rows = "".join(f"{k},5,{90 - k}\n" for k in range(9))
     (tmp_path / "t.csv").write_text("time_s,strain,stress_Pa\n" + rows)
     _, notes = read_columns(tmp_path / "t.csv")
-    assert any("the strain reaches 500 %: if it is in percent, name it strain_%" in note for note in notes)
+    assert any(
+        "the strain reaches 500 %: if the strain is in percent, name the column strain_%" in note for note in notes
+    )
     (tmp_path / "t.csv").write_text("time_s,strain_%,stress_Pa\n" + rows)
     columns, notes = read_columns(tmp_path / "t.csv")
     assert columns["strain"][0] == 0.05 and not any("percent" in note for note in notes)

@@ -78,12 +78,12 @@ BAD = {
     "stamps": (
         "time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n1,6\n2,5\n3,5\n",
         [],
-        "two rows have the time 1 s: write times with more digits, or replace both rows by their mean",
+        "two rows have the time 1 s; write times with more digits, or replace both rows by their mean",
     ),
     "backwards": (
         "time_s,relaxation_modulus_Pa\n3,5\n2,6\n1,7\n0.5,8\n",
         [],
-        "the rows run backwards, from 3 s to 0.5 s",
+        "the times decrease from 3 s to 0.5 s",
     ),
     "negative": ("time_s,strain,stress_Pa\n0,1,900\n1,1,-700\n2,1,-6\n3,1,-5\n4,1,-5\n", [], "correct the signs"),
     "no size": ("time_s,angle_rad,torque_N.m\n0,1,9\n1,1,7\n2,1,6\n3,1,6\n", [], "give --radius and --height"),
@@ -120,7 +120,7 @@ def test_unusable_files_get_one_sentence(name, tmp_path, capsys):
 
 
 def test_missing_files_and_damage_never_leave_a_traceback(tmp_path):
-    with pytest.raises(InputError, match="no such file; give the CSV file of a relaxation or creep test"):
+    with pytest.raises(InputError, match="does not exist; give the CSV file of a relaxation or creep test"):
         read_time_test(tmp_path / "none.csv", "creep")
     rng = np.random.default_rng(0)
     good = ("time_s,strain,stress_Pa\n" + "".join(f"{t:.4g},0.01,{9 / t:.5g}\n" for t in T)).encode()
@@ -185,7 +185,7 @@ def test_empty_cells_and_thousands_of_records(text, tmp_path):
     (tmp_path / "a.csv").write_text(text)
     found = read_time_test(tmp_path / "a.csv", "relaxation")
     assert found.answer[found.used].tolist() == [1200.5, 1100.25, 987.5, 950]
-    assert any("1 of 5 rows are ignored: a cell in them is empty" in n for n in found.notes)
+    assert any("1 of 5 rows are ignored, because a cell is empty" in n for n in found.notes)
 
 
 def test_an_offset_that_one_row_shows_is_told(tmp_path):
@@ -327,7 +327,7 @@ def test_a_modulus_that_rises_and_a_compliance_that_falls_are_refused_with_the_c
     assert read_time_test(file, "relaxation", ramp=0.5).used.sum() == 60
     assert read_time_test(file, "relaxation", start=0.5).used.sum() > 20
     falling = write(file, head, t, 600 + 400 * np.exp(-t / 3))
-    assert any("is --ramp right?" in note for note in read_time_test(falling, "relaxation", ramp=2.0).notes)
+    assert any("check --ramp" in note for note in read_time_test(falling, "relaxation", ramp=2.0).notes)
     back = 1e-3 * np.where(t < 20, 1 - 0.4 * np.exp(-t / 3), 0.4 * np.exp(-(t - 20) / 3))
     with pytest.raises(InputError, match=r"the compliance falls from 1.* two columns"):
         read_time_test(write(file, "time_s,creep_compliance_1/Pa", t, back), "creep")

@@ -393,4 +393,4 @@ def test_one_measurement_does_not_count_twice(tmp_path, capsys):
     for arguments in (["a.csv", "--with", "b.csv"], ["a.csv", "b.csv"]):
         paths = [str(tmp_path / a) if a.endswith("csv") else a for a in arguments]
         assert main([*paths, "--out", str(tmp_path / "o")]) == 2
-        assert "it is the same measurement as" in capsys.readouterr().err
+        assert "is the same measurement as" in capsys.readouterr().err

@@ -231,7 +231,7 @@ def test_inertia_is_taken_off_and_put_back():
     back = sample_inertia.put_back(own, 1060.0, 0.008)
     np.testing.assert_allclose(back.storage + 1j * back.loss, seen, rtol=1e-9)
     # No modulus of a passive material has such a small loss if inertia dominates.
-    with pytest.raises(lj.InputError, match="the inertia of the sample is larger than its modulus"):
+    with pytest.raises(lj.InputError, match="the inertia of the sample is larger than the modulus"):
         sample_inertia.taken_off(Sweep(omega, 0 * omega + 1.0, 0 * omega - 50.0), 1060.0, 0.008)
 
 

@@ -164,5 +164,5 @@ def test_scenes_without_viscosity_and_reduced_models_refuse_it():
     short = lj.Region(elements=jnp.array([0]), viscosity={"ratios": jnp.array([0.2])})
     with pytest.raises(lj.InputError, match="1 numbers, but the scene has 2 modes"):  # from Python, before compilation
         lj.simulate(block(region=(short,)))
-    with pytest.raises(lj.InputError, match="a reduced model has one viscosity"):
+    with pytest.raises(lj.InputError, match="a reduced model can have only one viscosity"):
         lj.reduce_scene(block(region=(region,)), {"law.mu": [800.0]})

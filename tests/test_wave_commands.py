@@ -151,7 +151,7 @@ def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
         file = tmp_path / "progress.h5"
         write(file)
         with pytest.raises(
-            InputError, match=r"belongs to another fit|is damaged, or from another program: remove --resume"
+            InputError, match=r"belongs to another fit|is damaged, or was written by another program: remove --resume"
         ):
             stiffness_map._first_or_resumed(course, file)
 
@@ -227,7 +227,7 @@ def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
         (["--stride", "0"], "--stride 0"),
         (["--noise", "-1"], "--noise -1 must be above 0"),
         (["--frequencies", "0"], "must be above 0 Hz"),
-        (["--mask", "none.npz"], "no such file"),
+        (["--mask", "none.npz"], "does not exist"),
         (["--stride", "3"], "at least 3 are needed along"),
     ],
 )

@@ -317,7 +317,7 @@ def test_a_region_that_says_nothing_is_told(monkeypatch):
     found = elastography.regions_of(own)
     assert np.all(np.isfinite(found.parts.modulus))
     told = cautions.cautions_of_elastography(own, found, None)
-    assert any("region 9: its standard error" in one for one in told) and not any("region 2" in one for one in told)
+    assert any("region 9: the standard error" in one for one in told) and not any("region 2" in one for one in told)
     monkeypatch.setattr(cautions, "LEAST_RADIUS", 100.0)
     told = cautions.cautions_of_elastography(own, found, None)
     assert any("a modulus is not reliable" in one and "2 (" in one and "9 (" not in one for one in told)

@@ -99,7 +99,7 @@ def test_components_that_do_not_follow_the_axes_are_told(noise, order, signs, to
     said = components.order_sentence(
         field._replace(displacement=np.asarray(signs) * field.displacement[..., list(order)])
     )
-    assert said is not None and told in said and "they change the volume much less" in said
+    assert said is not None and told in said and "the displacements change the volume much less" in said
 
 
 @pytest.mark.parametrize("noise", [0.0, 4e-7, 4e-6])
@@ -147,7 +147,7 @@ def test_frequencies_in_radians_are_told(hertz, told):
     own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array(hertz)), density=DENSITY)
     found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
     said = cautions._of_scales(own, found)
-    assert [s.startswith("the frequencies") and "if they are in rad/s" in s for s in said] == [True] * told
+    assert [s.startswith("the frequencies") and "if the given numbers are in rad/s" in s for s in said] == [True] * told
 
 
 def test_moduli_that_no_springpot_has_are_written_all_the_same(tmp_path):
@@ -184,7 +184,7 @@ def test_zeros_at_one_frequency_are_no_measurement(tmp_path):
     np.savez(tmp_path / "w.npz", displacement=U, spacing=[H] * 3, frequencies=HERTZ)
     found = wave_field.read_waves(tmp_path / "w.npz")
     assert np.isnan(found.displacement[1, :2]).all() and np.isfinite(found.displacement[0, :2]).all()
-    assert any("72 voxels do not move in field 2 but move in other" in n for n in found.notes)
+    assert any("72 voxels do not move in field 2, but move in other" in n for n in found.notes)
     assert any("field 1 has 6 components that are exactly 0" in n for n in found.notes)
 
 

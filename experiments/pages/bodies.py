@@ -167,9 +167,9 @@ def _layers() -> list[str]:
     rows = [
         "The next table is for a sphere on a bonded layer. It contains the modulus that Hertz's formula for a "
         "half-space gives, divided by the true modulus. The thickness of the layer is divided",
-        "by the contact radius sqrt(R d). The numbers in brackets are the errors of the force from the series of "
-        "Dimitriadis et al.",
-        "(equation 12, for an incompressible layer):",
+        "by the contact radius sqrt(R d). The series of Dimitriadis et al. (equation 12, for an incompressible layer) "
+        "also gives a force.",
+        "The numbers in brackets are the relative errors of this force:",
         "",
         "| Poisson's ratio | " + " | ".join(f"thickness {t:g}" for t in ratios) + " |",
         "|---" * (1 + len(ratios)) + "|",

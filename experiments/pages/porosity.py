@@ -78,7 +78,8 @@ def porosity() -> str:
         f"The law's bulk modulus K = {data['law_bulk_Pa']:g} Pa is not used. Instead, the bulk modulus of the porous "
         f"body, K0 = {data['table_2']['bulk']:g} Pa, acts, and the fluid flows out of the compressed parts.",
         f"The claim is true with {', or with '.join(found['it takes'])}.",
-        f"It is not true with {', nor with '.join(found['not enough'])}. The mesh of linear",
+        f"It is false for all tested values of the other parameters: {'; '.join(found['not enough'])}. The mesh of "
+        "linear",
         f"tetrahedra ({data['tetrahedra']:,} of them) is too stiff in bending. With eight times as many, the first "
         f"peak is {100 * finer['largest_m']:.3g} cm with porosity and",
         f"{100 * finer['without_m']:.3g} cm without it. So compare these displacements with each other, not with a "

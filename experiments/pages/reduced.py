@@ -232,8 +232,8 @@ def separated_table() -> str:
     """Table of separated forms on several grids, and of a reduced basis."""
     (data,) = load("separated")
     rows = [
-        "The hyperelastic phantom is at rest. Modulus, bulk modulus and weight may change. The error is the largest "
-        "distance",
+        "The hyperelastic phantom is at rest. Shear modulus, bulk modulus and gravity differ between the runs. "
+        "The error is the largest distance",
         f"of a node from the full model, divided by the largest displacement of the full model, in {data['unseen']} "
         "unseen runs within the ranges of the training.",
         f"A full run takes {1e-6 * data['full_us']:.2g} s. Times are for one core:",

@@ -58,9 +58,9 @@ def numbers() -> str:
         "(the default recursion of liverjax:",
         f"{mean['exponential', 50]}). With a mesh of {mesh['nodes']} nodes the error is",
         f"{percent(mesh['raw']['mean'])}, and {percent(mesh['corrected']['mean'])} if the error of the mesh is divided "
-        "out. A fit of two modes to a",
-        f"real tissue, the lion's mane with its wider band, has a misfit of {percent(modes[2]['mean'])},",
-        f"a fit of four modes {percent(modes[4]['mean'])}.",
+        "out. For a",
+        f"real tissue (the lion's mane mushroom), a fit of two modes has a misfit of {percent(modes[2]['mean'])},",
+        f"and a fit of four modes has a misfit of {percent(modes[4]['mean'])}.",
     ]
     return "\n".join(rows)
 

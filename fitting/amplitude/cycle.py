@@ -43,8 +43,8 @@ def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel")
 
     Args:
         strains: A strain amplitudes (A,) at the rim.
-        memories: M sets of modulus ratios m(nw), complex (M, `INSTANTS` / 2 + 1), for n = 0 to `INSTANTS` / 2. The
-            reported moduli are linear in m.
+        memories: M sets of modulus ratios m = G*(n omega) / G0, complex (M, `INSTANTS` / 2 + 1), for the harmonics
+            n = 0 to `INSTANTS` / 2 of the angular frequency omega. The reported moduli are linear in m.
         plates: "parallel", or "cone" (cone and plate, where the strain is the same everywhere).
     """
     rho, weights = _radii_and_weights(plates)

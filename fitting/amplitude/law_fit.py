@@ -27,13 +27,14 @@ CHANGED = 0.2
 
 
 class Memory(NamedTuple):
-    """Modulus ratio m(nw) = G*(nw)/G0 for each harmonic n (see `cycle`), from a Prony series. If `series` is None, the
-    ratio is 1 + i (loss tangent), with the same loss tangent for all harmonics n > 0."""
+    """Modulus ratio m = G*(n omega)/G0 for each harmonic n of the angular frequency omega (see `cycle`), from a Prony
+    series. If `series` is None, the ratio is 1 + i (loss tangent), with the same loss tangent for all harmonics n > 0.
+    """
 
     series: Maxwell | None = None
 
     def of(self, omega: float) -> np.ndarray:
-        """Return the modulus ratios m(nw) (1, N) of the series for N harmonics n = 0, 1, … of the angular frequency
+        """Return the modulus ratios m (1, N) of the series for N harmonics n = 0, 1, … of the angular frequency
         `omega` [rad/s]. If there is no series, return (2, N): m is the first row plus the loss tangent times the second
         row."""
         n = np.arange(cycle.INSTANTS // 2 + 1)
@@ -165,20 +166,22 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
     shape = [n for n, unit in zip(best.law.names, best.law.units, strict=True) if unit == "1" and n != "loss_tangent"]
     if "loss_tangent" in best.law.names and shape:
         told.append(
-            "without --model, also the constant part of the stress is computed with the modulus at this frequency. "
-            f"{' and '.join(shape)} may be wrong by several per cent, and the standard errors do not contain this "
-            "error: give --model with the fit.json of a frequency sweep"
+            "without --model, the constant part of the stress is also computed with the modulus at the frequency of "
+            f"the test. {' and '.join(shape)} may be wrong by several per cent, and the standard errors do not contain "
+            "this error: give --model with the fit.json of a frequency sweep"
         )
     if abs(change) > CHANGED:
         told.append(
             f"the loss tangent changes by {100 * change:+.0f} % over the sweep: a law with the same relaxation at all "
-            "strains cannot describe this. Fit only the strains before this change (--max-strain)"
+            "strains cannot describe this change. Fit only the strains before the change (--max-strain)"
         )
     if np.sqrt(np.mean(np.abs((best.storage + 1j * best.loss) / (sweep.storage + 1j * sweep.loss) - 1) ** 2)) > 0.05:
-        told.append("the law misses the moduli by more than 5 % on average: it does not describe this sweep")
+        told.append(
+            "the law misses the moduli by more than 5 % on average, so it does not describe this sweep: try another law"
+        )
     if sweep.storage[-1] < 0.8 * sweep.storage[0]:
         told.append(
-            "the storage modulus decreases with strain. The same happens if the tissue slips, yields or tears. In "
-            "this case, a hyperelastic law describes the curve but not its cause"
+            "the storage modulus decreases with strain. This also happens if the tissue slips, yields or tears. In "
+            "that case, a hyperelastic law describes the curve, but not the cause of the decrease"
         )
     return [*told, *tied_laws([f.law for f in fits], "sweep")]

@@ -43,7 +43,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     """
     found = [t for t in tables_of(str(path), text_of(path, "a strain sweep").splitlines()) if "strain" in t.raw]
     if not found:
-        raise InputError(f"{path}: no table has a column strain in % or 1: add this column")
+        raise InputError(f"{path}: no table has a column strain in % or 1; add this column")
     place, notes = choose_table(str(path), found, table, "strains", lambda t: len(np.unique(t.raw["strain"])))
     chosen = found[place]
     columns = {c.quantity: (c, j) for j, c in reversed(list(enumerate(chosen.columns)))}
@@ -51,7 +51,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     in_si = {q: (c, column_in_si(str(path), c, rows[:, j], notes)) for q, (c, j) in columns.items()}
     if told := to_shear(in_si):
         raise InputError(
-            f"{path}: {told[0].partition(':')[0]}, and E = 3 G does not hold at large strain: give a strain sweep in "
+            f"{path}: {told[0].partition(':')[0]}, and E = 3 G does not hold at large strain; give a strain sweep in "
             "shear, or fit curves of stress and stretch (python -m fitting curves)"
         )
     values = {q: v for q, (_, v) in in_si.items()}
@@ -66,16 +66,18 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are ignored as requested")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:
         raise InputError(
-            f"{path}: points at {len(np.unique(strain[kept]))} different strains are left: give {FEWEST_POINTS} or more"
+            f"{path}: points at {len(np.unique(strain[kept]))} different strains are left; give {FEWEST_POINTS} or more"
         )
     if np.ptp(omega[kept]) > 0.01 * omega[kept].mean():
         low, high = omega[kept].min() / 2 / np.pi, omega[kept].max() / 2 / np.pi
         raise InputError(
-            f"{path}: the frequency goes from {low:.3g} to {high:.3g} Hz: give a strain sweep at one frequency"
+            f"{path}: the frequency goes from {low:.3g} to {high:.3g} Hz; give a strain sweep at one frequency"
         )
     _refuse_several_temperatures(path, chosen.raw.get("temperature"), kept)
     if deviations := [c.name for c in chosen.columns if c.quantity.endswith("_sd")]:
-        notes.append(f"the columns {', '.join(deviations)} are not used: the noise is estimated from the residuals")
+        notes.append(
+            f"the columns {', '.join(deviations)} are not used, because the noise is estimated from the residuals"
+        )
     notes += _of_unit(path, chosen.strain_unit, float(strain[kept].max()))
     order = np.argsort(strain[kept], kind="stable")
     return StrainSweep(
@@ -93,7 +95,7 @@ def _refuse_several_temperatures(path: Path, temperature: np.ndarray | None, kep
         return
     low, high = temperature[kept].min() - 273.15, temperature[kept].max() - 273.15
     raise InputError(
-        f"{path}: the temperature goes from {low:.3g} to {high:.3g} °C: give one file for each temperature"
+        f"{path}: the temperature goes from {low:.3g} to {high:.3g} °C; give one file for each temperature"
     )
 
 
@@ -102,10 +104,14 @@ def _of_unit(path: Path, unit: str, largest: float) -> list[str]:
     large."""
     if largest > (LARGEST_STRAIN if unit else LARGEST_WITHOUT_UNIT):
         raise InputError(
-            f"{path}: a strain of {largest:g} is too large: write it in % (strain_%), or as a fraction (strain_1)"
+            f"{path}: a strain of {largest:g} is too large; write the strains in % (strain_%), or as a fraction "
+            "(strain_1)"
         )
     if not unit:
-        return ["the strain column states no unit: the unit 1 is assumed, not %"]
+        return ["the strain column states no unit, so the unit 1 is assumed, not %"]
     if unit != "1" and largest <= SMALLEST_LARGEST:
-        return [f"the strains end at {100 * largest:.3g} %: if they are fractions, name the column strain_1"]
+        return [
+            f"the strains end at {100 * largest:.3g} %: if the numbers of the column are fractions, name the column "
+            "strain_1"
+        ]
     return []

@@ -20,17 +20,25 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW for your own law, or all")
     command.add_argument(
-        "sweep", type=Path, metavar="SWEEP", help="frequency, moduli and strain: CSV, text or workbook"
+        "sweep",
+        type=Path,
+        metavar="SWEEP",
+        help="file with columns of frequency, moduli and strain: CSV, text or workbook",
     )
     command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="terms of Ogden's law (default 1, 2 and 3)")
-    command.add_argument("--model", type=Path, metavar="fit.json", help="Prony series of a frequency sweep")
-    command.add_argument("--plates", choices=("parallel", "cone"), help="plates (default parallel)")
-    command.add_argument("--max-strain", type=float, metavar="X", help="ignore larger strains; 0.1 is 10 %%")
     command.add_argument(
-        "--table", metavar="NAME", help="table to read if there are several: its name, a part of it, or its number"
+        "--model",
+        type=Path,
+        metavar="fit.json",
+        help="result of a frequency sweep, with the Prony series of the tissue",
+    )
+    command.add_argument("--plates", choices=("parallel", "cone"), help="plates (default parallel)")
+    command.add_argument("--max-strain", type=float, metavar="X", help="ignore strains above this value; 0.1 is 10 %%")
+    command.add_argument(
+        "--table", metavar="NAME", help="name of the table to read, part of this name, or the number of the table"
     )
     command.add_argument(
-        "--out", type=Path, default=Path("amplitude"), metavar="DIR", help="folder of the results (amplitude)"
+        "--out", type=Path, default=Path("amplitude"), metavar="DIR", help="folder of the results (default amplitude)"
     )
     return command
 

@@ -26,7 +26,11 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW for your own law, or all")
     command.add_argument(
-        "files", type=Path, nargs="+", metavar="CURVES.csv", help="with F11 … P33, or test, stretch, …"
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="CURVES.csv",
+        help="CSV files with columns F11 … P33, or test, stretch, …",
     )
     command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="terms of Ogden's law (default 1, 2 and 3)")
     command.add_argument(
@@ -42,11 +46,11 @@ def _with_finite_stress(fits: "list[LawFit]") -> "list[LawFit]":
     """Return the fits whose law has a finite stress on the curves. The program warns about the other laws. Raises
     `InputError` if no law remains."""
     wrong = [f.label for f in fits if not np.isfinite(f.mean_relative_error)]
-    told = f"{', '.join(wrong)}: the stress is not finite on these curves: check the law with python -m liverjax check"
+    told = f"{', '.join(wrong)}: the stress is not finite on these curves; check the law with python -m liverjax check"
     if len(wrong) == len(fits):
         raise InputError(told)
     if wrong:
-        print(f"warning: {told}; such laws are ignored", file=sys.stderr)
+        print(f"warning: {told}. These laws are ignored", file=sys.stderr)
     return [f for f in fits if f.label not in wrong]
 
 
@@ -67,7 +71,9 @@ def run(options: argparse.Namespace) -> int:
         notes.append(f"--unit {options.unit} has no effect: the stress columns name their unit")
     if options.law == "all":
         left = [n for n in laws.LAWS if not hyperelastic.incompressible_form(n)]
-        notes.append(f"not fitted, because they are not an isochoric energy plus U(J): {', '.join(left)}")
+        notes.append(
+            f"some laws are not fitted, because their energy is not an isochoric energy plus U(J): {', '.join(left)}"
+        )
     for note in [*notes, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)
     stress_stretch.initial_modulus(found)

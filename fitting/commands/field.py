@@ -36,7 +36,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         type=Path,
         nargs="+",
         metavar="SCENE.toml DISPLACEMENTS.csv",
-        help="x,y,z (or node),ux,uy,uz[,time][,sd]",
+        help="scene, and CSV file with the columns x,y,z (or node),ux,uy,uz[,time][,sd]",
     )
     command.add_argument("--name", default="law.mu", metavar="NAME", help="parameter to map (default law.mu)")
     command.add_argument("--length", type=float, metavar="M", help="correlation length [m] (default: size / 10)")
@@ -44,11 +44,13 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--sphere", action="store_true", help="also fit a sphere of another stiffness; the map gives the starting point"
     )
     command.add_argument(
-        "--parameters", metavar="NAME,…", help="these parameters instead of a map, e.g. law.mu,viscosity.ratios"
+        "--parameters", metavar="NAME,…", help="fit these parameters instead of a map, e.g. law.mu,viscosity.ratios"
     )
     command.add_argument("--noise", type=float, metavar="M", help="standard deviation [m] if a file has no column sd")
     command.add_argument("--unit", default="m", help="unit of the lengths in the displacement files (default m)")
-    command.add_argument("--iterations", type=int, default=60, help="maximum iterations for each prior (default 60)")
+    command.add_argument(
+        "--iterations", type=int, default=60, help="maximum number of iterations for each prior (default 60)"
+    )
     command.add_argument("--resume", action="store_true", help="continue from the last iteration written to --out")
     command.add_argument(
         "--out", type=Path, default=Path("field"), metavar="DIR", help="folder of the results (default field)"
@@ -118,7 +120,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
         remedy = "a finer mesh, or order = 2," if linear else "a finer mesh"
         finer = f"; {remedy} would give more information" if max(beside) > 1 else ""
         print(
-            f"note: the error of the mesh is {max(beside):.2g} times the noise, and counts as noise{finer}",
+            f"note: the error of the mesh is {max(beside):.2g} times the noise, and is treated as noise{finer}",
             file=sys.stderr,
         )
     with bar:

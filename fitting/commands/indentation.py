@@ -26,7 +26,11 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--thickness", type=float, required=True, metavar="M", help="thickness of the layer [m]")
     command.add_argument("--poisson", type=float, default=0.5, metavar="NU", help="Poisson's ratio (default 0.5)")
     command.add_argument(
-        "--out", type=Path, default=Path("indentation"), metavar="DIR", help="folder of the results (indentation)"
+        "--out",
+        type=Path,
+        default=Path("indentation"),
+        metavar="DIR",
+        help="folder of the results (default indentation)",
     )
     return command
 
@@ -42,14 +46,15 @@ def _notes_on_shape(options: argparse.Namespace) -> list[str]:
     cone, told = options.shape == "cone", []
     if cone and options.half_angle is None:
         told.append(
-            f"a half-angle of {HALF_ANGLE:g} degrees is assumed; --half-angle sets another. E is proportional to 1/tan"
+            f"a half-angle of {HALF_ANGLE:g} degrees is assumed; --half-angle sets another value. E is proportional "
+            "to 1/tan(half-angle)"
         )
     if not cone and options.half_angle is not None:
-        told.append(f"--half-angle is for a cone: it has no effect for a {options.shape}")
+        told.append(f"--half-angle is for a cone, and has no effect for a {options.shape}")
     if cone and options.radius:
-        told.append("--radius is for a sphere or a punch: it has no effect for a cone")
+        told.append("--radius is for a sphere or a punch, and has no effect for a cone")
     if options.thickness > THICK:
-        told.append(f"--thickness is in metres: {options.thickness:g} m act as a half-space")
+        told.append(f"--thickness is in metres: a layer of {options.thickness:g} m acts as a half-space")
     return told
 
 
@@ -64,7 +69,10 @@ def run(options: argparse.Namespace) -> int:
     if options.shape != "cone" and options.radius == 0:
         raise InputError(f"the radius of a {options.shape} must be above 0: give it in metres, e.g. --radius 0.001")
     if options.shape != "cone" and options.radius > LARGEST:
-        raise InputError(f"--radius {options.radius:g} is in metres: give e.g. --radius {options.radius / 1000:g}")
+        raise InputError(
+            f"--radius {options.radius:g} must be in metres, and at most 0.2: give e.g. --radius "
+            f"{options.radius / 1000:g}"
+        )
     angle = HALF_ANGLE if options.half_angle is None else options.half_angle
     rig = Indenter(options.shape, options.thickness, options.poisson, options.radius, angle)
     layer, curve = Layer(rig), read_indentation(options.file)

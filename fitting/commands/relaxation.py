@@ -27,7 +27,10 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.set_defaults(kind=kind)
     command.add_argument(
-        "file", type=Path, metavar="FILE", help="CSV, TRIOS or RheoCompass text; or a TOML description of a test rig"
+        "file",
+        type=Path,
+        metavar="FILE",
+        help="file of the test (CSV, TRIOS or RheoCompass text), or a TOML description of a test rig",
     )
     shared_options.add_modes(command)
     command.add_argument(
@@ -82,7 +85,7 @@ def _said_of_rows(test: "TimeTest") -> list[str]:
         return told
     told.append(
         f"the responses begin {first:.3g} s after the load, and end at {last:.3g} s: G0 does not contain the stress "
-        "that relaxed before"
+        "that relaxed before the first response"
     )
     return told
 
@@ -103,9 +106,9 @@ def run(options: argparse.Namespace) -> int:
             raise InputError(f"--{name} {value:g} cannot be a sample's {name} in metres: give e.g. --{name} 0.004")
     shared_options.check_samples(options.samples)
     if options.modes != "auto" and options.model != "prony":
-        raise InputError(f"--modes works with --model prony only: remove it for --model {options.model}")
+        raise InputError(f"--modes works only with --model prony: remove --modes for --model {options.model}")
     if options.samples is not None and options.model == "spectrum":
-        raise InputError("--samples works with models of a few parameters only; remove it for --model spectrum")
+        raise InputError("--samples works only with models of a few parameters: remove --samples for --model spectrum")
     out = options.out
     sample = reader.Sample(options.radius, options.height)
     if options.file.suffix.lower() == ".toml":

@@ -25,7 +25,7 @@ def run(options: argparse.Namespace) -> int:
         sweeps.append(shared_options.usable_sweep(options, path))
         for earlier in sweeps[:-1]:
             if all(np.array_equal(*own) for own in zip(sweeps[-1][:3], earlier[:3], strict=True)):
-                raise InputError(f"{path}: it has the same moduli as {earlier.source}: give each measurement once")
+                raise InputError(f"{path} has the same moduli as {earlier.source}: give each measurement once")
         for note in sweeps[-1].notes:
             print(f"note: {path.name}: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))

@@ -27,7 +27,7 @@ def refuse_copies(files: list[Path]) -> None:
     for file in (file for file in files if file.is_file()):
         first = seen.setdefault(file.read_bytes(), file)
         if first is not file:
-            raise InputError(f"{file}: it is the same measurement as {first}: give each measurement once")
+            raise InputError(f"{file} is the same measurement as {first}: give each measurement once")
 
 
 def add_cards_and_samples(command: argparse.ArgumentParser) -> None:
@@ -73,7 +73,7 @@ def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
         other = _other_command(path) if "no header names" in str(no_sweep) else None
         if other is None:
             raise
-        raise InputError(f"{path} holds no frequency sweep: give it to `python -m fitting {other}`") from None
+        raise InputError(f"{path} contains no frequency sweep: give it to `python -m fitting {other}`") from None
     sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
     sweep = rheometer.without_inertia(sweep, options.radius, options.height)
     return sweep if options.max_frequency else without_instrument_or_sample(options, sweep)

@@ -49,9 +49,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
         dest="others",
         default=[],
         metavar="TEST",
-        help="further tests of the same material (relaxation, creep, sweep, shear waves): one Prony series for all",
+        help="further tests of the same material (relaxation, creep, sweep, shear waves), all fitted together",
     )
-    command.add_argument("--table", metavar="NAME", help="which table of several: its number, or a part of its name")
+    command.add_argument("--table", metavar="NAME", help="number, or part of the name, of the table to read")
     command.add_argument("--max-frequency", type=float, metavar="HZ", help="ignore the points above this frequency")
     command.add_argument("--min-frequency", type=float, metavar="HZ", help="ignore the points below this frequency")
     shared_options.add_modes(command)
@@ -62,7 +62,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         help="free Prony modes (default), springpots, a smooth spectrum, or the best of all by the criterion",
     )
     command.add_argument(
-        "--method", choices=("torsion", "closed-form"), help="default torsion; for several samples closed-form"
+        "--method", choices=("torsion", "closed-form"), help="default torsion; closed-form for several samples"
     )
     command.add_argument(
         "--master",
@@ -99,7 +99,7 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
     command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
     command.add_argument(
-        "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m], which is added to errors"
+        "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m], included in errors"
     )
     command.add_argument(
         "--friction-error",
@@ -133,7 +133,7 @@ def _add_outputs(command: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="TEST",
-        help="tests that are not fitted, but predicted by the fit for comparison",
+        help="tests that are not fitted; the fit predicts their results, for comparison",
     )
     command.add_argument("--profile", action="store_true", help="also compute 95 %% profile-likelihood intervals")
     shared_options.add_cards_and_samples(command)
@@ -253,10 +253,7 @@ def _check(options: argparse.Namespace) -> None:
             meant = f"{value / 1000:g}" if 0.2 < value <= 200 else "0.004"
             raise InputError(f"--{name} {value} cannot be a plate {name} in metres: give e.g. --{name} {meant}")
     if options.gap_error is not None and not (options.height and 0 <= options.gap_error < options.height):
-        raise InputError(
-            f"--gap-error {options.gap_error:g} is the gap's standard deviation in metres: give --height, and an error "
-            "below this height"
-        )
+        raise InputError(f"--gap-error {options.gap_error:g} must be in metres, and below --height: give both options")
     _check_friction(options)
     if options.density is not None and not 100 <= options.density <= 25000:
         raise InputError(f"--density {options.density} is not possible in kg/m^3: give e.g. --density 1060")
@@ -272,15 +269,15 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps per cycle, e.g. 50")
     if options.model in ("fractional", "spectrum") and options.modes != "auto":
         raise InputError(
-            f"--modes {options.modes} works with --model prony only: remove it for --model {options.model}"
+            f"--modes {options.modes} works only with --model prony: remove this option for --model {options.model}"
         )
     if options.profile and options.model != "prony":
-        raise InputError(f"--profile works with --model prony only; remove it for --model {options.model}")
+        raise InputError(f"--profile works only with --model prony: remove --profile for --model {options.model}")
     _note_idle(options)
     shared_options.refuse_copies([*options.sweep, *options.others])
     shared_options.check_samples(options.samples)
     if options.samples and options.model == "spectrum":
-        raise InputError("--samples works with models of a few parameters only; remove it for --model spectrum")
+        raise InputError("--samples works only with models of a few parameters: remove --samples for --model spectrum")
     laws.find(options.law)
 
 
@@ -292,9 +289,9 @@ def _note_idle(options: argparse.Namespace) -> None:
     idle = {"--steps": options.steps != 50, "--scheme": options.scheme != "exponential"}
     idle["--law"] = options.law != "neo_hookean" and not options.precompression
     for name in (name for name, changed in idle.items() if changed):
-        print(f"note: {name} is for the simulation: it has no effect on the closed form", file=sys.stderr)
+        print(f"note: {name} is for the simulation, and has no effect on the closed form", file=sys.stderr)
     if several and options.optimizer != "levenberg-marquardt":
-        print(f"note: --optimizer {options.optimizer} is for a single sweep: it has no effect here", file=sys.stderr)
+        print(f"note: --optimizer {options.optimizer} is for a single sweep, and has no effect here", file=sys.stderr)
 
 
 def _check_friction(options: argparse.Namespace) -> None:
@@ -314,9 +311,7 @@ def _check_friction(options: argparse.Namespace) -> None:
         ("all samples but one", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(
-                f"--friction-error works only with the Prony modes of one sample: remove --friction-error, or {name}"
-            )
+            raise InputError(f"--friction-error needs the Prony modes of one sample: remove this option, or {name}")
 
 
 def _check_precompression(options: argparse.Namespace) -> None:
@@ -328,7 +323,7 @@ def _check_precompression(options: argparse.Namespace) -> None:
     compression.check_strain(options.precompression)
     for name, asked in (("--with", bool(options.others)), ("all samples but one", len(options.sweep) > 1)):
         if asked:
-            raise InputError(f"--precompression works for a single sweep only: remove {name}, or --precompression")
+            raise InputError(f"--precompression works only for a single sweep: remove {name}, or --precompression")
     for name, asked in (("--profile", options.profile), ("--samples", options.samples is not None)):
         if asked:
             raise InputError(
@@ -336,8 +331,8 @@ def _check_precompression(options: argparse.Namespace) -> None:
             )
     if options.model != "prony" and options.method != "closed-form":
         raise InputError(
-            f"--precompression with --model {options.model} works in closed form only, because the modes of a "
-            "simulation do not separate constant from slowly relaxing stress: give --method closed-form"
+            f"--precompression with --model {options.model} needs --method closed-form. A simulation represents this "
+            "model by Prony modes, and these do not distinguish the equilibrium stress from slowly relaxing stress"
         )
 
 
@@ -345,7 +340,7 @@ def _check_master(options: argparse.Namespace) -> None:
     """Raise an error for options that cannot be combined with a master curve."""
     if options.master is None:
         if options.vertical:
-            raise InputError("--vertical is for a master curve: give --master too")
+            raise InputError("--vertical works only for a master curve: also give --master")
         return
     for name, asked in (
         ("--with", bool(options.others)),
@@ -369,7 +364,7 @@ def _check_samples(options: argparse.Namespace) -> None:
         ("--density", options.density is not None, "remove the option, or give one file"),
     ):
         if asked:
-            raise InputError(f"{name} is for one sample only, and {len(options.sweep)} files are given: {instead}")
+            raise InputError(f"{name} works only for one sample, and {len(options.sweep)} files are given: {instead}")
 
 
 def _check_together(options: argparse.Namespace) -> None:
@@ -431,7 +426,8 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     closed, corrected = instrument.without_error_of_inertia(closed, sweep)
     for note in corrected.notes[len(sweep.notes) :]:
         print(f"note: {note}", file=sys.stderr)
-    if options.gap_error:  # before the warnings are made, because they use the errors
+    # The error of the gap is included before the warnings are made, because the warnings use the errors.
+    if options.gap_error:
         closed = instrument.with_gap_error(closed, options.gap_error / simulation.height)
     if corrected is not sweep:
         dense = generalised_maxwell.spectrum(corrected)

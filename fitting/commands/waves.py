@@ -38,17 +38,27 @@ def parser(prog: str) -> argparse.ArgumentParser:
         epilog=EXIT_CODES,
     )
     command.add_argument(
-        "data", type=Path, metavar="DATA", help="complex displacements: .npz, .npy, .h5, .mat, .csv, .nii, .nii.gz"
+        "data",
+        type=Path,
+        metavar="DATA",
+        help="file of complex displacements: .npz, .npy, .h5, .mat, .csv, .nii, .nii.gz",
     )
-    command.add_argument("--frequencies", type=float, nargs="+", metavar="HZ", help="frequencies, if the file has none")
-    command.add_argument("--mask", type=Path, metavar="FILE", help="voxels of the organ, if the file has no mask")
-    command.add_argument("--labels", type=Path, metavar="FILE", help="number of the region of each voxel")
+    command.add_argument(
+        "--frequencies", type=float, nargs="+", metavar="HZ", help="frequencies [Hz], if DATA contains none"
+    )
+    command.add_argument(
+        "--mask", type=Path, metavar="FILE", help="file of the voxels of the organ, if DATA has no mask"
+    )
+    command.add_argument("--labels", type=Path, metavar="FILE", help="file with the number of the region of each voxel")
     command.add_argument("--unit", help="unit of the displacements: m, mm or um (default m)")
     command.add_argument(
         "--spacing", type=float, nargs=3, metavar="M", help="spacing of the voxels [m], if the file states no spacing"
     )
     command.add_argument(
-        "--noise", type=float, metavar="M", help="standard deviation of one component (default: from data)"
+        "--noise",
+        type=float,
+        metavar="M",
+        help="standard deviation of one component (default: estimated from the data)",
     )
     command.add_argument("--density", type=float, default=DENSITY, metavar="KG_M3", help=f"default {DENSITY:g}")
     command.add_argument("--stride", type=int, metavar="N", help="use means of N x N x N voxels (default: as needed)")
@@ -57,7 +67,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--length", type=float, metavar="M", help="correlation length of the map [m] (default 4 voxels)"
     )
     command.add_argument(
-        "--samples", type=int, default=20, metavar="N", help="maps drawn from the posterior (default 20)"
+        "--samples", type=int, default=20, metavar="N", help="number of maps drawn from the posterior (default 20)"
     )
     command.add_argument("--resume", action="store_true", help="continue from the last step written to --out")
     command.add_argument("--out", type=Path, default=Path("waves"), metavar="DIR", help="folder (default waves)")
@@ -121,7 +131,7 @@ def _kept_regions(options: argparse.Namespace, organ: "Organ") -> "Keep":
         for file in progress:  # these files are from an earlier run
             file.unlink(missing_ok=True)
     elif not any(file.is_file() for file in progress):
-        print(f"note: {options.out} has no files to resume: a new search begins", file=sys.stderr)
+        print(f"note: {options.out} contains no files to resume, so a new search begins", file=sys.stderr)
     return kept_regions.kept_in(progress[1], options.resume, marks)
 
 
@@ -132,7 +142,7 @@ def _forces_that_balance(data: Path) -> Iterator[None]:
         yield
     except np.linalg.LinAlgError:
         raise InputError(
-            f"{data}: no modulus balances the forces of these waves: check the mask, the spacing, the units and the "
+            f"{data}: no modulus balances the forces of these waves; check the mask, the spacing, the units and the "
             "noise"
         ) from None
 
@@ -155,7 +165,7 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
             )
         stride += 1
     if stride > 1:
-        print(f"note: means of {stride} x {stride} x {stride} voxels are used", file=sys.stderr)
+        print(f"note: means over {stride} x {stride} x {stride} voxels are used", file=sys.stderr)
     parts = int(body.part.max()) + 1
     if parts > 1:
         print(

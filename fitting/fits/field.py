@@ -80,12 +80,15 @@ def start_of(problem: Problem, name: str) -> jax.Array:
     for other in problem.scenes[1:]:
         same = other.mesh.number_of_elements == E and other.mesh.order == scene.mesh.order
         if not same or not np.allclose(other.mesh.points, scene.mesh.points):
-            raise InputError("the scenes have different meshes: a field needs one mesh in all scenes")
+            raise InputError("the scenes have different meshes: use one mesh in all scenes")
     base = numbers_at(scene, name)
     if isinstance(base, tuple) or jnp.ndim(base) > 1 or (jnp.ndim(base) == 1 and base.shape != (E,)):
-        raise InputError(f"a field of {name!r} needs one number per element: name one entry of the list, e.g. {name}.0")
+        raise InputError(
+            f"{name!r} is a list, and a field can multiply only one number, or one number per element: name one entry "
+            f"of the list, e.g. {name}.0"
+        )
     if not np.all(np.asarray(base) > 0):
-        raise InputError(f"a field of {name!r} must begin at a positive value: change the value in the scene")
+        raise InputError(f"a field of {name!r} must begin at a value above 0: change this value in the scene")
     if np.all(given_by_regions(problem, name)[0]):
         raise InputError(
             f"a [[region]] sets {name} in every element, so nothing is left to map: remove this parameter from a "

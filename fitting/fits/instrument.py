@@ -117,8 +117,8 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
         return fit._replace(details=details, warnings=(*fit.warnings, *_not_corrected(errors, known))), sweep
     corrected = _shifted(weighed, known, values)
     notes = [
-        f"the instrument's {n.name} is {n.compared(v)} (standard error {n.told(e)}, prior {n.told(1.0)}), and the "
-        "moduli are corrected for it"
+        f"the instrument's {n.name} is {n.compared(v)} (standard error {n.told(e)}, prior {n.told(1.0)}). The moduli "
+        "are corrected for this error"
         if e < UNTOLD
         else f"the data do not determine the instrument's {n.name}: its standard error is {n.told(e)} with the data "
         f"and {n.told(1.0)} without the data, and the moduli contain this error"
@@ -158,8 +158,8 @@ def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]
             there = f"the error is then {n.told(errors.part[k])}"
         out.append(
             f"the instrument's {n.name} seems {n.compared(errors.values[k])} (standard error {n.told(e[k])}), but not "
-            f"if the last half decade is left out ({there}). The misfit of the model poses as {n.name}, so this error "
-            "is not corrected"
+            f"in a fit without the last half decade ({there}). So a misfit of the model poses as {n.name}, and this "
+            "error is not corrected"
         )
     return out
 

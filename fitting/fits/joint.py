@@ -89,13 +89,13 @@ def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
     measured = np.asarray(measured, float)
     if measured.shape != (rig.scene.solve.steps,):
         raise InputError(
-            f"{name}: {measured.size} readings for {rig.scene.solve.steps} steps: give one reading per step"
+            f"{name}: there are {measured.size} readings for {rig.scene.solve.steps} steps; give one reading per step"
         )
     if np.shape(sd) not in ((), measured.shape):
-        raise InputError(f"{name}: sd has shape {np.shape(sd)}: give one number, or one per reading {measured.shape}")
+        raise InputError(f"{name}: sd has shape {np.shape(sd)}; give one number, or one per reading {measured.shape}")
     sd = np.broadcast_to(np.asarray(sd, float), measured.shape)
     if not (np.all(np.isfinite(measured)) and np.all(np.isfinite(sd)) and np.all(sd > 0)):
-        raise InputError(f"{name}: measured and sd must be finite, and sd above 0: correct these values")
+        raise InputError(f"{name}: measured and sd must be finite, and sd above 0; correct these values")
 
     def predict(law, viscosity, model):
         readings, codes = glued.read(rig, law, viscosity)
@@ -179,11 +179,13 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
             "mode"
         )
     if not (np.isfinite(start.shear_modulus) and start.shear_modulus > 0):
-        raise InputError(f"start: shear_modulus = {start.shear_modulus} must be above 0 Pa: give e.g. 1000.0")
+        raise InputError(f"start: shear_modulus = {start.shear_modulus} must be above 0 Pa; give e.g. 1000.0")
     if not (np.all(ratios > 0) and ratios.sum() < 1):
-        raise InputError(f"start: ratios = {ratios.tolist()} must be above 0 and add up to less than 1")
+        raise InputError(
+            f"start: ratios = {ratios.tolist()} must be above 0 and add up to less than 1; correct the ratios"
+        )
     if not (np.all(times > 0) and np.all(np.isfinite(times))):
-        raise InputError(f"start: relaxation_times = {times.tolist()} must be above 0 s")
+        raise InputError(f"start: relaxation_times = {times.tolist()} must be above 0 s; correct the times")
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> np.ndarray:

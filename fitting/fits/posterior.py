@@ -40,11 +40,11 @@ BEYOND = 10.0
 #: The prior of the moduli of a fractional model extends by this factor beyond the measured moduli.
 MODULI_BEYOND = 1e3
 PRIORS = {
-    "prony": "G0 log-uniform from the smallest measured modulus to 1000 times the largest; relaxation times "
-    "log-uniform from a tenth of the shortest to ten times the longest that the data resolve; ratios and the "
-    "equilibrium fraction uniform among all values with the sum 1",
-    "fractional": "moduli at the middle of the band log-uniform within a factor of 1000 of the measured ones; "
-    "exponents uniform",
+    "prony": "G0 is log-uniform from the smallest measured modulus to 1000 times the largest; relaxation times are "
+    "log-uniform from a tenth of the shortest to ten times the longest time that the data resolve; the ratios and "
+    "the equilibrium fraction are uniform on the simplex (all values that add up to 1)",
+    "fractional": "moduli at the middle of the band are log-uniform within a factor of 1000 of the measured moduli; "
+    "exponents are uniform",
 }
 
 
@@ -127,8 +127,8 @@ class Target(NamedTuple):
 
 def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np.ndarray:
     """Return the logarithm of the integral of s^-m exp(-square / (2 s^2)) ds / s over all s, up to a constant. Here s
-    is the common factor of the errors, and `square` is the sum of m = `count` squared residuals. If `deviations_given`,
-    the integral is only over s >= 1."""
+    is the common factor of the errors, and `square` is the sum of m = `count` squared residuals (at least m times
+    `QUIETEST`^2). If `deviations_given`, the integral is only over s >= 1."""
     half = 0.5 * np.maximum(square, QUIETEST**2 * count)
     out = -0.5 * count * np.log(half)
     return out + np.log(scipy.special.gammainc(0.5 * count, half)) if deviations_given else out
@@ -170,9 +170,8 @@ class Modes(NamedTuple):
     @property
     def words(self) -> str:
         """Description of the prior in words. A fluid has no equilibrium fraction."""
-        return (
-            PRIORS["prony"].replace("ratios and the equilibrium fraction", "ratios") if self.fluid else PRIORS["prony"]
-        )
+        words = PRIORS["prony"]
+        return words.replace("the ratios and the equilibrium fraction", "the ratios") if self.fluid else words
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
         """Return the log prior (W,) of W vectors u (W, P), up to a constant."""
@@ -259,7 +258,10 @@ class WithInstrument(NamedTuple):
     @property
     def words(self) -> str:
         """Description of the prior in words."""
-        each = [f"error of the {n.name} normal around 0 with a deviation of {n.told(1.0)}" for n in self.errors]
+        each = [
+            f"the error of the {n.name} is normal around 0 with a standard deviation of {n.told(1.0)}"
+            for n in self.errors
+        ]
         return "; ".join([self.modes.words, *each])
 
     def apart(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -319,7 +321,7 @@ def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:
     factor = np.exp(relative * np.random.default_rng((seed, 1)).standard_normal((*found.draws.shape[:2], 1)))
     draws = np.where([name in moduli for name in found.names], found.draws * factor, found.draws)
     known = np.array([r_hat(draws[..., k]) for k in range(draws.shape[-1])])
-    prior = f"{found.prior}; gap log-normal with a deviation of {100 * relative:.2g} %"
+    prior = f"{found.prior}; the gap is log-normal with a standard deviation of {100 * relative:.2g} %"
     return found._replace(draws=draws, r_hat=known, prior=prior)
 
 

@@ -73,15 +73,15 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
     lost = np.flatnonzero(~(np.isfinite(G) & (G.real > 0) & (G.imag > 0)))
     if lost.size:
         raise InputError(
-            f"{sweep.source or 'sweep'}: at {hertz[lost[0]]:.3g} Hz the inertia of the sample is larger than its "
-            "modulus: exclude such frequencies with --max-frequency, or check --density and --height"
+            f"{sweep.source or 'sweep'}: at {hertz[lost[0]]:.3g} Hz the inertia of the sample is larger than the "
+            "modulus; exclude such frequencies with --max-frequency, or check --density and --height"
         )
     change = np.abs(G / seen - 1)
     k, notes = int(change.argmax()), sweep.notes
     if change[k] > WORTH_A_NOTE:
         notes = (
             *notes,
-            f"the inertia of the sample, {1e3 * height:.3g} mm high, is subtracted: this changes the modulus by up to "
+            f"the inertia of the sample, {1e3 * height:.3g} mm high, is subtracted, which changes the modulus by up to "
             f"{100 * change[k]:.2g} % (at {hertz[k]:.3g} Hz)",
         )
     return sweep._replace(storage=G.real, loss=G.imag, notes=notes)

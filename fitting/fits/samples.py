@@ -175,14 +175,15 @@ def outliers(found: Samples) -> list[str]:
     out = []
     for sample, own in told.items():
         which = ", and ".join(
-            f"its {name} is {ratio:.2g} times the mean of the others, {mean:.4g} (probability by chance: {chance:.1g})"
+            f"its {name} is {ratio:.2g} times the mean {mean:.4g} of the other samples (probability by chance "
+            f"{chance:.1g})"
             for chance, name, ratio, mean in own
         )
-        what = "its units and sizes"
+        what = "the units and sizes of this sample"
         if not any(name.endswith(("modulus", "springpot")) for _, name, _, _ in own):  # no parameter is a modulus
-            what = "its temperature, the unit of its frequency, and the sample"
+            what = "the temperature, the unit of the frequency, and the sample"
         source = Path(found.sweeps[sample].source).name
-        out.append(f"{source}: {which}: check {what}. This sample widens the population's intervals")
+        out.append(f"{source}: {which}. Check {what}. This sample widens the population's intervals")
     if out:
         return out
     name = next((n for n in ("shear_modulus", *found.populations) if n in found.populations), "")
@@ -226,8 +227,8 @@ def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[st
     below, above = ([sources[k] for k in own] for own in (order[:first], order[first:]))
     fewer, way = (above, "above") if len(above) < len(below) else (below, "below")
     return [
-        f"{', '.join(fewer)}: the {name} is a factor of {np.exp(gaps.max()):.2g} {way} that of the other samples: "
-        "check units and sizes. The population's intervals contain this factor"
+        f"{', '.join(fewer)}: the {name} is at least a factor of {np.exp(gaps.max()):.2g} {way} that of the other "
+        "samples; check units and sizes. The population's intervals contain this factor"
     ]
 
 

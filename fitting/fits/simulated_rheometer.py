@@ -162,8 +162,8 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
         return torsion.make_rig(simulation.radius, height, cell, density=simulation.density)
     if simulation.part != "all":
         raise InputError(
-            f"a precompression of {simulation.precompression:g} needs a sample whose whole stress relaxes: remove "
-            f"part {simulation.part!r}"
+            f"a precompression of {simulation.precompression:g} needs a sample whose whole stress relaxes: remove part "
+            f"= {simulation.part!r}"
         )
     tall = height / (1 - simulation.precompression)
     rest = torsion.make_rig(simulation.radius, tall, cell, density=simulation.density)

@@ -206,7 +206,7 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
         told.append(
             "the residuals of neighbouring points are correlated. Possible causes: drift of the instrument, a "
             f"calibration factor or offset of one test, or an inadequate law. The {n} points carry the information of "
-            f"{alike.independent:.0f} independent points; the standard errors include this"
+            f"{alike.independent:.0f} independent points; the standard errors include this effect"
         )
     if factors is not None and factors.shown:
         told.append(
@@ -281,11 +281,11 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
     told = []
     if sum(len(c.stress) for c in curves) <= len(fit.values):
         told.append(
-            f"the law has as many parameters as there are points, or more ({len(fit.values)}): the errors of the "
-            "parameters are unknown"
+            f"the law has at least as many parameters ({len(fit.values)}) as there are points, so the errors of the "
+            "parameters are unknown: use a law with fewer parameters"
         )
     if not fit.converged:
-        told.append("the fit did not converge from its best starting point")
+        told.append("the fit did not converge from its best starting point, so its parameters are not reliable")
     quantile = scipy.stats.t.ppf(0.975, max(1, sum(len(c.stress) for c in curves) - len(fit.values)))
     if fit.limits:
         ran = ", ".join(f"{name} to {end}" for name, end in fit.limits.items())
@@ -295,11 +295,13 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
         )
     for name, value, error in zip(fit.names, fit.values, fit.standard_errors, strict=True):
         if name not in fit.limits and not error * quantile < abs(value):
-            told.append(f"the data do not determine {name}: {value:.3g} with a standard error of {error:.2g}")
+            told.append(
+                f"the data do not determine {name}: its value is {value:.3g}, with a standard error of {error:.2g}"
+            )
     if not fit.limits and singular[-1] < 1e-7 * singular[0]:
-        told.append("the data do not determine some combination of the parameters")
+        told.append("the data do not determine at least one combination of the parameters")
     if fit.starts_at_minimum == 1:
-        told.append("only one starting point led to this minimum: there may be a better minimum")
+        told.append("only one starting point led to this minimum, so there may be a better minimum")
     if held:
         told.append(
             "without a constraint, the stress of the law would decrease within the range of the data, so the fit "
@@ -350,7 +352,7 @@ def loaded_at_rest(curves: list[Curve]) -> list[str]:
         if abs(offset) > _PRELOAD * curve.scale and np.abs(driven[near]).min() < 0.02 * np.ptp(driven):
             told.append(
                 f"{curve.label}: the stress is {offset:.3g} Pa where the sample is not deformed. Every law has a "
-                "stress of 0 there: subtract the preload, or compute the stretch with the unloaded length"
+                "stress of 0 there; subtract the preload, or compute the stretch with the unloaded length"
             )
     return told
 
@@ -364,7 +366,7 @@ def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
         if not error < HOPELESS:
             told.append(
                 f"{curve.label}: no law fits this curve. The nearest law ({best.label}) misses the curve by "
-                f"{100 * error:.0f} % of the stress: check unit, signs and axes, or fit this curve alone"
+                f"{100 * error:.0f} % of the stress; check unit, signs and axes, or fit this curve alone"
             )
     return told
 

@@ -152,7 +152,7 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
     largest = (len(rows) - 2) // 2
     if modes != "auto" and not 1 <= int(modes) <= largest:
         raise InputError(
-            f"{test.source}: --modes {modes} is out of range: give 1 to {largest} for {len(rows)} measured values"
+            f"{test.source}: --modes {modes} is out of range; give 1 to {largest} for {len(rows)} measured values"
         )
     top = min(uncertainty.supported_modes(test), largest)
     numbers = range(1, top + 1) if modes == "auto" else range(int(modes), int(modes) + 1)

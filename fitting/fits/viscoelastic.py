@@ -112,7 +112,7 @@ def check_modes(sweep: Sweep, modes: int) -> None:
     if modes > largest:
         raise InputError(
             f"{sweep.source or 'sweep'}: {largest + 1} different frequencies cannot determine the {2 * modes + 1} "
-            f"parameters of {modes} modes: use at most --modes {largest}"
+            f"parameters of {modes} modes; use at most --modes {largest}"
         )
 
 
@@ -312,7 +312,7 @@ def choose_modes(
         if failures == 2:
             break
     if chosen is None:
-        raise InputError(f"{sweep.source or 'sweep'}: every fit failed (with 1 mode: {broken[1]}): check the data")
+        raise InputError(f"{sweep.source or 'sweep'}: every fit failed (with 1 mode: {broken[1]}); check the data")
     table = [
         {
             "modes": f.modes,
@@ -343,7 +343,8 @@ def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int
         out.append(closer_but_not_chosen(closer.modes, errors, closer.converged))
     for modes, reason in broken.items():
         out.append(
-            f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}), so they could not be chosen"
+            f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}), so this number of modes could "
+            "not be chosen"
         )
     return out
 

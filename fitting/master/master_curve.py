@@ -71,7 +71,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
     if vertical and found.given:
         notes.append(
             "--vertical finds no factors of the moduli, because the file gives the factors of the frequencies: remove "
-            "its column shift_factor to find both kinds of factors"
+            "the column shift_factor to find both kinds of factors"
         )
     return MasterCurve(whole._replace(notes=tuple(notes)), parts, found, laws)
 
@@ -96,16 +96,16 @@ def _sentences(found: Shifts, noise: float) -> list[str]:
     uncertain. `noise`: relative scatter of the points."""
     T = celsius(found.temperatures)
     out = [
-        f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; their "
-        f"root mean square distance from one smooth curve is {100 * found.apart:.2g} %"
+        f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C. The root mean "
+        f"square distance of the shifted points from one smooth curve is {100 * found.apart:.2g} %"
     ]
     far = [k for k in np.argsort(-found.misfit) if found.misfit[k] > max(FAR_OFF, SCATTERS * noise)]
     if far:
         listed = ", ".join(f"{T[k]:.4g} °C {100 * found.misfit[k]:.2g} %" for k in far[:4])
         more = f" and {len(far) - 4} more" if len(far) > 4 else ""
         out.append(
-            f"superposition is not valid at all temperatures (distance from the common curve: {listed}{more}): "
-            "remove these temperatures, or try --vertical"
+            f"superposition is not valid at some temperatures (distance from the common curve: {listed}{more}); remove "
+            "these temperatures, or try --vertical"
         )
     loose = [k for k in range(len(T)) if found.log_a_errors[k] > LOOSE]
     if loose:
@@ -144,10 +144,10 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     moved = np.abs(other.log_a - found.log_a) / np.maximum(found.log_a_errors, 1e-12)
     k = int(np.argmax(moved))
     return [
-        f"the moduli have factors too ({b.min():.3g} to {b.max():.3g}). With --vertical, the sweeps lie "
-        f"{100 * other.apart:.2g} % from one curve instead of {100 * found.apart:.2g} %, and log10 a at {T[k]:.4g} °C "
-        f"is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}. The stated error does "
-        "not contain this difference: give --vertical"
+        f"the moduli also change with the temperature by factors of {b.min():.3g} to {b.max():.3g}. With --vertical, "
+        f"the sweeps lie {100 * other.apart:.2g} % from one curve instead of {100 * found.apart:.2g} %, and log10 a at "
+        f"{T[k]:.4g} °C is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}. The "
+        "stated error does not contain this difference: give --vertical"
     ]
 
 

@@ -49,7 +49,7 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
     if len(groups) < 2:
         raise InputError(
             f"{paths[0]}: --master needs sweeps at two or more temperatures, but all sweeps are at "
-            f"{celsius(parts[0][0]):.4g} °C: give a file with several tables, or several files"
+            f"{celsius(parts[0][0]):.4g} °C; give a file with several tables, or several files"
         )
     factors = np.array([float(np.exp(np.mean([np.log(p[1]) for p in g]))) for g in groups])
     means = np.array([float(np.mean([p[0] for p in g])) for g in groups])
@@ -82,18 +82,18 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
         stated = re.search(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
         if stated is None:
             raise InputError(
-                f"{path}: the table {repr(name) if name else 'of the file'} states no temperature: add a column "
+                f"{path}: the table {repr(name) if name else 'of the file'} states no temperature; add a column "
                 "temperature_C"
             )
         T = np.full(len(sweep.storage), float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C"))
     if np.any(T <= 0):
-        raise InputError(f"{path}: a temperature of {celsius(T.min()):.4g} °C is below absolute zero: check its unit")
+        raise InputError(f"{path}: a temperature of {celsius(T.min()):.4g} °C is below absolute zero; check its unit")
     order = np.argsort(T, kind="stable")
     group = np.empty(len(T), int)
     group[order] = np.concatenate([[0], np.cumsum(np.diff(T[order]) >= SAME)])
     factors = raw.get("shift_factor", np.full(len(T), np.nan))
     if np.any(factors <= 0):
-        raise InputError(f"{path}: shift_factor = {factors.min():g} is not above 0: give positive factors of frequency")
+        raise InputError(f"{path}: shift_factor = {factors.min():g} is not above 0; give positive factors of frequency")
     # Every temperature has the same frequencies. So a note that frequencies repeat would be wrong.
     if group.max() > 0:
         sweep = sweep._replace(notes=tuple(note for note in sweep.notes if REPEATED not in note and note != SORTED))

@@ -187,7 +187,8 @@ def refuse_impossible(sweep: Sweep) -> Spectrum:
         above = np.median(sweep.loss / sweep.storage)
         warm = next((note for note in sweep.notes if WARM in note), None)
         hint = warm or (
-            f"loss_modulus is {above:.1f} times storage_modulus (are the two columns exchanged, or in different units?)"
+            f"loss_modulus is {above:.1f} times storage_modulus (perhaps the two columns are exchanged, or in "
+            "different units)"
             if above > 1
             else "check columns and units"
         )

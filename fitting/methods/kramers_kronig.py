@@ -81,8 +81,9 @@ def without_instrument(sweep: Sweep) -> Sweep:
     low, high = (omega / (2 * np.pi) for omega in (here.angular_frequency[-1], sweep.angular_frequency[-1]))
     note = (
         f"{lost.sum()} of {len(lost)} points above {low:.4g} Hz {'is' if lost.sum() == 1 else 'are'} ignored. Reason: "
-        f"{told}, which is the mark of the instrument. Its inertia adds a term that grows as frequency^2; no material "
-        f"that relaxes shows this. --max-frequency {_rounded_up(high):.4g} keeps all points"
+        f"{told}, which is the mark of the instrument. The inertia of the instrument adds a term that grows as "
+        "frequency^2; no material that relaxes shows this term. To keep all points, give --max-frequency "
+        f"{_rounded_up(high):.4g}"
     )
     grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
     grey = grey if sweep.grey is None else np.concatenate([sweep.grey, grey])
@@ -136,9 +137,9 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
     if found.onset is not None:
         hertz, bound = found.onset / (2 * np.pi), next(why for low, _, why in found.breaches if low == found.onset)
         out.append(
-            f"above {hertz:.3g} Hz the storage modulus changes as in no material that relaxes ({bound}): the mark of "
-            "the instrument. Its inertia adds a term that grows as frequency^2. No model describes these points: "
-            f"exclude them with --max-frequency {_rounded_up(hertz):.4g}"
+            f"above {hertz:.3g} Hz the storage modulus changes as in no material that relaxes ({bound}). This is the "
+            "mark of the instrument: its inertia adds a term that grows as frequency^2. No model describes these "
+            f"points: exclude them with --max-frequency {_rounded_up(hertz):.4g}"
         )
     inner = [b for b in found.breaches if found.onset is None or b[0] < found.onset]
     if inner:
@@ -152,8 +153,8 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
         )
     if found.far:
         out.append(
-            "G' and G'' contradict each other (Kramers-Kronig): the best spectrum of any shape differs from them by "
-            f"{100 * found.misfit:.2g} % on average up to {last:.3g} Hz, but the points scatter by only "
+            "G' and G'' contradict each other (Kramers-Kronig): the best spectrum of any shape differs from these "
+            f"moduli by {100 * found.misfit:.2g} % on average up to {last:.3g} Hz, but the points scatter by only "
             f"{100 * found.scatter:.2g} %. No model can come closer. Look for drift, or strain beyond the linear range"
         )
     return out

@@ -49,7 +49,10 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     fewer than two values are determined."""
     values, errors = np.asarray(values, float), np.asarray(errors, float)
     if values.ndim != 1 or values.shape != errors.shape or np.any(errors < 0):
-        raise InputError(f"values {values.shape}, errors {errors.shape}: give one error of at least 0 per value (n,)")
+        raise InputError(
+            f"values have the shape {values.shape} and errors the shape {errors.shape}: give values (n,), and for each "
+            "value one error, 0 or more"
+        )
     known = (values > 0) & np.isfinite(values) & np.isfinite(errors) & (errors < 10 * values)
     if known.sum() < 2:
         return None

@@ -212,24 +212,24 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
                 + (
                     "the data do not need this mode; use fewer modes"
                     if modes > 1
-                    else f"the data do not determine it; {fewer}"
+                    else f"the data do not determine this ratio; {fewer}"
                 )
             )
         elif not tau_err[k] < 0.5 * tau[k]:
             out.append(
-                f"relaxation_times[{k}] = {tau[k]:.3g} s has a standard error of {_percent(tau_err[k], tau[k])}: "
-                f"the data hardly determine it; {fewer}"
+                f"relaxation_times[{k}] = {tau[k]:.3g} s has a standard error of {_percent(tau_err[k], tau[k])}: the "
+                f"data hardly determine this time; {fewer}"
             )
     for k in range(modes - 1):
         if tau[k] < MERGED * tau[k + 1]:
             out.append(
-                f"relaxation times {tau[k]:.3g} s and {tau[k + 1]:.3g} s have merged: they act as one mode; use "
+                f"relaxation times {tau[k]:.3g} s and {tau[k + 1]:.3g} s have merged, so they act as one mode; use "
                 f"{modes - 1} mode{'s' if modes > 2 else ''}"
             )
     if modes > supported_modes(data) or _decades(data) < 0.3:
         out.append(
-            f"the {kind} spans {_decades(data):.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
-            f"(the limit is about one mode per decade, plus one): {fewer}"
+            f"the {kind} spans {_decades(data):.2g} decades, which is too short for {modes} "
+            f"mode{'s' if modes > 1 else ''} (the limit is about one mode per decade, plus one): {fewer}"
         )
     return out
 
@@ -252,8 +252,8 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
         if low / 100 <= tau[k] <= 100 * high and not low <= tau[k] <= high:
             out.append(
                 f"relaxation_times[{k}] = {tau[k]:.3g} s lies outside the {low:.3g}-{high:.3g} s that the measured "
-                f"frequencies resolve: it is extrapolated (standard error {_percent(tau_err[k], tau[k])}); measure at "
-                f"{'higher' if tau[k] < low else 'lower'} frequencies to determine it"
+                f"frequencies resolve, so this time is extrapolated (standard error {_percent(tau_err[k], tau[k])}): "
+                f"measure at {'higher' if tau[k] < low else 'lower'} frequencies to determine it"
             )
     if model == "prony":
         out += like_a_fluid(u, LOWER)
@@ -261,7 +261,8 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
         out.append(
             f"the deviations in the file ({100 * sweep.relative_deviation:.2g} %) are not noise: the points scatter by "
             f"only {100 * sweep.point_scatter:.2g} %. The deviations are used as weights, and as the spread between "
-            "samples: one sample may differ that much from these moduli. To fit each sample, give one file per sample"
+            "samples (one sample may differ from these moduli by as much as the deviations). To fit each sample, give "
+            "one file per sample"
         )
     elif sweep.noise_given and _SMALL < sweep.point_scatter < sweep.relative_deviation / SHARED:
         out.append(
@@ -272,7 +273,7 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
         )
     elif sweep.noise_given and u.noise > 1.5:
         out.append(
-            f"the residuals are {u.noise:.2g} times the given deviations: the model misses something, or the "
+            f"the residuals are {u.noise:.2g} times the given deviations, so the model misses something, or the "
             "deviations are too small. The standard errors are enlarged by this factor"
         )
     return out

@@ -76,22 +76,25 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
             f"{file.name}: data row {k} is a summary of other rows ({own}) and is ignored" for k, own in summaries
         ]
         rows, left_out = _measured_rows(rows)
-        notes += [f"{file.name}: rows without a stress are ignored: {left_out}"] if left_out else []
+        notes += [f"{file.name}: {left_out} rows without a stress are ignored"] if left_out else []
         spreads = [name for name in rows[0] if _SPREAD.search(name)]
         if spreads:
             notes.append(
-                f"{file.name}: {', '.join(spreads)} {'is' if len(spreads) == 1 else 'are'} not used: the noise is "
-                "estimated from the residuals"
+                f"{file.name}: {', '.join(spreads)} {'is' if len(spreads) == 1 else 'are'} not used, because the noise "
+                "is estimated from the residuals"
             )
         found, named = _components(file, rows, unit) if "F11" in rows[0] else _named_tests(file, rows, unit)
         curves += found
         if not named:
-            notes.append(f"{file.name}: its stress column names no unit; {unit} is assumed (--unit Pa, kPa or MPa)")
+            notes.append(
+                f"{file.name}: the stress column names no unit; {unit} is assumed (to change this, give --unit Pa, kPa "
+                "or MPa)"
+            )
     for curve in (c for c in curves if c.returns):
         times = "once" if curve.returns == 1 else f"{curve.returns} times"
         notes.append(
             f"{curve.label}: the deformation reverses {times} (unloading, cycles or several samples). All rows are "
-            "fitted as one curve, and the errors do not contain the differences between its parts: keep one part, or "
+            "fitted as one curve, and the errors do not contain the differences between its parts; keep one part, or "
             "write each part into a separate file"
         )
     seen: dict[str, int] = {}
@@ -142,8 +145,8 @@ def _measured_rows(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], in
 def _row_under(names: list[str], cells: list[str], file: Path) -> dict[str, str]:
     if any(re.match(r"[-+]?\.?\d", cell) for cell in cells[len(names) :]):
         raise InputError(
-            f"{file}: {len(cells)} cells under {len(names)} headings in {','.join(cells)[:60]!r}; write decimals with "
-            "a point, and give every column a heading"
+            f"{file}: there are {len(cells)} cells under {len(names)} headings in {','.join(cells)[:60]!r}; write "
+            "decimals with a point, and give every column a heading"
         )
     return dict(zip(names, cells, strict=False))  # cells may be missing at the end, and remarks may follow the cells
 
@@ -192,9 +195,9 @@ def _column(file: Path, rows: list[dict], name: str, default: float | None = Non
             values.append(float(text))
         except ValueError:
             where = f"{file}, data row {row['row']}"
-            raise InputError(f"{where}: {name} = {text[:40]!r} is not a number: give a number") from None
+            raise InputError(f"{where}: {name} = {text[:40]!r} is not a number; give a number") from None
         if not np.isfinite(values[-1]):
-            raise InputError(f"{file}, data row {row['row']}: {name} = {text} is not finite: remove the row")
+            raise InputError(f"{file}, data row {row['row']}: {name} = {text} is not finite; remove this row")
     return np.array(values)
 
 
@@ -233,11 +236,11 @@ def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], b
     measured = {at: values for at, values in measured.items() if np.abs(values).max() > ROUNDOFF * largest}
     named = all(stated[at] for at in measured)
     if not measured:
-        raise InputError(f"{file}: all stresses P11 … P33 are zero or missing: give the measured components")
+        raise InputError(f"{file}: all stresses P11 … P33 are zero or missing; give the measured components")
     if any(2 in ij for ij in measured):
-        raise InputError(f"{file}: face 3 carries stress (P13 … P33): rotate the axes so that face 3 is free of stress")
+        raise InputError(f"{file}: P13 … P33 are not 0; rotate the axes so that face 3 is free of stress")
     if np.abs(F[:, [0, 1, 2, 2], [2, 2, 0, 1]]).max() > 1e-9:
-        raise InputError(f"{file}: F13, F23, F31, F32 must be 0: rotate the axes so that face 3 stays flat")
+        raise InputError(f"{file}: F13, F23, F31, F32 must be 0; rotate the axes so that face 3 stays flat")
     if (1, 1) in measured and (0, 0) in measured and np.allclose(measured[0, 0], measured[1, 1], rtol=1e-6):
         del measured[1, 1]  # P11 and P22 are the same measurement, written twice
     kind = _kind(F)
@@ -281,7 +284,7 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
     for row in rows:
         test = row["test"]
         if test not in homogeneous.TESTS:
-            raise InputError(f"{file}: test {test!r} is not known: use one of {', '.join(homogeneous.TESTS)}")
+            raise InputError(f"{file}: test {test!r} is not known; use one of {', '.join(homogeneous.TESTS)}")
         groups.setdefault((test, at.get(_stretch_of_shear(row), "") if test == "simple_shear" else ""), []).append(row)
     curves, factor = [], column[1]
     for (test, fixed), group in groups.items():
@@ -290,16 +293,16 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         driven = _column(file, group, "shear") if shear else stretch
         if shear and np.abs(driven).max() > SHEARED:
             raise InputError(
-                f"{file}: a shear of {driven[np.argmax(np.abs(driven))]:g} is too large: a shear is the displacement "
+                f"{file}: a shear of {driven[np.argmax(np.abs(driven))]:g} is too large. A shear is the displacement "
                 "divided by the height; write a shear of 2 % as 0.02"
             )
         if np.any(stretch <= 0):
             raise InputError(
-                f"{file}: a stretch of {stretch.min():g} is not possible: give the length divided by the length at rest"
+                f"{file}: a stretch of {stretch.min():g} is not possible; give the length divided by the length at rest"
             )
         if not shear and stretch.min() >= STRAINED:
             raise InputError(
-                f"{file}: stretches of {stretch.min():g} to {stretch.max():g} do not begin near 1: a stretch is the "
+                f"{file}: stretches of {stretch.min():g} to {stretch.max():g} do not begin near 1. A stretch is the "
                 "length divided by the length at rest; write a strain of 2 % as 1.02"
             )
         stress = factor * _column(file, group, column[0])
@@ -308,7 +311,7 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         if not shear and stretch.min() < SHORTENED and stretch.max() > STRAINED and of_one_sign:
             raise InputError(
                 f"{file}: stretches of {stretch.min():g} and {stretch.max():g} do not have opposite stresses, although "
-                "one is below 1. A stretch is the length divided by the length at rest: write 1.02 for a strain of 2 %"
+                "one is below 1. A stretch is the length divided by the length at rest; write 1.02 for a strain of 2 %"
             )
         F = np.asarray(homogeneous.deformation_gradient(test, driven, stretch))
         label = f"{file.stem}, {test.replace('_', ' ')}" + (f" at {fixed}" if shear and fixed not in ("", "1") else "")
@@ -342,14 +345,17 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
     J = np.linalg.det(F)
     worst = int(np.argmax(np.abs(J - 1)))
     if abs(J[worst] - 1) > 1e-3:
-        raise InputError(f"{file}: det F = {J[worst]:.4g} in row {worst + 1}: the volume must not change (det F = 1)")
+        raise InputError(
+            f"{file}: det F = {J[worst]:.4g} in row {worst + 1}, but the volume must not change; give gradients with "
+            "det F = 1"
+        )
     if len(stress) < 3:
-        raise InputError(f"{file}: {label} has {len(stress)} points: give at least 3")
+        raise InputError(f"{file}: {label} has {len(stress)} points; give at least 3")
     rms = np.sqrt(np.mean(stress**2))
     if not 1e-100 < rms < 1e100:
-        raise InputError(f"{file}: {label} has a mean stress of {rms:g} Pa: give measured stresses")
+        raise InputError(f"{file}: {label} has a mean stress of {rms:g} Pa; give measured stresses")
     if np.ptp(F, axis=0).max() == 0:
-        raise InputError(f"{file}: {label} has the same deformation in every row: give a curve")
+        raise InputError(f"{file}: {label} has the same deformation in every row; give a curve")
     # The digits of F in the file are rounded, so F33 is scaled to make det F = 1.
     F = F.copy()
     F[:, 2, 2] /= J

@@ -63,16 +63,19 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     n = len(table["ux"])
     measured = scale * np.stack([table[c] for c in ("ux", "uy", "uz")], axis=1)
     if np.any(np.isinf(measured)):
-        raise InputError(f"{path}: row {int(np.argwhere(np.isinf(measured))[0, 0]) + 1} is infinite: empty the cell")
+        raise InputError(
+            f"{path}: row {int(np.argwhere(np.isinf(measured))[0, 0]) + 1} contains an infinite displacement; leave "
+            "the cell empty"
+        )
     seen = np.isfinite(measured)
     if not seen.any():
-        raise InputError(f"{path}: no displacement is measured: fill ux, uy, uz")
+        raise InputError(f"{path}: no displacement is measured; fill the columns ux, uy, uz")
     size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
     wild = np.argwhere(np.abs(np.where(seen, measured, 0.0)) > _LONGEST * size)
     if len(wild):
         row, axis = wild[0]
         raise InputError(
-            f"{path}: row {row + 1}: u{'xyz'[axis]} = {measured[row, axis]:g} m in a body of {size:.3g} m: give "
+            f"{path}: row {row + 1} has u{'xyz'[axis]} = {measured[row, axis]:g} m in a body of {size:.3g} m; give "
             "--unit, or leave the cell empty if the displacement was not measured"
         )
     if "sd" in table:
@@ -81,10 +84,11 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
         sd = np.full(n, noise)
     else:
         raise InputError(
-            f"{path}: no column sd: add this column, or give the noise's standard deviation in metres with --noise"
+            f"{path}: the column sd is missing; add this column, or give the noise's standard deviation in metres "
+            "with --noise"
         )
     if not (np.all(np.isfinite(sd)) and np.all(sd > 0)):
-        raise InputError(f"{path}: sd must be positive and finite: give the noise's standard deviation")
+        raise InputError(f"{path}: sd must be positive and finite; give the noise's standard deviation")
     if "node" in table:
         nodes, weights = _at_nodes(path, mesh, table["node"])
     else:
@@ -111,7 +115,7 @@ def _refuse_other_places(path: Path, places: np.ndarray, size: float, unit: str)
     if len(np.unique(places, axis=0)) >= _SOME and across < _TOGETHER * size:
         raise InputError(
             f"{path}: all points lie within {across:.2g} m of each other, in a body of {size:.3g} m: --unit {unit} "
-            "applies to x, y, z and ux, uy, uz, so write all these columns in one unit"
+            "applies to x, y, z and to ux, uy, uz, so write all these columns in one unit"
         )
 
 
@@ -125,7 +129,7 @@ def _no_copies(path: Path, table: dict[str, np.ndarray]) -> None:
         k = int(again[0])
         raise InputError(
             f"{path}: row {k + 1} repeats row {first[of.ravel()[k]] + 1} ({len(again)} of {len(rows)} rows are "
-            "copies): remove the copies, because each row counts as a measurement"
+            "copies); remove the copies, because each row counts as a measurement"
         )
 
 
@@ -144,7 +148,7 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
         names, lines = [name.lower() for name in names], lines[1:]
     for name in names:
         if name not in _COLUMNS:
-            raise InputError(f"{path}: column {name!r} is not known: use {', '.join(_COLUMNS)}")
+            raise InputError(f"{path}: column {name!r} is not known; use {', '.join(_COLUMNS)}")
     for needed in ("ux", "uy", "uz"):
         if needed not in names:
             raise InputError(f"{path} has no column {needed}: give x,y,z (or node) and ux,uy,uz")
@@ -160,12 +164,12 @@ def _rows_of_numbers(path: Path, names: list[str], rows: list[list[str]], betwee
     sign, values = decimal_sign(cell for row in rows[:1000] for cell in row), np.full((len(rows), len(names)), np.nan)
     for k, row in enumerate(rows):
         if len(row) > len(names):
-            raise InputError(f"{path}: row {k + 1} has {len(row)} cells under {len(names)} headings: correct the row")
+            raise InputError(f"{path}: row {k + 1} has {len(row)} cells under {len(names)} headings; correct the row")
         for j, cell in enumerate(row):
             value = to_number(cell, between, sign)
             if value is None:
                 raise InputError(
-                    f"{path}: row {k + 1}: {names[j]} = {cell!r} is not a number: correct it, or leave it empty"
+                    f"{path}: row {k + 1}: {names[j]} = {cell!r} is not a number; correct this cell, or leave it empty"
                 )
             values[k, j] = value
     return values
@@ -175,7 +179,7 @@ def _at_nodes(path: Path, mesh: TetMesh, node: np.ndarray) -> tuple[np.ndarray, 
     whole = np.isfinite(node) & (node == np.round(node)) & (node >= 0) & (node < mesh.number_of_nodes)
     if not whole.all():
         bad = node[np.flatnonzero(~whole)[0]]
-        raise InputError(f"{path}: node {bad:g} is not in the mesh: give whole numbers 0 to {mesh.number_of_nodes - 1}")
+        raise InputError(f"{path}: node {bad:g} is not in the mesh; give whole numbers 0 to {mesh.number_of_nodes - 1}")
     weights = np.zeros((len(node), 4))
     weights[:, 0] = 1
     return np.repeat(node.astype(np.int32)[:, None], 4, axis=1), weights
@@ -183,19 +187,19 @@ def _at_nodes(path: Path, mesh: TetMesh, node: np.ndarray) -> tuple[np.ndarray, 
 
 def _measured_at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not np.all(np.isfinite(points)):
-        raise InputError(f"{path}: a position x,y,z is not finite: give the position at rest of every point")
+        raise InputError(f"{path}: a position x,y,z is not finite; give the position at rest of every point")
     nodes, weights, outside = locate(mesh, points)
     if np.any(outside > _FAR):
         bad = int(np.argmax(outside))
         raise InputError(
-            f"{path}: the point {points[bad].tolist()} m is {outside[bad]:.3g} element sizes away from "
-            "the mesh: is --unit right?"
+            f"{path}: the point {points[bad].tolist()} m is {outside[bad]:.3g} element sizes away from the mesh; check "
+            "--unit"
         )
     off = int(np.sum(outside > _OUTSIDE))
     if off > _MOST_OUTSIDE * len(points):
         raise InputError(
             f"{path}: {off} of {len(points)} points lie outside of the mesh, by up to {outside.max():.2g} element "
-            "sizes: check the axes, the origin and --unit"
+            "sizes; check the axes, the origin and --unit"
         )
     return nodes, weights
 
@@ -236,7 +240,7 @@ def _steps(path: Path, scene: Scene, time: np.ndarray | None, n: int) -> np.ndar
     if off.any():
         bad = time[np.flatnonzero(off)[0]]
         raise InputError(
-            f"{path}: there is no step of the scene at time {bad:g} s: use multiples of dt = {dt:g} s up to "
+            f"{path}: the scene has no step at the time {bad:g} s; use multiples of dt = {dt:g} s up to "
             f"{dt * (last + 1):g} s"
         )
     return step.astype(np.int32)

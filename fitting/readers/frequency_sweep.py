@@ -89,18 +89,18 @@ def check_sweep(sweep: Sweep) -> None:
             continue
         kind = getattr(getattr(values, "dtype", None), "kind", "")
         if kind not in ("f", "i", "u"):
-            raise InputError(f"{name}: {key} is of type {type(values).__name__}: give an array of real numbers (n,)")
+            raise InputError(f"{name}: {key} is of type {type(values).__name__}; give an array of real numbers (n,)")
         if values.ndim != 1 or values.shape != first or not len(values):
-            raise InputError(f"{name}: {key} has shape {values.shape}: give one number per frequency, here {first}")
+            raise InputError(f"{name}: {key} has shape {values.shape}; give one number per frequency, here {first}")
         wrong = np.flatnonzero(~(np.isfinite(values) & (values > 0)))
         if wrong.size:
             raise InputError(
-                f"{name}: {key}[{wrong[0]}] = {values[wrong[0]]:g} must be above 0: correct or remove this value"
+                f"{name}: {key}[{wrong[0]}] = {values[wrong[0]]:g} must be above 0; correct or remove this value"
             )
     if (sweep.storage_sd is None) != (sweep.loss_sd is None):
-        raise InputError(f"{name}: only one of storage_sd and loss_sd is given: give both, or neither")
+        raise InputError(f"{name}: only one of storage_sd and loss_sd is given; give both, or neither")
     if np.any(np.diff(sweep.angular_frequency) < 0):
-        raise InputError(f"{name}: angular_frequency must be in ascending order: sort the points")
+        raise InputError(f"{name}: angular_frequency must be in ascending order; sort the points")
 
 
 #: Numbers of neighbouring points that are compared with a polynomial. With more neighbours the degree is higher, and
@@ -261,7 +261,7 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
     if len(np.unique(hertz[kept])) < FEWEST:
         raise InputError(
             f"{sweep.source or 'sweep'}: --min-frequency and --max-frequency keep only {kept.sum()} of {len(kept)} "
-            f"points (the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz): keep {FEWEST} frequencies or more"
+            f"points (the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz); keep {FEWEST} frequencies or more"
         )
     ends = " and ".join(
         f"{word} {limit:g} Hz" for word, limit in (("below", low), ("above", high)) if limit is not None
@@ -302,7 +302,9 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     if found is None and "phase" in raw:
         found = raw_torque.share_by_phase(omega, G, {"phase": -raw["phase"]})
         if found is not None:
-            sign = "the raw phases agree with the moduli only after a change of sign (they are lags of the angle)"
+            sign = (
+                "the raw phases agree with the moduli only after a change of sign (these phases are lags of the angle)"
+            )
             sweep = sweep._replace(notes=(*sweep.notes, sign))
     if found is None:
         if {"torque", "angle"} <= set(raw) and geometry is None:
@@ -336,7 +338,8 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     lowest = sweep.angular_frequency[lost].min() / (2 * np.pi)
     share = f"the uncertainty of the torque of the inertia ({100 * raw_torque.UNCERTAINTY:g} % of that torque)"
     left = (
-        f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are ignored: the sample's torque is below {share}"
+        f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are ignored, because the torque of the sample is "
+        f"below {share}"
     )
     grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
     return some(sweep, ~lost)._replace(notes=(*sweep.notes, note, left), grey=grey)

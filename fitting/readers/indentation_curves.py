@@ -76,14 +76,14 @@ def read_indentation(path: str | Path) -> IndentationCurve:
         pulls = len(force) >= _FEWEST and np.mean(force) < 0 and np.argmin(force) > len(force) / 2
         remedy = "the depth falls during loading, so change its sign" if falls else "give more loading points"
         remedy = "the force falls while the depth grows, so change its sign" if pulls and not falls else remedy
-        remedy = "the force is the same in all rows; is this the right column?" if np.ptp(force) == 0 else remedy
+        remedy = "the force is the same in all rows, so check the column of the force" if np.ptp(force) == 0 else remedy
         raise InputError(
             f"{path}: the loading has {last} points; a fit needs {_FEWEST} or more, at different depths: {remedy}"
         )
     depth, force = depth[:last], force[:last]
     offset = _offset(force)
     if offset:
-        notes.append(f"the force is {offset:.3g} N before it rises: this offset of the sensor is subtracted")
+        notes.append(f"the force is {offset:.3g} N before the rise; this offset of the sensor is subtracted")
     return IndentationCurve(depth, force - offset, str(path), tuple(notes))
 
 
@@ -208,7 +208,9 @@ def _told_of_others(lines: list[str], head: int, found: dict[str, _PlacedColumn]
     for quantity, place in found.items():
         others = [each.name for each in _places(cells, below, quantity) if each != place]
         if others:
-            notes.append(f"the {quantity} is the column {place.name!r}; not used: {', '.join(map(repr, others))}")
+            notes.append(
+                f"the {quantity} is read from the column {place.name!r}, not from {', '.join(map(repr, others))}"
+            )
     return notes
 
 
@@ -233,6 +235,6 @@ def _in_si_units(
         kept.append(values)
     table = np.array(kept, float).reshape(-1, len(found)) * [p.factor for p in found.values()]
     if np.any(np.abs(table) > _LARGEST):
-        raise InputError(f"{path}: {np.abs(table).max():g} is beyond any measurement: correct the unit or the row")
-    notes = [f"{empty} of {len(rows)} rows are ignored: a cell in them is empty"] if empty else []
+        raise InputError(f"{path}: {np.abs(table).max():g} is beyond any measurement; correct the unit or the row")
+    notes = [f"{empty} of {len(rows)} rows are ignored, because a cell is empty"] if empty else []
     return dict(zip(found, table.T, strict=True)), notes

@@ -67,8 +67,8 @@ def without_unit(cells: list[str], units: list[str]) -> list[str]:
     """Return a note on each raw column of the instrument that cannot be used because its unit is unknown."""
     known = _places_and_units(cells, units)
     return [
-        f"column {cells[k].strip()!r} is not used to find the inertia of the instrument: its unit "
-        f"{f'{unit!r} is not known' if unit else 'is not stated'}; name it e.g. {_EXAMPLES[quantity]}"
+        f"column {cells[k].strip()!r} is not used to find the inertia of the instrument, because the unit "
+        f"{f'{unit!r} is not known' if unit else 'is not stated'}; name this column e.g. {_EXAMPLES[quantity]}"
         for k, quantity, _, unit in _known_headings(cells, units)
         if quantity in _EXAMPLES and quantity not in known
     ]

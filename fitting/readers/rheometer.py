@@ -178,13 +178,13 @@ def _what_differs(sweep: Sweep) -> list[str]:
     if len(np.unique(sweep.angular_frequency)) == len(sweep.angular_frequency):
         if heat.size and np.ptp(heat) > WARMER:
             out.append(
-                f"the temperature changes by {np.ptp(heat):.2g} K in the sweep: the fit treats its effect on the "
+                f"the temperature changes by {np.ptp(heat):.2g} K in the sweep, and the fit treats its effect on the "
                 "moduli as an effect of the frequency"
             )
         if strain.size and strain.min() > 0 and strain.max() > STRAINED * strain.min():
             out.append(
                 f"the strain goes from {strain.min():.2g} to {strain.max():.2g} in the sweep: if the strain is not "
-                "small, the fit treats its effect on the moduli as an effect of the frequency"
+                "small, the fit treats the effect of the strain as an effect of the frequency"
             )
         return out
     if heat.size and np.ptp(heat) > WARMER:
@@ -229,7 +229,7 @@ def _contradictions(path: str, beside: list[tuple[Column, np.ndarray]], values: 
         )
         if apart > CONTRADICTS:
             out.append(
-                f"column {column.name!r} is not used; it contradicts G' and G'' by {100 * apart:.2g} % "
+                f"column {column.name!r} is not used, because it contradicts G' and G'' by {100 * apart:.2g} % "
                 "(median): check which of these columns is wrong, or was corrected"
             )
     return out
@@ -242,4 +242,4 @@ def _check_agreement(path: str, first: dict, column: Column, written: np.ndarray
     both = both / 3 if column.quantity.split("_")[0] in MODULI and is_tensile(column) else both
     seen = np.isfinite(both)
     if not np.allclose(both[seen], values[good][seen], rtol=0.01):
-        raise InputError(f"{path}: columns {own.name} and {column.name} disagree; remove the wrong one")
+        raise InputError(f"{path}: columns {own.name} and {column.name} disagree; remove the wrong column")

@@ -134,7 +134,7 @@ def read_time_test(
         notes += _another_course(str(path), kind, time, columns[form[0]], (ramp or 0.0, start))
         time, driven, answer = _as_a_step(str(path), time, columns[form[0]], ramp or 0.0)
         if sample.radius is not None or sample.height is not None:
-            notes.append(f"the size of the sample is not used: the file has a column of {form[0]}")
+            notes.append(f"the size of the sample is not used, because the file has a column of {form[0]}")
         if ramp is None:
             word = "strain" if kind == "relaxation" else "stress"
             notes.append(
@@ -213,7 +213,7 @@ def from_rest(
             shown = f"the load rose between {time[rows[0] - 1]:.4g} and {time[rows[0]]:.4g} s"
         elif loaded:
             shown = "the rows begin under load, and only 0 (a step at 0 s) is possible there"
-        raise InputError(f"{names[0]}: {names[1]} {ramp:g} cannot be right, since {shown}: remove this setting")
+        raise InputError(f"{names[0]}: {names[1]} {ramp:g} cannot be right, since {shown}; remove this setting")
     if ramp is not None:
         time, driven, answer = _rows_before_jumps(rows, ramp, time, driven, answer)
     if not time[0] > 0:
@@ -336,7 +336,7 @@ def _as_a_step(path, time, modulus, ramp):
     if not (np.isfinite(ramp) and ramp >= 0):
         raise InputError(f"{path}: --ramp {ramp:g} cannot be the duration of a ramp in seconds; give 0 or more")
     if ramp > time[-1]:
-        raise InputError(f"{path}: --ramp {ramp:g} ends after the last row at {time[-1]:g} s; give it in seconds")
+        raise InputError(f"{path}: --ramp {ramp:g} ends after the last row at {time[-1]:g} s; give seconds")
     kept = time > 0
     times = np.unique(np.concatenate([[0.0], time[kept], [ramp] if ramp else []]))
     answer = np.full(len(times), np.nan)
@@ -381,14 +381,14 @@ def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, 
     peak = int(np.argmax(v))
     if not ramp and v[peak] - v[: peak + 1].min() > allowed:
         raise InputError(
-            f"{path}: the modulus rises until {t[peak]:.3g} s, but after a step of strain it can only fall. If the "
-            f"strain rose until then, give --ramp {t[peak]:.3g}; otherwise exclude the earlier rows (--min-time "
+            f"{path}: the modulus rises until {t[peak]:.3g} s, but after a step of strain the modulus can only fall. "
+            f"If the strain rose until then, give --ramp {t[peak]:.3g}; otherwise exclude the earlier rows (--min-time "
             f"{t[peak]:.3g})"
         )
     if ramp and t[0] < 0.3 * ramp and v[0] > 0.7 * size:
         return [
             f"the modulus has {100 * v[0] / size:.0f} % of its largest value at {t[0]:.3g} s, but a ramp of {ramp:g} s "
-            f"has only {100 * t[0] / ramp:.2g} % of its strain then: is --ramp right?"
+            f"has only {100 * t[0] / ramp:.2g} % of its strain at this time: check --ramp"
         ]
     return []
 
@@ -429,7 +429,7 @@ def _as_shear(path, form, columns, sample):
     if form == ("strain", "stress"):
         return columns["strain"], columns["stress"], []
     if sample.radius is None or sample.height is None:
-        raise InputError(f"{path}: {form[1]} needs the sample's size: give --radius and --height in metres")
+        raise InputError(f"{path}: {form[1]} needs the sample's size; give --radius and --height in metres")
     r, h = sample.radius, sample.height
     if form == ("angle", "torque"):
         return columns["angle"] * r / h, columns["torque"] * 2 / (np.pi * r**3), []
@@ -456,8 +456,8 @@ def _without_offset(test: TimeTest) -> tuple[np.ndarray, float, list[str]]:
         return test.answer, 0.0, []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
     told = (
-        f"the {what} of the {count} rows before the load is {mean:.3g}{unit} on average, "
-        f"{100 * abs(mean) / size:.2g} % of the largest: this offset of the sensor is subtracted from all rows"
+        f"the {what} of the {count} rows before the load is {mean:.3g}{unit} on average, which is "
+        f"{100 * abs(mean) / size:.2g} % of the largest {what} (absolute value): this sensor offset is subtracted"
     )
     return test.answer - mean, error, [told]
 
@@ -473,9 +473,9 @@ def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
         return []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
     return [
-        f"the {what} is {here:.3g}{unit} at {test.time[k]:.3g} s, before the load, {100 * abs(here) / size:.2g} % of "
-        "the largest. If this is an offset of the sensor, it changes all moduli: subtract it from all rows, or give "
-        f"{RESTING} or more rows before the load"
+        f"the {what} is {here:.3g}{unit} at {test.time[k]:.3g} s, before the load, which is "
+        f"{100 * abs(here) / size:.2g} % of the largest {what} (absolute value). If this is an offset of the sensor, "
+        f"it changes all moduli: subtract this {what} from all rows, or give {RESTING} or more rows before the load"
     ]
 
 
@@ -489,7 +489,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
     used = test.used & np.isfinite(answer) & (test.time >= start) & (test.time > test.begun)
     if used.sum() < 4:
         raise InputError(
-            f"{test.source}: {used.sum()} usable responses remain; give four or more (is --min-time too late?)"
+            f"{test.source}: {used.sum()} usable responses remain; give four or more, or a smaller --min-time"
         )
     if not np.sum(driven[used] * answer[used]) > 0:
         raise InputError(

@@ -37,8 +37,8 @@ def text(path: Path, data: bytes, wanted: str) -> str:
         sheets = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
     except Exception as error:  # the library has one exception per format, and raises others for damaged files
         raise InputError(
-            f"{path} is a spreadsheet workbook that cannot be read ({_line(error)}): save it again, or export {wanted} "
-            "as CSV"
+            f"{path} is a spreadsheet workbook that cannot be read ({_line(error)}): save the file again, or export "
+            f"{wanted} as CSV"
         ) from None
     parts = [["[step]", name, *("\t".join(map(_line, row)) for row in rows), ""] for name, rows in sheets.items()]
     return "\n".join(line for part in parts for line in part)

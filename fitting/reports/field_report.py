@@ -42,9 +42,9 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
     ratio = found.chi2 / found.components
     if ratio < TOO_NEAR and found.components >= FEW and not with_mesh:
         return (
-            f"chi2 is {ratio:.3g} per component, so the displacements scatter {np.sqrt(ratio):.2g} times as much "
-            "as the stated noise, and the errors are too large. Give the noise (--noise) in metres, whatever the unit "
-            "of the file is"
+            f"chi2 is {ratio:.3g} per component, so the displacements scatter {np.sqrt(ratio):.2g} times as much as "
+            "the stated noise, and the errors are too large. Give the noise (--noise) in metres, also if the file has "
+            "another unit"
         )
     if not ratio > TOO_FAR:
         return None

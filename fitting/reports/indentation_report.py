@@ -84,20 +84,20 @@ def indentation_warnings(
         told.append(f"{fit.before} points are before contact: measure the approach too, to find the contact point")
     if level is not None:
         told.append(
-            "the force rises or falls steadily before contact: the sensor drifts, and this changes modulus and "
+            "the force rises or falls steadily before contact. The sensor drifts, and this drift changes modulus and "
             f"contact point. If a straight line through these points is subtracted, E = {level.modulus:.5g} ± "
             f"{level.standard_errors[0]:.2g} Pa and d0 = {level.contact_point:.5g} ± {level.standard_errors[1]:.2g} m"
         )
     width = np.sqrt(deepest / rig.radius) if rig.shape == "sphere" else 0.0
     if width > _WIDE or deepest > _DEEP * rig.thickness:
         far = (
-            f"the contact is {width:.0%} of the radius wide"
+            f"the radius of the contact is {width:.0%} of the radius of the sphere"
             if width > _WIDE
-            else f"the indentation depth is {deepest:.3g} m, {deepest / rig.thickness:.0%} of the thickness"
+            else f"the indentation depth is {deepest:.3g} m, which is {deepest / rig.thickness:.0%} of the thickness"
         )
         told.append(f"{far}, but the theory is for small strains: also fit only a part of the curve, and compare")
     if fit.modulus <= 0:
-        told.append("the modulus is not positive: the force does not rise with the depth; check the signs")
+        told.append("the modulus is not positive, because the force does not rise with the depth: check the signs")
     # The points before contact contain only noise. With these points, a misfit in contact would look like noise.
     touching = fit.residuals[curve.depth > fit.contact_point]
     runs, chance = runs_probability(touching)
@@ -109,13 +109,16 @@ def indentation_warnings(
         )
     if fit.independent is not None:
         told.append(
-            "neighbouring residuals are correlated: the noise is correlated, or the model is incomplete. The "
-            f"{len(fit.residuals)} points carry the information of {fit.independent:.0f} independent points; the "
-            "standard errors include this"
+            "neighbouring residuals are correlated, because the noise is correlated, or because the model is "
+            f"incomplete. The {len(fit.residuals)} points carry the information of {fit.independent:.0f} independent "
+            "points; the standard errors include this effect"
         )
     # The noise is estimated from neighbouring points, because the residuals contain the adhesion.
     if curve.force.min() < -5 * noise_of_series(curve.force):
-        told.append("some forces are negative: this is adhesion, which the model does not contain")
+        told.append(
+            "some forces are clearly negative: this is probably adhesion, which the model does not contain, or an "
+            "error of the zero of the force"
+        )
     return told
 
 

@@ -23,7 +23,9 @@ def write(folder: Path, model: Maxwell) -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
     told = []
     if len(model.ratios) > FEBIO_TERMS:
-        told.append(f"FEBio has at most {FEBIO_TERMS} modes, but the model has {len(model.ratios)}: no FEBio card")
+        told.append(
+            f"FEBio has at most {FEBIO_TERMS} modes, but the model has {len(model.ratios)}, so no FEBio card is written"
+        )
         (folder / "febio.feb").unlink(missing_ok=True)
     else:
         (folder / "febio.feb").write_text(febio(model))

@@ -25,7 +25,7 @@ class Prediction(NamedTuple):
     measured: np.ndarray  # (m,)
     standard_errors: np.ndarray  # (m,) of the prediction; infinite if the fit does not determine it
     scales: np.ndarray  # (m,) weights: standard deviations if the test has them
-    sizes: np.ndarray  # (m,) divisors of relative errors
+    sizes: np.ndarray  # (m,) relative error = |predicted - measured| / sizes
     inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep
 
     @property

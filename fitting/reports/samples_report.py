@@ -143,8 +143,8 @@ def warnings(found: Samples) -> list[str]:
             without = [Path(s.source).name for s, x in zip(found.sweeps, p.pooled, strict=True) if np.isnan(x)]
             if without:
                 out.append(
-                    f"{name}: {', '.join(without)} does not determine this parameter (a fluid, or another band?), so "
-                    "the population contains only the other samples"
+                    f"{name}: the fit of {', '.join(without)} does not determine this parameter (perhaps a fluid, or "
+                    "another band), so the population contains only the other samples"
                 )
     out += _limits_of_typical(found)
     out += outliers(found)
@@ -152,8 +152,8 @@ def warnings(found: Samples) -> list[str]:
     if heat.size and np.ptp(heat) > WARMER:
         low, high = celsius(np.array([heat.min(), heat.max()]))
         out.append(
-            f"the samples were measured at {low:.4g} to {high:.4g} °C: their spread contains the effect of the "
-            "temperature"
+            f"the samples were measured at {low:.4g} to {high:.4g} °C, so the spread between the samples contains the "
+            "effect of the temperature"
         )
     failed = [Path(s.source).name for f, s in _pairs(found) if not f.converged]
     if failed:

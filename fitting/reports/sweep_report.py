@@ -203,8 +203,8 @@ def write(
         content["warnings"] += posterior.warnings()
         if alike_points.INDEPENDENT in main.details:
             content["warnings"].append(
-                "the posterior assumes independent noise of all moduli, but neighbouring points are correlated: "
-                "its intervals are too narrow; use the standard errors"
+                "the posterior assumes independent noise of all moduli, but neighbouring points are correlated. The "
+                "intervals of the posterior are too narrow: use the standard errors"
             )
         posterior_report.write_draws(out / "posterior.csv", posterior)
     content = numbers(content)
@@ -495,5 +495,5 @@ def _agreement(fits: list[Fit]) -> list[str]:
         return [f"the simulation changes a parameter by {shift:.2g} standard errors, in {seconds:.2g} s"]
     return [
         f"closed form and simulation agree within {100 * max(shift, 1e-3):.1g} % of the standard errors: the "
-        f"simulation ({seconds:.2g} s) adds nothing here, and --method closed-form gives the same"
+        f"simulation ({seconds:.2g} s) adds nothing here, and --method closed-form gives the same result"
     ]

@@ -104,7 +104,7 @@ def read_described(path: str | Path) -> TimeTest:
     sign = np.sign(d[np.argmax(np.abs(d))]) or 1.0
     largest = float(np.max(sign * d))
     if not largest > 0:
-        raise InputError(f"{described.data}: the displacement is zero throughout: give a test with a displacement")
+        raise InputError(f"{described.data}: the displacement is zero throughout; give a test with a displacement")
     curve, size, told = _elastic(described, largest, str(path))
     section = curve(largest * 1e-3) / (1e-3 * largest / size)
     if described.test in ("sphere", "cone"):
@@ -117,8 +117,8 @@ def read_described(path: str | Path) -> TimeTest:
         kept, told_of_way = _while_contact_grows(time, sign * d)
         if kept < _FEWEST:
             raise InputError(
-                f"{described.data}: the indenter goes back from {time[kept]:.4g} s on, after {kept} rows: "
-                "give a test that begins with an indentation"
+                f"{described.data}: the indenter goes back from {time[kept]:.4g} s on, after {kept} rows; give a test "
+                "that begins with an indentation"
             )
         time, d, force, told = time[:kept], d[:kept], force[:kept], [*told, *told_of_way]
     if described.test in ("sphere", "cone") and described.drive == "displacement":
@@ -144,8 +144,8 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
         return len(time), []
     kept = int(np.argmax(back))
     return kept, [
-        f"{len(time) - kept} rows from {time[kept]:.4g} s on are ignored: the indenter goes back there, and the "
-        "formulas are not valid while the contact shrinks"
+        f"{len(time) - kept} rows from {time[kept]:.4g} s on are ignored, because the indenter goes back there, and "
+        "the formulas are not valid while the contact shrinks"
     ]
 
 
@@ -186,31 +186,31 @@ def _description(path: Path) -> Described:
     for key in ("data", *needed):
         if key not in table:
             unit = {"data": "", "half_angle": " in degrees"}.get(key, " in metres")
-            raise InputError(f"{path}: {test} needs {key}: give {key}{unit}")
+            raise InputError(f"{path}: {test} needs {key}; give this key{unit}")
     sizes = {key: _number_of(path, key, table[key]) for key in needed}
     bad = next((key for key, value in sizes.items() if not 0 < value < (90 if key == "half_angle" else 1)), None)
     if bad:
         raise InputError(
-            f"{path}: {bad} = {sizes[bad]:g} cannot be the size of a sample: give metres (half_angle: degrees)"
+            f"{path}: {bad} = {sizes[bad]:g} cannot be the size of a sample; give metres (half_angle: degrees)"
         )
     own = _LAYER if "thickness" in needed else _GLUED
     poisson = _number_of(path, "poisson", table.get("poisson", own))
     if not 0 <= poisson <= own:
-        raise InputError(f"{path}: poisson = {poisson:g} must be from 0 to {own:g}: remove poisson for a soft tissue")
+        raise InputError(f"{path}: poisson = {poisson:g} must be from 0 to {own:g}; remove poisson for a soft tissue")
     if not isinstance(table["data"], str):
-        raise InputError(f"{path}: data = {table['data']!r} must name a file: write data = 'test.csv'")
+        raise InputError(f"{path}: data = {table['data']!r} must name a file; write data = 'test.csv'")
     drive = table.get("drive", "displacement")
     if drive not in _KINDS:
-        raise InputError(f"{path}: drive = {drive!r} is not known: use displacement or force")
+        raise InputError(f"{path}: drive = {drive!r} is not known; use displacement or force")
     first = _number_of(path, "min_time", table.get("min_time", 0.0))
     if first < 0:
         raise InputError(
-            f"{path}: min_time = {first:g} is negative: give the time after the load in seconds, 0 or more"
+            f"{path}: min_time = {first:g} is negative; give the time after the load in seconds, 0 or more"
         )
     ramp = table.get("ramp")
     if ramp is not None and _number_of(path, "ramp", ramp) != 0:
         raise InputError(
-            f"{path}: ramp = {ramp} cannot be used: remove ramp, or give ramp = 0 if the load was a step and no row "
+            f"{path}: ramp = {ramp} cannot be used; remove ramp, or give ramp = 0 if the load was a step and no row "
             "shows its rise"
         )
     return Described(test, path.parent / table["data"], sizes, poisson, drive, first, ramp is not None)
@@ -218,7 +218,7 @@ def _description(path: Path) -> Described:
 
 def _number_of(path: Path, key: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise InputError(f"{path}: {key} = {value!r} is not a number: give a number")
+        raise InputError(f"{path}: {key} = {value!r} is not a number; give a number")
     return float(value)
 
 
@@ -250,13 +250,13 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
     radius, height = sizes["radius"], sizes["height"]
     if largest >= 0.5 * height:
         raise InputError(
-            f"{path}: the displacement reaches {largest:g} m, which is more than half of the height {height:g} m: "
+            f"{path}: the displacement reaches {largest:g} m, which is more than half of the height {height:g} m; "
             "correct the height, or the unit of the displacement"
         )
     if height > _SLENDER * radius:
         raise InputError(
             f"{path}: height = {height:g} m is {height / radius:.3g} radii, but glued samples are computed only up to "
-            f"{_SLENDER:g} radii. The glued ends of such a slender sample hardly matter: give a table of strain and "
+            f"{_SLENDER:g} radii. The glued ends of such a slender sample hardly matter; give a table of strain and "
             f"shear stress instead (tensile stress divided by 2 (1 + poisson) = {2 * (1 + described.poisson):.4g})"
         )
     at = largest * np.array(_GRID if largest <= _LARGE * height else _FINER_GRID)
@@ -277,7 +277,7 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
         else:
             raise InputError(
                 f"{path}: the simulation of an elastic sample (radius {radius:g} m, height {height:g} m) fails before "
-                f"the displacement {largest:g} m ({NAMES[int(np.max(codes))]}): check the sizes, or give only rows of "
+                f"the displacement {largest:g} m ({NAMES[int(np.max(codes))]}); check the sizes, or give only rows of "
                 "smaller displacements"
             )
         left_out = np.asarray(glued.mesh_error(rig, law, None)) / 1e3
@@ -292,6 +292,6 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
     if abs(secant[-1] / secant[0] - 1) > _CURVED:
         notes.append(
             f"at the largest displacement, the elastic force differs by {100 * (secant[-1] / secant[0] - 1):+.0f} % "
-            "from a straight line; the fit assumes that it relaxes like the shear stress (quasi-linear)"
+            "from a straight line; the fit assumes that this force relaxes like the shear stress (quasi-linear)"
         )
     return (lambda d: d * float(np.interp(d, at, secant))), height, notes

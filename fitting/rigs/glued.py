@@ -148,7 +148,7 @@ def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size
     """
     strains = _finite_history("strains", strains)
     if strains.min() <= -0.9:
-        raise InputError(f"strains reach {strains.min():g}: keep them above -0.9")
+        raise InputError(f"strains reach {strains.min():g}: keep all strains above -0.9")
     cells = _cells(radius, height, dt, cell_size)
     rim = cells.rim * min(radius, height / 2)
     sample = _sample({radius: rim}, {0.0: rim, height: rim}, cells)
@@ -175,7 +175,7 @@ def indentation(
     cells = _cells(radius, height, dt, cell_size)
     if depths.max() >= 0.9 * height:
         raise InputError(
-            f"depths reach {depths.max():g} m of a height of {height:g} m: keep them below {0.9 * height:g} m"
+            f"depths reach {depths.max():g} m of a height of {height:g} m: keep all depths below {0.9 * height:g} m"
         )
     if not NARROWEST * radius <= punch <= (1 - NARROWEST) * radius:
         raise InputError(

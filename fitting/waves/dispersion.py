@@ -74,18 +74,20 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
     lines = text_of(Path(path), "shear waves").splitlines()
     header = _header(lines)
     if header is None:
-        raise InputError(f"{path}: no header names frequency_Hz and phase_velocity_m/s: add this header")
-    notes = [] if density is not None else [f"a density of {DENSITY:g} kg/m^3 is assumed: change it with --density"]
+        raise InputError(f"{path}: no header names frequency_Hz and phase_velocity_m/s; add a header with these names")
+    notes = (
+        [] if density is not None else [f"a density of {DENSITY:g} kg/m^3 is assumed: change this value with --density"]
+    )
     columns = _columns(str(path), lines, header)
     order = np.argsort(columns["frequency"], kind="stable")
     columns = {q: v[order] for q, v in columns.items()}
     for quantity, values in columns.items():
         bad = np.flatnonzero(~(np.isfinite(values) & (values > 0)))
         if bad.size:
-            raise InputError(f"{path}: {quantity} {values[bad[0]]:g} must be above 0: correct or remove this row")
+            raise InputError(f"{path}: {quantity} {values[bad[0]]:g} must be above 0; correct or remove this row")
     if len(np.unique(columns["frequency"])) < FEWEST:
         raise InputError(
-            f"{path}: {len(order)} rows of numbers follow the header: give at least {FEWEST} different frequencies"
+            f"{path}: {len(order)} rows of numbers follow the header; give at least {FEWEST} different frequencies"
         )
     return Dispersion(
         columns["frequency"],
@@ -113,7 +115,7 @@ def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispers
         left = len(np.unique(hertz[kept]))
         raise InputError(
             f"{waves.source}: only {left} frequencies are between --min-frequency and --max-frequency, but {FEWEST} "
-            "are needed: widen the band"
+            "are needed; widen the band"
         )
     attenuation = None if waves.attenuation is None else waves.attenuation[kept]
     note = f"{np.sum(~kept)} waves outside of the given frequency band are ignored"

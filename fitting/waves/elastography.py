@@ -64,8 +64,8 @@ def body_of(field: WaveField, side: int | None = None) -> VoxelBody:
     measured = np.all(np.isfinite(field.displacement), axis=0)
     if not np.any(np.all(measured, axis=-1)):
         raise InputError(
-            f"{field.source or 'waves'}: the balance of forces needs three components of the displacement: measure "
-            "all three"
+            f"{field.source or 'waves'}: the balance of forces needs three components of the displacement; measure all "
+            "three"
         )
     return voxels.voxel_body(field.mask & np.all(measured, axis=-1), field.spacing, field.origin, side)
 
@@ -124,7 +124,7 @@ def notes_on_layers(field: WaveField) -> list[str]:
         return []
     return [
         f"{every - kept} of {every} voxels are in no element. An element needs 3 voxels along an axis and shares the "
-        f"last one with the next element, so the last layer along {', '.join(axes)} is ignored: measure an odd "
+        f"last voxel with the next element, so the last layer along {', '.join(axes)} is ignored: measure an odd "
         "number of voxels along these axes"
     ]
 

@@ -67,7 +67,7 @@ def _read_regions(file: Path, marks: dict[str, object]) -> dict[str, Regions]:
             refuse_other(file, f.attrs, marks)
             return {name: _of_group(group) for name, group in f.items()}
     except (OSError, KeyError):
-        raise InputError(f"{file} is damaged, or from another program: remove --resume") from None
+        raise InputError(f"{file} is damaged, or was written by another program: remove --resume") from None
 
 
 def _of_group(group: h5py.Group) -> Regions:

@@ -476,7 +476,7 @@ def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
             history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
             z, ends = f["z"][:], f["visited"][:]
     except (OSError, KeyError):
-        raise InputError(f"{file} is damaged, or from another program: remove --resume") from None
+        raise InputError(f"{file} is damaged, or was written by another program: remove --resume") from None
     visited = []
     for k, end in enumerate(ends):
         point = _reached(course, end, k)

@@ -74,13 +74,13 @@ def read_waves(
     hertz = _hertz(name, frequencies, found.get("frequencies"), len(U))
     origin = np.zeros(3) if found.get("origin") is None else _plain(name, "origin", found["origin"])
     if origin.shape != (3,) or not np.all(np.isfinite(origin)):
-        raise InputError(f"{name}: origin {origin.tolist()} must be three coordinates in metres: correct it")
+        raise InputError(f"{name}: origin {origin.tolist()} must be three coordinates in metres; correct the origin")
     shape = U.shape[1:4]
     measured = np.asarray(np.isfinite(U).any(axis=(0, 4)))
     chosen = _whole_numbers(name, "mask", found.get("mask"), shape)
     inside = measured if chosen is None else measured & (chosen != 0)
     if not inside.any():
-        raise InputError(f"{name}: no voxel of the mask has a displacement: give a mask of voxels with displacements")
+        raise InputError(f"{name}: no voxel of the mask has a displacement; give a mask of voxels with displacements")
     now_and_then = inside & ~np.isfinite(U).any(axis=4).all(axis=0)
     if now_and_then.any() and np.isfinite(U).any(axis=(1, 2, 3, 4)).all():
         notes.append(
@@ -116,13 +116,13 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object
         if apart > SAME_PLACE * float(np.min(spacing)):
             raise InputError(
                 f"{file}: the voxels are not at the positions of the voxels of the waves, or the axes have different "
-                f"directions: resample {key} to the voxels of the waves"
+                f"directions; resample {key} to the voxels of the waves"
             )
     if own is not None:
         size = _lengths(str(file), "spacing", own, "its spacing")
         if not np.allclose(size, spacing, rtol=0.01):
             raise InputError(
-                f"{file}: the voxel size is {size.tolist()} m, but the waves have voxels of {spacing.tolist()} m: give "
+                f"{file}: the voxel size is {size.tolist()} m, but the waves have voxels of {spacing.tolist()} m; give "
                 f"{key} on the voxels of the waves"
             )
     return values
@@ -141,14 +141,14 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
     still = np.all(nothing, axis=(0, 4))
     if np.any(still & np.any(U == 0, axis=(0, 4))):
         U[:, still] = np.nan
-        notes.append(f"{still.sum()} voxels do not move at all: they are treated as not measured")
+        notes.append(f"{still.sum()} voxels do not move at all, so they are treated as not measured")
     for f, u in enumerate(U):
         rests = np.all(u == 0, axis=-1)
         if rests.any() and np.any(np.isfinite(u) & (u != 0)):
             u[rests] = np.nan
             notes.append(
-                f"{rests.sum()} voxels do not move in field {f + 1} but move in other fields: they are treated as not "
-                "measured at all frequencies"
+                f"{rests.sum()} voxels do not move in field {f + 1}, but move in other fields, so they are treated as "
+                "not measured at all frequencies"
             )
         several = np.isfinite(u) & np.any(np.isfinite(u) & (u != 0), axis=-1, keepdims=True)
         zeros = (u == 0) & several
@@ -190,32 +190,32 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
     elif found.get("real") is not None and found.get("imag") is not None:
         parts = [_array_of_numbers(name, key, found[key]) for key in ("real", "imag")]
         if parts[0].shape != parts[1].shape:
-            raise InputError(f"{name}: real has shape {parts[0].shape}, but imag has {parts[1].shape}: use one shape")
+            raise InputError(f"{name}: real has shape {parts[0].shape}, but imag has {parts[1].shape}; use one shape")
         U = parts[0] + 1j * parts[1]
     else:
         if _is_image(name):
-            raise InputError(f"{name}: the numbers are real, so they are read as labels: give waves as {_layout(name)}")
+            raise InputError(f"{name}: the numbers are real, so they are read as labels; give waves as {_layout(name)}")
         known = ", ".join(sorted(k for k, v in found.items() if v is not None and k[0] != "(")) or "nothing"
         if "labels" in found and "displacement" not in found:
             known += " (real numbers are read as labels)"
         near = "".join(f" ({note})" for note in found.get(formats.NEARLY, []))
         raise InputError(
-            f"{name}: the file contains {known}, but no waves: store the waves as displacement (complex), as real and "
+            f"{name}: the file contains {known}, but no waves; store the waves as displacement (complex), as real and "
             f"imag, or as phases{near}"
         )
     shape = U.shape
     if U.ndim == 4:
         U = U[None]
     if U.ndim != 5 or U.shape[-1] not in (1, 3):
-        raise InputError(f"{name}: displacement has shape {shape}: give {_layout(name)}")
+        raise InputError(f"{name}: displacement has shape {shape}; give {_layout(name)}")
     if not np.any(np.isfinite(U) & (U != 0)):
-        raise InputError(f"{name}: displacement is zero or not a number everywhere: check the file")
+        raise InputError(f"{name}: displacement is zero or NaN in every voxel; check the file")
     largest = float(np.max(np.abs(U[np.isfinite(U)])))
     if not 1e-100 < largest < 1e100:
-        raise InputError(f"{name}: the largest displacement is {largest:.3g}: check the numbers and their unit")
+        raise InputError(f"{name}: the largest displacement is {largest:.3g}; check the numbers and their unit")
     if not np.iscomplexobj(U) or not np.any(np.isfinite(U) & (U.imag != 0)):
         raise InputError(
-            f"{name}: displacement has no imaginary part: give complex amplitudes, or phases over a period"
+            f"{name}: displacement has no imaginary part; give complex amplitudes, or phases over a period"
         )
     U = U.astype(complex)
     if U.shape[-1] == 3:
@@ -241,7 +241,7 @@ def _instants(name: str, field: str, values: Numbers) -> np.ndarray:
     u = _array_of_numbers(name, field, values)
     if u.ndim not in (5, 6) or u.shape[-5] < 3 or u.shape[-1] not in (1, 3) or np.iscomplexobj(u):
         raise InputError(
-            f"{name}: {field} has shape {u.shape}: give real numbers (F, T, nx, ny, nz, 3) with 3 instants or more"
+            f"{name}: {field} has shape {u.shape}; give real numbers (F, T, nx, ny, nz, 3) with 3 instants or more"
         )
     return u if u.ndim == 6 else u[None]
 
@@ -267,15 +267,15 @@ def _of_a_last_instant(u: np.ndarray) -> list[str]:
     if not missed(T - 1) < _REPEATED * missed(T):
         return []
     return [
-        f"the {T} instants fit a period of {T - 1} steps better. If the last instant is the end of the period, it "
-        "repeats the first instant: remove the last instant"
+        f"the {T} instants fit a period of {T - 1} steps better. If the last instant is the end of the period, this "
+        "instant repeats the first one: remove the last instant"
     ]
 
 
 def _array_of_numbers(name: str, field: str, values: Numbers) -> np.ndarray:
     a = np.asarray(values)
     if a.dtype.kind not in "fciu":
-        raise InputError(f"{name}: {field} contains {a.dtype}, not numbers: store complex numbers")
+        raise InputError(f"{name}: {field} contains {a.dtype}, not numbers; store complex numbers")
     return a
 
 
@@ -284,42 +284,46 @@ def _plain(name: str, field: str, values: object) -> np.ndarray:
     try:
         return np.asarray(values, float).ravel()
     except (TypeError, ValueError):
-        raise InputError(f"{name}: {field} = {str(values)[:40]!r} does not contain numbers: correct it") from None
+        raise InputError(
+            f"{name}: {field} = {str(values)[:40]!r} does not contain numbers; correct this value"
+        ) from None
 
 
 def _factor(name: str, unit: str) -> float:
     if unit not in UNITS:
-        raise InputError(f"{name}: unit {unit!r} is not known: use {', '.join(UNITS)}")
+        raise InputError(f"{name}: unit {unit!r} is not known; use {', '.join(UNITS)}")
     return UNITS[unit]
 
 
 def _hertz(name: str, asked: list[float] | None, held: Any, number: int) -> np.ndarray:
     if asked is None and held is None:
-        raise InputError(f"{name}: no frequencies in the file: give {number} in Hz, e.g. --frequencies 60")
+        raise InputError(f"{name}: the file contains no frequencies; give {number} in Hz, e.g. --frequencies 60")
     hertz = _plain(name, "frequencies", held if asked is None else asked)
     own = hertz if held is None else _plain(name, "frequencies", held)
     if asked is not None and (len(own) != len(hertz) or not np.allclose(hertz, own)):
-        raise InputError(f"{name}: the file states {np.ravel(held).tolist()} Hz: remove --frequencies")
+        raise InputError(f"{name}: the file states {np.ravel(held).tolist()} Hz; remove --frequencies")
     if len(hertz) != number:
         raise InputError(
-            f"{name}: {len(hertz)} frequencies for {number} displacement fields: give {number} frequencies"
+            f"{name}: there are {len(hertz)} frequencies for {number} displacement fields; give {number} frequencies"
         )
     if not np.all(np.isfinite(hertz) & (hertz > 0)):
-        raise InputError(f"{name}: frequencies {hertz.tolist()} must be above 0 Hz: correct them")
+        raise InputError(f"{name}: frequencies {hertz.tolist()} must be above 0 Hz; correct the frequencies")
     if len(np.unique(hertz)) < number:
-        raise InputError(f"{name}: frequencies {hertz.tolist()} are not all different: give one for each field")
+        raise InputError(
+            f"{name}: frequencies {hertz.tolist()} are not all different; give one frequency for each field"
+        )
     return hertz
 
 
 def _lengths(name: str, field: str, given: object, option: str) -> np.ndarray:
     if given is None:
-        raise InputError(f"{name}: no {field} in the file: give {option} in metres, e.g. 0.002 0.002 0.002")
+        raise InputError(f"{name}: the file contains no {field}; give {option} in metres, e.g. 0.002 0.002 0.002")
     values = _plain(name, field, given)
     values = np.repeat(values, 3) if len(values) == 1 else values
     if len(values) != 3 or not np.all(np.isfinite(values) & (values > 0)):
-        raise InputError(f"{name}: {field} {values.tolist()} must be three lengths above 0 m: correct them")
+        raise InputError(f"{name}: {field} {values.tolist()} must be three lengths above 0 m; correct these lengths")
     if np.any(values > 0.1):
-        raise InputError(f"{name}: {field} {values.tolist()} m is too large for a voxel: give metres, not mm")
+        raise InputError(f"{name}: {field} {values.tolist()} m is too large for a voxel; give metres, not mm")
     return values
 
 
@@ -328,9 +332,9 @@ def _whole_numbers(name: str, field: str, values: object, shape: tuple[int, ...]
         return None
     a = np.asarray(values)
     if a.shape != shape:
-        raise InputError(f"{name}: {field} has shape {a.shape}, but the waves have {shape}: use the same voxels")
+        raise InputError(f"{name}: {field} has shape {a.shape}, but the waves have {shape}; use the same voxels")
     if a.dtype.kind not in "biuf" or not np.all(np.isfinite(a)) or np.any(a != np.rint(a)):
-        raise InputError(f"{name}: {field} must be whole numbers: correct it")
+        raise InputError(f"{name}: {field} must be whole numbers; correct this array")
     return a.astype(int)
 
 

@@ -58,7 +58,7 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
             if error.errno is None or error.errno not in FULL:
                 raise
             print(
-                f"error: {os.strerror(error.errno)}: the last file is not complete; free disk space and repeat the "
+                f"error: the last file is not complete ({os.strerror(error.errno)}). Free disk space, and repeat the "
                 "command",
                 file=sys.stderr,
             )

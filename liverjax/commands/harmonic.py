@@ -56,10 +56,17 @@ def _tell(scene: "Scene", ran: "Waves") -> None:
         f"{ran.seconds:.3g} s including compilation"
     )
     for k, frequency in enumerate(np.asarray(ran.found.frequencies_Hz)):
-        line = f"{frequency:g} Hz: at most {1e3 * u[k].max():.4g} mm, residual {float(ran.found.residual[k]):.1e}"
+        line = (
+            f"{frequency:g} Hz: largest displacement {1e3 * u[k].max():.4g} mm, residual "
+            f"{float(ran.found.residual[k]):.1e}"
+        )
         if parts is not None:
             motion, force = (float(part[k]) for part in parts)
-            line += ", nothing moves" if np.isnan(motion) else f", mesh error about {motion:.2g} of the motion"
+            line += (
+                ", nothing moves"
+                if np.isnan(motion)
+                else f", mesh error about {motion:.2g} of the largest displacement"
+            )
             line += "" if np.isnan(force) else f" and {force:.2g} of the reaction forces"
         print(line)
     for sentence in ran.cautions:

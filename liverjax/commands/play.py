@@ -21,7 +21,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
     command.add_argument(
-        "--port", type=int, default=8765, metavar="N", help="port of the page (8765; 0: any free port)"
+        "--port", type=int, default=8765, metavar="N", help="port of the page (default 8765; 0 selects any free port)"
     )
     command.add_argument("--no-browser", action="store_true", help="do not open the page")
     command.add_argument(
@@ -36,7 +36,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or run a number of steps without a page."""
     if not 0 <= options.port < 65536:
-        raise InputError(f"--port {options.port} is not a port: give 0 to 65535")
+        raise InputError(f"--port {options.port} is not the number of a port: give 0 to 65535")
     if options.steps is not None and options.steps < 1:
         raise InputError(f"--steps {options.steps} must be above 0: give e.g. 100")
     from liverjax.play import pulling
@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         server = PlayServer(playing, options.port)
     except OSError as error:
-        raise InputError(f"--port {options.port}: {error.strerror}: give another port") from None
+        raise InputError(f"--port {options.port} cannot be used ({error.strerror}): give another port") from None
     print(f"{server.address}  (Ctrl-C ends)", flush=True)
     if not options.no_browser:
         import webbrowser

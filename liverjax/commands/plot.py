@@ -21,12 +21,14 @@ def add(parsers: argparse._SubParsersAction) -> None:
         "law",
         nargs="+",
         metavar="NAME|FILE.py:LAW|RESULT.h5",
-        help=f"{LAW}; all: every law of this package; or a result of liverjax simulate",
+        help=f"{LAW}; all for every law of this package; or the result.h5 of liverjax simulate",
     )
-    command.add_argument("--field", metavar="NAME", help="field of a result, e.g. cauchy_stress; default displacement")
-    command.add_argument("--step", type=int, metavar="N", help="step of a result, from 1; default the last")
+    command.add_argument("--field", metavar="NAME", help="field of a result, e.g. cauchy_stress (default displacement)")
     command.add_argument(
-        "--stretch", nargs=2, type=float, metavar=("LOW", "HIGH"), help="range for a law; default 0.6 1.6"
+        "--step", type=int, metavar="N", help="number of the step of a result, counted from 1 (default: the last step)"
+    )
+    command.add_argument(
+        "--stretch", nargs=2, type=float, metavar=("LOW", "HIGH"), help="range of stretches for a law (default 0.6 1.6)"
     )
     add_out(command)
     command.set_defaults(run=run)
@@ -49,7 +51,10 @@ def run(options: argparse.Namespace) -> int:
             )
     if results:
         if len(options.law) > 1:
-            raise InputError(f"{results[0]} is a result: give only this file")
+            raise InputError(
+                f"{results[0]} is the result of a run, which cannot be drawn together with other arguments: give only "
+                "this file"
+            )
         return _draw_field(results[0], options)
     from liverjax.laws import figures, gradient_check
 

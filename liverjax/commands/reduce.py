@@ -16,21 +16,23 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument(
         "rows", type=Path, metavar="ROWS.csv", help="table with a header of dotted names and one row per run"
     )
-    command.add_argument("--out", type=Path, default=Path("model.h5"), metavar="MODEL.h5", help="the model (model.h5)")
+    command.add_argument(
+        "--out", type=Path, default=Path("model.h5"), metavar="MODEL.h5", help="file of the model (default model.h5)"
+    )
     command.add_argument(
         "--tolerance",
         type=float,
         default=1e-4,
         metavar="X",
-        help="fraction of the displacements that the modes may neglect (1e-4)",
+        help="fraction of the displacements that the modes may neglect (default 1e-4)",
     )
-    command.add_argument("--modes", type=int, default=40, metavar="N", help="maximum number of modes (40)")
+    command.add_argument("--modes", type=int, default=40, metavar="N", help="maximum number of modes (default 40)")
     command.add_argument(
         "--runs",
         type=int,
         metavar="N",
-        help="number of full runs (one per row). Two thirds use the first rows, the others the rows with the largest "
-        "estimated errors",
+        help="number of full runs (default: one for each row). Two thirds of the runs use the first rows, and the "
+        "others use the rows with the largest estimated errors",
     )
     command.set_defaults(run=run)
 
@@ -43,5 +45,5 @@ def run(options: argparse.Namespace) -> int:
     print(
         f"{model.number_of_modes} modes, {len(model.points)} points, {reduction.learnt(model)}\nwritten: {options.out}"
     )
-    print(f'to use it: [solve] reduced = "{options.out}"')
+    print(f'to use this model, write reduced = "{options.out}" in [solve]')
     return 0

@@ -22,7 +22,9 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
     command.add_argument("--vtu", action="store_true", help="also write a series of files for ParaView")
     command.add_argument("--png", action="store_true", help="also draw the last state")
-    command.add_argument("--every", type=int, default=50, metavar="N", help="write the results after each N steps (50)")
+    command.add_argument(
+        "--every", type=int, default=50, metavar="N", help="write the results after each N steps (default 50)"
+    )
     command.add_argument("--resume", action="store_true", help="continue a run that was stopped")
     command.add_argument(
         "--fields", metavar="NAMES", help="fields to write, separated by commas: cauchy_stress,volume_ratio,…"
@@ -58,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     if scene.solve.kind == "harmonic":
         return harmonic.run(options, scene, text)
     if options.about:
-        raise InputError("--about is only for [solve] kind = 'harmonic': remove --about")
+        raise InputError("--about can be used only with [solve] kind = 'harmonic': remove --about")
     given = scene.points_are
     if given == "loaded":
         scene = unloaded(scene).scene
@@ -73,7 +75,11 @@ def run(options: argparse.Namespace) -> int:
         if ran is None:
             ran = long_run.run(scene, text, target, options.every, options.resume, report)
     except OSError as error:
-        print(f"stopped: {target}: {error.strerror}; free disk space and continue with --resume", file=sys.stderr)
+        print(
+            f"stopped, because {target} cannot be written ({error.strerror}): free disk space and continue with "
+            "--resume",
+            file=sys.stderr,
+        )
         return 1
     finally:
         bar.close()

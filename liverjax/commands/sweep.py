@@ -26,7 +26,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
         metavar="PARAMETERS.csv",
         help="table with a header of dotted names and one row per run",
     )
-    command.add_argument("--out", type=Path, metavar="FILE.h5", help="the results (PARAMETERS.h5)")
+    command.add_argument("--out", type=Path, metavar="FILE.h5", help="file of the results (default PARAMETERS.h5)")
     command.add_argument("--resume", action="store_true", help="continue a run that was stopped")
     command.add_argument("--store", nargs="+", default=["final_positions"], metavar="WHAT", help="|".join(OUTPUTS))
     command.add_argument(
@@ -35,10 +35,13 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument(
         "--rows", nargs="+", type=int, default=[], metavar="N", help="only these rows, numbered from 1"
     )
-    command.add_argument("--chunk", type=int, default=16, metavar="N", help="write the results after each N rows (16)")
-    command.add_argument("--devices", type=int, metavar="N", help="spread the rows over N CPU devices (1)")
+    command.add_argument(
+        "--chunk", type=int, default=16, metavar="N", help="write the results after each N rows (default 16)"
+    )
+    command.add_argument("--devices", type=int, metavar="N", help="distribute the rows over N CPU devices (default 1)")
     where = (
-        "run as process I of N processes, connected through HOST:PORT; without values, the cluster (SLURM) gives them"
+        "run as process I of N processes, connected through HOST:PORT. If no values are given, they are read from the "
+        "cluster (SLURM)"
     )
     command.add_argument("--distributed", nargs="*", metavar="HOST:PORT N I", help=where)
     command.set_defaults(run=run)
@@ -65,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
     if solve.kind == "harmonic" or solve.reduced:
         own = "kind = 'harmonic'" if solve.kind == "harmonic" else f"reduced = {solve.reduced!r}"
         raise InputError(
-            f"{options.scene}: [solve] {own} cannot be used in a sweep: use python -m liverjax simulate for each row"
+            f"{options.scene}: [solve] {own} cannot be used in a sweep; use python -m liverjax simulate for each row"
         )
     out = options.out or options.parameters.with_suffix(".h5")
     bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # on a terminal only
@@ -73,14 +76,18 @@ def run(options: argparse.Namespace) -> int:
         done = sweep.run(table, out, options.resume, process, bar.update)
     except OSError as error:
         print(
-            f"error: {out}: {error.strerror or error}: finished chunks are kept, continue with --resume",
+            f"error: {out} cannot be written ({error.strerror or error}). Finished chunks are kept: continue with "
+            "--resume",
             file=sys.stderr,
         )
         return 1
     finally:
         bar.close()
     if done.file is None:
-        print(f"process {process[0]} of {process[1]}: {done.computed} rows; other processes still have rows to compute")
+        print(
+            f"process {process[0]} of {process[1]} computed {done.computed} rows; other processes still have rows to "
+            "compute"
+        )
         return 0
     print(f"{len(table.rows)} rows, {done.computed} computed now, {len(done.failed)} failed\nwritten: {done.file}")
     for row, code in list(done.failed.items())[:20]:
@@ -88,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
     for said in (*cautions_of_mesh(table.scene.mesh), *_of_crushed(done.crushed)):
         print(f"caution: {said}", file=sys.stderr)
     if done.failed:
-        print(f"to run these rows again: --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
+        print(f"to run these rows again, use --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
     return 1 if done.failed else 0
 
 
@@ -99,8 +106,8 @@ def _of_crushed(rows: dict[int, float]) -> list[str]:
     named = ", ".join(map(str, list(rows)[:20])) + (", …" if len(rows) > 20 else "")
     how_many = f"{len(rows)} row{'s' if len(rows) > 1 else ''} ({named}; worst: row {worst}, J = {rows[worst]:.2g})"
     return [
-        f"at the end, elements have less than a fifth or more than five times their volume in {how_many}, which is "
-        "impossible in tissue: use a larger bulk modulus or smaller loads"
+        f"at the end, some elements have less than a fifth or more than five times their volume in {how_many}, which "
+        "is impossible in tissue: use a larger bulk modulus or smaller loads"
     ]
 
 
@@ -119,13 +126,16 @@ def _share(given: list[str]) -> tuple[int, int]:
 
     option = f"--distributed {' '.join(given)}"
     if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
-        raise InputError(f"{option}: give HOST:PORT, the number of processes and the index of this process, or nothing")
+        raise InputError(
+            f"{option} needs three values or none: give HOST:PORT, the number of processes and the index of this "
+            "process, or no value"
+        )
     if given and not _is_address(given[0]):
-        raise InputError(f"{option}: {given[0]} is not HOST:PORT with a port of 1 to 65535: give e.g. node1:12345")
+        raise InputError(f"{option}: {given[0]} is not HOST:PORT with a port of 1 to 65535; give e.g. node1:12345")
     if given and int(given[1]) < 1:
-        raise InputError(f"{option}: the number of processes must be above 0: give e.g. {given[0]} 2 0")
+        raise InputError(f"{option}: the number of processes must be above 0; give e.g. {given[0]} 2 0")
     if given and int(given[2]) >= int(given[1]):
-        raise InputError(f"{option}: processes are numbered from 0 to {int(given[1]) - 1}")
+        raise InputError(f"{option}: the processes are numbered from 0; give an index from 0 to {int(given[1]) - 1}")
     try:
         if given:
             jax.distributed.initialize(given[0], int(given[1]), int(given[2]))
@@ -137,6 +147,7 @@ def _share(given: list[str]) -> tuple[int, int]:
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(
-            f"--distributed: the processes could not be connected ({reason}): give HOST:PORT N I"
+            f"--distributed: the processes could not be connected ({reason}); check HOST:PORT and the number of "
+            "processes, or give HOST:PORT N I"
         ) from None
     return process

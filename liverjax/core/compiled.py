@@ -26,8 +26,8 @@ import numpy as np
 from liverjax.core import program_cache
 from liverjax.core.files import whole
 
-#: Packages whose functions and structs a stored program may use. The name of the folder contains a digest of their
-#: source files.
+#: Packages whose functions and structs a stored program may use. The name of the folder of stored programs
+#: (`program_cache.folder`) contains a digest of the source files of these packages.
 OWN = ("liverjax.", "fitting.")
 
 

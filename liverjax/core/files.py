@@ -68,6 +68,6 @@ def refuse_other(file: Path, held: Mapping[str, object], marks: Mapping[str, obj
     other = [name for name, own in marks.items() if held.get(name) != own]
     if other:
         raise InputError(
-            f"{file} belongs to another fit ({', '.join(other)} differ{'s' * (len(other) == 1)}): remove --resume "
-            "or name another --out"
+            f"{file} belongs to another fit ({', '.join(other)} differ{'s' * (len(other) == 1)}): remove --resume, or "
+            "give another --out"
         )

@@ -56,13 +56,15 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     try:
         text = path.read_text(encoding="utf-8-sig")  # files of spreadsheet programs begin with a byte order mark
     except OSError as error:
-        raise InputError(f"{name} history {path} cannot be read ({error.strerror}): give columns {wanted}") from None
+        raise InputError(
+            f"{name} history {path} cannot be read ({error.strerror}): give a CSV file with columns {wanted}"
+        ) from None
     except UnicodeDecodeError:
-        raise InputError(f"{name} history {path} is not a text file: give columns {wanted}") from None
+        raise InputError(f"{name} history {path} is not a text file: give a CSV file with columns {wanted}") from None
     # NumPy would read a comment on the first line as the names of the columns.
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
-        raise InputError(f"{name} history {path} is empty: give columns {wanted}")
+        raise InputError(f"{name} history {path} is empty: give a CSV file with columns {wanted}")
     commas = {line.count(",") for line in lines}
     if len(commas) > 1 or commas == {0}:
         why = "has rows of different lengths" if len(commas) > 1 else "has one column"
@@ -72,7 +74,7 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     data = np.atleast_1d(np.genfromtxt(lines, delimiter=",", names=True))
     found = next((kind for kind in kinds if set(kind) <= set(data.dtype.names or ())), None)
     if found is None:
-        raise InputError(f"{name} history {path} has columns {data.dtype.names}: give {wanted}")
+        raise InputError(f"{name} history {path} has the columns {data.dtype.names}: give the columns {wanted}")
     return np.stack([data[column] for column in found], axis=1)
 
 
@@ -83,14 +85,17 @@ def check_times(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1
         InputError: only one of times and history is given, their shapes do not match, or the times do not increase.
     """
     if (times is None) != (history is None):
-        raise InputError(f"{name} needs both times and history, or none of them: give both, or remove both")
+        raise InputError(f"{name} needs both times and history, or neither of them: give both, or remove both")
     if history is None:
         return
     count = np.shape(times)
     allowed = [count if n == 1 else (*count, n) for n in forms]
     if len(count) != 1 or np.shape(history) not in allowed:
         shapes = " or ".join(map(str, allowed))
-        raise InputError(f"{name} history has shape {np.shape(history)}, its times have {count}: give {shapes}")
+        raise InputError(
+            f"{name} history has the shape {np.shape(history)}, and the times have the shape {count}: give a history "
+            f"of shape {shapes}"
+        )
     if isinstance(times, jax.core.Tracer):
         return
     falls = np.flatnonzero(~(np.diff(np.asarray(times)) > 0))

@@ -12,8 +12,8 @@ ONE_STEP = 8
 
 ADVICE = {
     CONVERGED: "converged",
-    STALLED: "the residual stopped decreasing above the tolerance: use a looser tolerance (in float32, with very stiff "
-    "springs or with very short time steps, rounding may allow no smaller residual), float64 or smaller steps",
+    STALLED: "the residual stopped decreasing above the tolerance: use float64, smaller steps or a looser tolerance "
+    "(in float32, with very stiff springs or with very short time steps, roundoff may not allow a smaller residual)",
     NOT_FINITE: "a residual was not finite, usually because of an inverted element: use smaller loads or steps, or a "
     "law with continued_below; check a law that you wrote with `python -m liverjax check`",
     INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (the body buckles, collapses, "

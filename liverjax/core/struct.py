@@ -65,7 +65,7 @@ def param(
     """
     unknown = limits.keys() - Limits.__annotations__.keys()
     if unknown:
-        raise TypeError(f"param has no {sorted(unknown)[0]!r}: use {', '.join(Limits.__annotations__)}")
+        raise TypeError(f"param has no argument {sorted(unknown)[0]!r}: use {', '.join(Limits.__annotations__)}")
     metadata = {
         "unit": unit,
         "about": about,

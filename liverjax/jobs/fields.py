@@ -42,7 +42,7 @@ def check(names: list[str], scene: Scene) -> None:
         if name not in FIELDS:
             raise InputError(f"[output] fields: {name!r} is not known: {hint(name, FIELDS)}")
     if "fluid_velocity" in names and scene.porosity is None:
-        raise InputError("[output] fields: fluid_velocity needs [porosity]: remove fluid_velocity")
+        raise InputError("[output] fields contains fluid_velocity, which needs [porosity]: remove fluid_velocity")
 
 
 def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarray]:

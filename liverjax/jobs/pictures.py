@@ -76,11 +76,15 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
     try:
         with h5py.File(file) as data:
             if "sweep" in data.attrs:
-                raise InputError(f"{file} contains the runs of a sweep: give the result.h5 of one run")
+                raise InputError(
+                    f"{file} contains the runs of a sweep, which cannot be drawn: give the result.h5 of one run"
+                )
             if "modes" in data:
-                raise InputError(f"{file} contains a reduced model: run it, and give the result.h5 of this run")
+                raise InputError(f"{file} contains a reduced model: run this model, and give the result.h5 of the run")
             if "frequencies_Hz" in data:
-                raise InputError(f"{file} contains harmonic motion: use simulate --vtu to write it for ParaView")
+                raise InputError(
+                    f"{file} contains harmonic motion: use simulate --vtu to write the motion for ParaView"
+                )
             tets, before, after = data["tetrahedra"][()][:, :4], data["reference"][()], data["positions"]
             steps, fields = len(after), list(data.get("fields/vertices", ()))
             known = ["displacement", *(["pressure"] if "pressure" in data else []), *fields]
@@ -97,7 +101,9 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
             if name == "pressure":
                 values = data["pressure"][step - 1]
     except (OSError, KeyError) as error:
-        raise InputError(f"{file} is not a result of liverjax simulate ({error}): give its result.h5") from None
+        raise InputError(
+            f"{file} is not a result of liverjax simulate ({error}): give the result.h5 of a run"
+        ) from None
     V = int(tets.max()) + 1
     if name == "displacement":
         values, label = np.linalg.norm(after - before, axis=1), "displacement [m]"

@@ -27,9 +27,11 @@ from liverjax.solvers.problem import StepStatistics
 def learnt(model: ReducedModel) -> str:
     """Return one sentence about the learnt correction of a model."""
     if model.correction is None:
-        return "no correction: too few training runs, or no correction reduced the errors"
+        return "no correction, because there were too few training runs or no correction reduced the errors"
     left = np.asarray(model.correction.left)
-    return f"corrected; cross-validated errors {np.median(left):.2g} of the motion (median; largest {left.max():.2g})"
+    return (
+        f"corrected; errors in cross-validation: {np.median(left):.2g} of the motion (median; largest {left.max():.2g})"
+    )
 
 
 class Tried(NamedTuple):
@@ -51,7 +53,7 @@ def make(
         raise InputError(f"--modes {modes} must be above 0: give e.g. 40")
     if not out.parent.is_dir():
         wrong = "is a file" if out.parent.exists() else "does not exist; make it first"
-        raise InputError(f"--out {out}: the folder {out.parent} {wrong}")
+        raise InputError(f"--out {out} cannot be used, because the folder {out.parent} {wrong}")
     if out.is_dir():
         raise InputError(f"--out {out} is a folder: name a file for the model, e.g. {out / 'model.h5'}")
     writable(out.parent, ())
@@ -94,7 +96,7 @@ def tried(scene: Scene) -> Tried:
         small, beside["reduced_pressure_error"] = small and off.max() <= solve.reduced_tolerance * whole, (off, "Pa")
     if np.any(np.asarray(first.status)) or not small:
         limit = f"{float(np.asarray(solve.reduced_tolerance)):.2%}"
-        return Tried(None, f"{said}: the error is above {limit}, or a step failed, so the full model runs")
+        return Tried(None, f"{said}. The error is above {limit}, or a step failed, so the full model runs")
     ran = Ran(_as_result(found, x, P), len(found.times), run_time, compile_time, beside)
     return Tried(ran, said)
 

@@ -68,7 +68,7 @@ def make_folder(folder: Path) -> None:
         probe.write_text("")
         probe.unlink()
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; give an --out that can be written") from None
+        raise InputError(f"{folder} cannot be written ({error.strerror}): give an --out that can be written") from None
 
 
 @contextmanager

@@ -93,7 +93,9 @@ def read_sweep(
     names, rows = read_table(parameters)
     for name in names:
         if np.shape(numbers_at(scene, name)):
-            raise InputError(f"parameter {name!r} is a list in the scene file: name one number of the list")
+            raise InputError(
+                f"parameter {name!r} is a list in the scene file: name one number of the list, by its index"
+            )
     parts = {".".join(name.split(".")[:2]) for name in names}
     held = holding(scene, parts)
     for k, row in enumerate(rows.tolist()):
@@ -111,7 +113,7 @@ def read_sweep(
         if name not in OUTPUTS:
             raise InputError(f"--store {name} is not known: use {', '.join(OUTPUTS)}")
         if name == "largest_pressure" and scene.porosity is None:
-            raise InputError("--store largest_pressure needs [porosity] in the scene: remove it from --store")
+            raise InputError("--store largest_pressure needs [porosity] in the scene: remove largest_pressure")
     for node in probes:
         if not 0 <= node < scene.mesh.number_of_nodes:
             raise InputError(f"--probe {node} is not a node of the mesh: give 0 to {scene.mesh.number_of_nodes - 1}")
@@ -120,7 +122,7 @@ def read_sweep(
     numbers = np.arange(1, len(rows) + 1)
     for row in only:
         if not 1 <= row <= len(rows):
-            raise InputError(f"--rows {row} is not in {parameters}: give 1 to {len(rows)}")
+            raise InputError(f"--rows {row} is not a row of {parameters}: give 1 to {len(rows)}")
     if only:
         numbers = np.array(sorted(set(only)))
     chunk = min(chunk, len(numbers))
@@ -159,14 +161,16 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
         raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row per run")
     names = tuple(table[0])
     if "" in names:
-        raise InputError(f"{file}: column {names.index('') + 1} has no name: give it a name, or remove its comma")
+        raise InputError(
+            f"{file}: column {names.index('') + 1} has no name; give a name, or remove the comma of this column"
+        )
     if len(set(names)) < len(names):
-        raise InputError(f"{file} names {max(names, key=names.count)} twice: remove one of the two columns")
+        raise InputError(f"{file} has two columns {max(names, key=names.count)}: remove one of them")
     rows = []
     for k, row in enumerate(table[1:]):
         if len(row) != len(names):
             raise InputError(
-                f"{file}: row {k + 1} has {len(row)} values for {len(names)} names: give one value for each name"
+                f"{file}: row {k + 1} has {len(row)} values for {len(names)} names; give one value for each name"
             )
         for name, cell in zip(names, row, strict=True):
             try:
@@ -174,7 +178,7 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
             except ValueError:
                 finite = False
             if not finite:
-                raise InputError(f"{file}: row {k + 1}, {name} = {cell!r} is not a finite number: correct it")
+                raise InputError(f"{file}: row {k + 1}, {name} = {cell!r} is not a finite number; correct this cell")
         rows.append([number_of(cell) for cell in row])
     return names, np.array(rows)
 

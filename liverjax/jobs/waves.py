@@ -74,14 +74,16 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
             x, reactions = (np.asarray(given[name][-1]) for name in ("positions", "reactions"))
             code = int(np.ravel(read_by_step(given, "status"))[-1])
     except (OSError, KeyError, IndexError) as error:
-        raise InputError(f"--about {file} holds no positions: give the result.h5 of a run of this scene") from error
+        raise InputError(f"--about {file} contains no positions: give the result.h5 of a run of this scene") from error
     if x.shape != scene.mesh.points.shape:
         raise InputError(
             f"--about {file} has {len(x)} nodes, but the scene has {scene.mesh.number_of_nodes}: give a run of the "
             "same mesh"
         )
     if code not in (status.CONVERGED, status.ONE_STEP):
-        raise InputError(f"--about {file}: its last step is {status.NAMES[code]}; give a run that ended in equilibrium")
+        raise InputError(
+            f"--about {file}: the last step of this run is {status.NAMES[code]}; give a run that ended in equilibrium"
+        )
     return jnp.asarray(x), reactions
 
 
@@ -103,9 +105,9 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
     if apart <= _RESTED:
         return []
     return [
-        f"the relaxed body has other forces in the state of {name} than the run ({100 * apart:.2g} % difference), and "
-        "the harmonic motion uses the relaxed body: let the run rest for much longer than its relaxation times, and "
-        "use the same material in both scenes"
+        f"in the state of {name}, the forces of the relaxed body differ from the forces of the run by "
+        f"{100 * apart:.2g} %. The harmonic motion is computed for the relaxed body: let the body rest in the run for "
+        "much longer than its relaxation times, and use the same material in both scenes"
     ]
 
 

@@ -76,14 +76,14 @@ def load(name: str) -> Law:
         loader: Any = spec.loader
         loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise InputError(f"{file} does not run ({_reason(error)}): correct it first") from None
+        raise InputError(f"{file} does not run ({_reason(error)}): correct this file first") from None
     finally:
         sys.path.pop(0)
     found: Any = getattr(module, attribute, None) if attribute else None
     if found is None:
         own = {n: v if inspect.isclass(v) else type(v) for n, v in vars(module).items() if _is_law(v)}
         offered = [n for n, c in own.items() if c.__module__ == module.__name__ or not inspect.isclass(vars(module)[n])]
-        wrong = f"{file} has no {attribute}" if attribute else f"{name} names a file, but no law in it"
+        wrong = f"{file} has no {attribute}" if attribute else f"{name} names a file, but not a law in this file"
         raise InputError(
             f"{wrong}: {'use ' + ' or '.join(f'{file}:{n}' for n in offered) if offered else 'define a law'}"
         )
@@ -111,13 +111,13 @@ def _try(law: Law, name: str) -> None:
                 found = jax.eval_shape(lambda law, F, what=what: getattr(law, what)(F), law, F).shape
             except Exception as error:
                 raise InputError(
-                    f"{name}: its {what} cannot be evaluated ({_reason(error)}): correct the law. List all invariants "
+                    f"{name}: its {what} cannot be evaluated ({_reason(error)}); correct the law. List all invariants "
                     "of its energy in `invariants`, give a single fibre direction, and write conditions on parameters "
                     "with jnp.where"
                 ) from None
             if found != expected:
                 raise InputError(
-                    f"{name}: for F of shape {F.shape}, its {what} has shape {found}, not {expected}: correct the law"
+                    f"{name}: for F of shape {F.shape}, its {what} has shape {found}, not {expected}; correct the law"
                 )
 
 
@@ -147,14 +147,14 @@ def _typical_law(cls: type, name: str) -> Law:
     missing = [n for n, v in values.items() if v is None]
     if missing:
         raise InputError(
-            f"{name}: parameter {missing[0]} has no typical value: write param(…, typical=…) in the class, or name an "
+            f"{name}: parameter {missing[0]} has no typical value; write param(…, typical=…) in the class, or name an "
             "object of this class instead of the class (FILE.py:OBJECT)"
         )
     try:
         return cls(**values)
     except TypeError as error:
         raise InputError(
-            f"{name} cannot be made ({_reason(error)}): give every field a typical value or default"
+            f"no object of {name} can be made ({_reason(error)}): give every field a typical value or a default"
         ) from None
 
 

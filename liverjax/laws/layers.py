@@ -22,7 +22,7 @@ def read_layer(table: object, name: str) -> Law:
         InputError: a law or parameter is unknown. The message begins with `name`.
     """
     if not isinstance(table, dict) or "name" not in table:
-        raise InputError(f'{name} law needs name = "…": see the names with python -m liverjax laws')
+        raise InputError(f'{name}.law needs name = "…": python -m liverjax laws lists the names')
     values = {key: value for key, value in table.items() if key != "name"}
     fields = {f.name: f for f in dataclasses.fields(find(table["name"]))}  # type: ignore[arg-type]
     without = "bulk" in fields and "bulk" not in values

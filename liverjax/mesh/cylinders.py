@@ -185,5 +185,5 @@ def _rising(name: str, places: np.ndarray) -> np.ndarray:
     if places.ndim != 1 or len(places) < 2 or not np.all(np.isfinite(places)) or not np.all(np.diff(places) > 0):
         raise InputError(f"{name} = {places} must be two or more increasing numbers: correct these numbers")
     if name == "radii" and places[0] != 0:
-        raise InputError(f"radii begin at {places[0]:g}: begin with 0, the axis")
+        raise InputError(f"the list of radii begins at {places[0]:g}: begin with 0 (the axis)")
     return places

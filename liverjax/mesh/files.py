@@ -49,7 +49,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
         raise InputError(f"mesh unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"mesh file {path}: {'is a folder' if path.is_dir() else 'no such file'}; give a mesh file")
+        raise InputError(f"mesh file {path} {'is a folder' if path.is_dir() else 'does not exist'}; give a mesh file")
     data = _read_quietly(path)
     order = next((k for k, kind in CELLS.items() if any(block.type == kind for block in data.cells)), None)
     if order is None:
@@ -85,7 +85,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     size = float(np.ptp(points, axis=0).max())
     if size > _LARGE and unit == "m":
         warnings.warn(
-            f"mesh file {path} is {size:.4g} m long: if its coordinates are in millimetres, write unit = 'mm'",
+            f"mesh file {path} is {size:.4g} m long: if the coordinates are in millimetres, write unit = 'mm'",
             stacklevel=2,
         )
     return mesh
@@ -118,8 +118,9 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
         )
     if len(curved):
         warnings.warn(
-            f"{name}: {len(np.unique(curved))} middles of edges lie up to {off.max():.3g} m off the straight edge: "
-            "these nodes are moved onto the edge, since elements must be straight; refine curved parts",
+            f"{name}: {len(np.unique(curved))} midside nodes lie up to {off.max():.3g} m off their straight edges. "
+            "These nodes are moved onto the edges, because elements must be straight; refine the mesh where the "
+            "surface is curved",
             stacklevel=3,
         )
     sets = {k: new[nodes][new[nodes] >= 0] for k, nodes in node_sets.items()}
@@ -163,12 +164,12 @@ def _read_quietly(path: Path) -> Any:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
             return meshio.read(path)
     except SystemExit:  # meshio prints the reasons and exits if none of its readers accepts the file
-        reason = " ".join(said.getvalue().split()) or f"its content is not in the format of {path.suffix} files"
+        reason = " ".join(said.getvalue().split()) or f"the content is not in the format of {path.suffix} files"
     except KeyError as error:  # a missing attribute, or a missing entity of a Gmsh group
-        reason = f"the entry {error.args[0]} is missing"
+        reason = f"the entry {error.args[0]} is missing in the file"
     except Exception as error:  # meshio's readers raise many kinds of errors
         reason = " ".join(str(error).split()) or type(error).__name__
-    raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export the mesh as VTU or Gmsh 2.2")
+    raise InputError(f"mesh file {path} cannot be read by meshio ({reason[:120]}); export the mesh as VTU or Gmsh 2.2")
 
 
 #: Cells of surfaces and edges. A file may have them in addition to its tetrahedra.
@@ -190,7 +191,7 @@ def _node_sets(data: Any, tets: np.ndarray, name: str) -> dict[str, np.ndarray]:
     for key, nodes in _surface_sets(data, tets).items():
         if key in sets and set(sets[key].tolist()) != set(nodes.tolist()):
             raise InputError(
-                f"{name}: {key!r} is a set of {len(sets[key])} nodes and a group of triangles with {len(nodes)} nodes: "
+                f"{name}: {key!r} is a set of {len(sets[key])} nodes and a group of triangles with {len(nodes)} nodes; "
                 "rename the set or the group"
             )
         sets[key] = nodes
@@ -308,7 +309,7 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, 
     groups = {name: np.asarray(own)[:, :3] for name, own in (mesh.triangle_sets or {}).items()}
     if groups and Path(path).suffix == ".msh":
         warnings.warn(
-            f"{path}: groups of triangles ({', '.join(groups)}) are not written in Gmsh's format: write a .vtu file",
+            f"{path}: groups of triangles ({', '.join(groups)}) are not written in Gmsh's format; write a .vtu file",
             stacklevel=2,
         )
     elif groups:

@@ -51,7 +51,9 @@ def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarra
     element = least.argmax(axis=1)
     worst = int(least.max(axis=1).argmin())
     if least[worst, element[worst]] < -_INSIDE:
-        raise InputError(f"{name}: the point {points[worst].tolist()} m is outside the body: move it inside")
+        raise InputError(
+            f"{name}: the point {points[worst].tolist()} m is outside the body; move this point into the body"
+        )
     return element, L[:, np.arange(len(points)), element]
 
 

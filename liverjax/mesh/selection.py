@@ -29,16 +29,17 @@ def select(
         InputError: `where` and `set` are both given or both missing, a key or set is unknown, or no node is found.
     """
     if (where is None) == (set is None):
-        raise InputError(f'{name}: give either where = {{z_max = 0.0}} or set = "name"')
+        raise InputError(f'{name} needs either where = {{z_max = 0.0}} or set = "name": give one of them')
     if set is not None:
         if as_word(set, f"{name}: set") not in mesh.node_sets:
             there = ", ".join(mesh.node_sets) or "none"
             raise InputError(
-                f"{name}: the mesh has no node set {set!r} (its node sets: {there}); use one of these sets, or where"
+                f"{name}: the mesh has no node set {set!r} (the node sets are: {there}); use one of these sets, or "
+                "where"
             )
         nodes = np.asarray(mesh.node_sets[set])
         if not len(nodes):
-            raise InputError(f"{name}: the node set {set!r} of the mesh contains no node: use another set or where")
+            raise InputError(f"{name}: the node set {set!r} of the mesh contains no node; use another set or where")
         return nodes
     if not isinstance(where, Mapping):
         raise InputError(f"{name} = {where!r} is not a table of bounds: write where = {{z_max = 0.0}}")
@@ -50,14 +51,14 @@ def select(
         if key not in known:
             raise InputError(f"{name}: {key!r} is not known: {hint(key, known)}")
         if isinstance(bound, bool) or not isinstance(bound, (int, float)) or not finite(bound):
-            raise InputError(f"{name}: {key} = {bound!r} is not a length: give a number in metres")
+            raise InputError(f"{name}: {key} = {bound!r} is not a length; give a number in metres")
         x = points[:, AXES.index(key[0])]
         _warn_of_millimetres(x, key, bound, name)
         inside &= x >= bound - tolerance if key.endswith("min") else x <= bound + tolerance
     if not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         box = ", ".join(f"{a} {lo:.4g} to {hi:.4g}" for a, lo, hi in zip(AXES, low, high, strict=True))
-        raise InputError(f"{name} = {where} selects no node: the mesh spans {box} m")
+        raise InputError(f"{name} = {where} selects no node: choose bounds within the mesh, which spans {box} m")
     return np.flatnonzero(inside)
 
 
@@ -68,7 +69,7 @@ def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> No
     if idle and abs(bound) > 1 and low < 1e-3 * bound < high:
         warnings.warn(
             f"{name}: {key} = {bound:g} m excludes no node, since the mesh spans {low:.4g} to {high:.4g} m. Bounds are "
-            f"in metres: write {1e-3 * bound:g} if you meant mm",
+            f"in metres; write {1e-3 * bound:g} if you meant mm",
             stacklevel=3,
         )
 

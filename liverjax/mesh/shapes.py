@@ -96,7 +96,9 @@ def _graded(
     _positive("rim_cell", [rim_cell])
     for ring in rings:
         if not (np.isfinite(ring) and 0 < ring < radius):
-            raise InputError(f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: correct rings")
+            raise InputError(
+                f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: correct these numbers"
+            )
     largest = min(cell_size, radius / 2)
     # A ring of radius r has at least 2 pi r / largest cells. This gives a lower bound of the number of prisms.
     _not_too_many(18 * math.ceil(radius / largest) ** 2 * math.ceil(height / cell_size), "radius, height and cell_size")
@@ -130,8 +132,8 @@ def _not_too_many(tetrahedra: int, names: str) -> None:
     """Raise `InputError` if a mesh would have more than `MOST_TETRAHEDRA` elements, before the mesh is made."""
     if tetrahedra > MOST_TETRAHEDRA:
         raise InputError(
-            f"shape {names} would give about {tetrahedra:.2g} tetrahedra, more than {MOST_TETRAHEDRA:.0e}: give "
-            "lengths in metres, or add the unit"
+            f"the shape with these values of {names} would have about {tetrahedra:.2g} tetrahedra, but at most "
+            f"{MOST_TETRAHEDRA:.0e} are allowed: give lengths in metres, or add the unit"
         )
 
 

@@ -27,7 +27,8 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 class TetMesh:
     """Straight tetrahedra with their reference geometry: a pytree with arrays as leaves.
 
-    `tet_mesh` makes a mesh. `shape_vectors` and `volumes` are computed from points and tetrahedra, also in `jax.grad`.
+    `tet_mesh` makes a mesh. `tet_mesh` and `with_points` compute `shape_vectors` and `volumes` from points and
+    tetrahedra. JAX can differentiate these functions with respect to the points.
     With `order` 2 the nodes are the vertices, followed by the middles of the edges in the order of `pattern.edges`.
     """
 
@@ -154,8 +155,8 @@ class TetMesh:
     def oriented(self, values: jax.Array) -> jax.Array:
         """Multiply values (n, C, E) of n functions and C components by the signs of the functions.
 
-        A function of order 3 on an edge has a direction, towards the vertex with the higher number. In an element that
-        has this vertex first, its sign is -1.
+        A function of order 3 on an edge has a direction, towards the vertex with the higher number. If this vertex is
+        the first one of the edge in the local numbering of the element, the sign of the function in this element is -1.
         """
         if self.order < 3:
             return values
@@ -175,7 +176,9 @@ def tet_mesh(
     The positions may be unknown (inside jit, grad or vmap), but the node numbers must be known.
     """
     if isinstance(tetrahedra, jax.core.Tracer):
-        raise InputError("tet_mesh: the node numbers are unknown inside jit, grad or vmap: make the mesh outside")
+        raise InputError(
+            "tet_mesh: the node numbers are unknown inside jit, grad or vmap; make the mesh outside of these functions"
+        )
     # `asarray` may share memory with the caller's arrays, so copies are made. NumPy copies without a compiled program.
     points = jnp.array(points, float) if isinstance(points, jax.core.Tracer) else _float_copy(points)
     neighbours = pattern(tetrahedra, points)
@@ -236,7 +239,7 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
     if tets.min() < 0 or tets.max() >= len(points):
         raise InputError(
             f"{name}: tetrahedra contain node numbers that do not exist (largest number {tets.max()}, number of nodes "
-            f"{len(points)}): number the nodes from 0"
+            f"{len(points)}); number the nodes from 0"
         )
     if not np.all(np.isfinite(points)):
         bad = int(np.argwhere(~np.isfinite(points).all(axis=1))[0, 0])

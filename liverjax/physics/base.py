@@ -146,25 +146,25 @@ class Solid:
 
     def stress(self, F: Matrix) -> Matrix:
         """First Piola-Kirchhoff stress [Pa]."""
-        raise TypeError(f"{type(self).__name__} lacks stress(F)")
+        raise TypeError(f"{type(self).__name__} must define stress(F)")
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
         """Return the stiffness blocks d2W/dx_i dx_j of the energy W per reference volume, for pairs (i, j) of nodes.
 
         D [1/m] are the gradients of the shape functions.
         """
-        raise TypeError(f"{type(self).__name__} lacks blocks(F, D, pairs)")
+        raise TypeError(f"{type(self).__name__} must define blocks(F, D, pairs)")
 
     def energy(self, F: Matrix) -> jax.Array:
         """Energy density (E,) [Pa]."""
-        raise TypeError(f"{type(self).__name__} lacks energy(F)")
+        raise TypeError(f"{type(self).__name__} must define energy(F)")
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix | None]:
         """Return pairs (weight, law), and a constant second Piola-Kirchhoff stress [Pa] or None.
 
         The stress of this term is the weighted sum of the stresses of the laws, plus the constant stress.
         """
-        raise TypeError(f"{type(self).__name__} lacks parts()")
+        raise TypeError(f"{type(self).__name__} must define parts()")
 
 
 class VolumeStress:
@@ -182,23 +182,23 @@ class VolumeStress:
 
         If the pressures are found by iterations, the iterations start at `guess`.
         """
-        raise TypeError(f"{type(self).__name__} lacks pressure(mesh, J)")
+        raise TypeError(f"{type(self).__name__} must define pressure(mesh, J)")
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
         """First Piola-Kirchhoff stress [Pa] at given pressures (V,)."""
-        raise TypeError(f"{type(self).__name__} lacks stress(mesh, pressure, F)")
+        raise TypeError(f"{type(self).__name__} must define stress(mesh, pressure, F)")
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
         """Return the first and second derivative of the energy density with respect to J, the volume ratio."""
-        raise TypeError(f"{type(self).__name__} lacks scalars(mesh, pressure, F)")
+        raise TypeError(f"{type(self).__name__} must define scalars(mesh, pressure, F)")
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
         """Return the energy [J] at volume ratios J (E,), with the pressures that belong to these volume ratios."""
-        raise TypeError(f"{type(self).__name__} lacks energy(mesh, J)")
+        raise TypeError(f"{type(self).__name__} must define energy(mesh, J)")
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
         """Return the matrix [m^3/Pa] of the pressure equation, without negative eigenvalues if `positive` is true."""
-        raise TypeError(f"{type(self).__name__} lacks matrix(mesh, J, positive)")
+        raise TypeError(f"{type(self).__name__} must define matrix(mesh, J, positive)")
 
     #: The pressure equation of a flowing fluid (`liverjax.physics.darcy.Flow`). None: no fluid flows between nodes.
     flow: Any = None
@@ -220,11 +220,11 @@ class NodalForce:
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Nodal forces (V, 3) [N], the gradient of the energy, at positions x (V, 3) and fraction s of a step."""
-        raise TypeError(f"{type(self).__name__} lacks force(mesh, x, s)")
+        raise TypeError(f"{type(self).__name__} must define force(mesh, x, s)")
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
         """Energy [J] at the end of the step."""
-        raise TypeError(f"{type(self).__name__} lacks energy(mesh, x)")
+        raise TypeError(f"{type(self).__name__} must define energy(mesh, x)")
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
         """Return an energy [J] at positions x, for a minimisation that begins at the positions `start` (V, 3).
@@ -271,7 +271,7 @@ class NodalForce:
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:
         """Return the inertia forces (V, 3) [N] for accelerations (V, 3) [m/s^2], if the term has mass."""
-        raise TypeError(f"{type(self).__name__} lacks inertial(acceleration)")
+        raise TypeError(f"{type(self).__name__} must define inertial(acceleration)")
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
         """Return the change (V, 3) [N] of a non-conservative force due to a small displacement dx (V, 3) [m]."""

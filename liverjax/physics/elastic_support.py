@@ -64,7 +64,10 @@ class ElasticSupport(Physics):
             return cls(nodes=jnp.asarray(nodes, jnp.int32), **given)
         triangles = selection.surface_of(mesh, nodes, table.get("set"))
         if not len(triangles):
-            raise InputError(f"{name} where selects nodes but no boundary triangle: enlarge the region to a whole face")
+            raise InputError(
+                f"{name}: the selected region contains nodes, but no triangle of the boundary: enlarge the region to a "
+                "whole face"
+            )
         return cls(triangles=jnp.asarray(triangles, jnp.int32), **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:

@@ -173,9 +173,9 @@ def law_in_force(porosity: Porosity | None, law: Law) -> Law:
 
 def bulk_in_force(porosity: Porosity, law: Law) -> str:
     """Return a sentence for the report: the bulk modulus in use, and the parts of the law that are not used."""
-    sponge = f"bulk modulus in use: that of the porous body, {float(porosity.bulk):g} Pa"
+    sponge = f"the bulk modulus in use is the modulus {float(porosity.bulk):g} Pa of the porous body"
     if porosity.keep_bulk:
-        return f"{sponge}, plus that of the law (keep_bulk)"
+        return f"{sponge}, plus the bulk modulus of the law (keep_bulk)"
     parts = [part for own in law.pieces() for part in own.summands()]
     whole = [part for part in parts if isochoric_part(part) is None and part.without_volume() is not None]
     if not whole:

@@ -51,12 +51,12 @@ class RigidPlate(Physics):
                 f"{name} has fewer than two nodes, or a node number above {mesh.number_of_nodes - 1}: correct the nodes"
             )
         if abs(np.linalg.norm(np.asarray(self.axis)) - 1) > 1e-6:
-            raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
+            raise InputError(f"{name} axis = {self.axis} must be of length 1: divide this vector by its length")
         if times.shape != turn.shape or (times.ndim and (np.diff(times) <= 0).any()):
-            raise InputError(f"{name} needs ascending times and one value of turn for each time: correct its history")
+            raise InputError(f"{name} needs ascending times and one value of turn for each time: correct the history")
         arms = self.at_rest(mesh).arms(mesh.points)
         if not np.abs(np.asarray(arms)).max() > 1e-9 * np.ptp(np.asarray(mesh.points)):
-            raise InputError(f"{name} has all its nodes on its axis: add nodes, or move the centre")
+            raise InputError(f"{name} has no node off its axis: add nodes, or move the centre")
 
     def at_rest(self, mesh: TetMesh) -> "Plate":
         """Return the nodes of the plate in their reference positions."""

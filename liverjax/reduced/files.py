@@ -77,7 +77,9 @@ def load_reduced(file: str | Path) -> ReducedModel:
         )
         wrong = _wrong(model)
     except (OSError, KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{file} is not a reduced model ({error}): make it with python -m liverjax reduce") from None
+        raise InputError(
+            f"{file} is not a reduced model ({error}): make a model with python -m liverjax reduce"
+        ) from None
     if wrong:
         raise InputError(f"{file} is damaged: {wrong}; make the model again with python -m liverjax reduce")
     return model

@@ -171,10 +171,12 @@ def refuse_unknown_physics(scene: Scene) -> None:
             than "float64", or a setting of newton other than "converged".
     """
     if any(region.viscosity for region in scene.region):
-        raise InputError("a reduced model has one viscosity: remove the viscosity of regions, or run the full model")
+        raise InputError(
+            "a reduced model can have only one viscosity: remove the viscosity of regions, or run the full model"
+        )
     if len(laws_of(scene.law, scene.region)) > 1:
         raise InputError(
-            "a reduced model has only one kind of law: use the same law in all regions, or run the full model"
+            "a reduced model can have only one kind of law: use the same law in all regions, or run the full model"
         )
     if scene.porosity is not None and scene.porosity.inlet:
         raise InputError("a reduced model cannot have [[porosity.inlet]]: remove the inlet, or run the full model")
@@ -191,7 +193,9 @@ def refuse_unknown_physics(scene: Scene) -> None:
     if scene.body is not None and scene.body.mass != "lumped":
         raise InputError(f"[body] mass = {scene.body.mass!r} does not work in reduced models: use mass = 'lumped'")
     if scene.solve.newton != "converged":
-        raise InputError(f"[solve] newton = {scene.solve.newton!r} does not work in reduced models: use 'converged'")
+        raise InputError(
+            f"[solve] newton = {scene.solve.newton!r} does not work in reduced models: use newton = 'converged'"
+        )
     if scene.solve.precision != "float64":
         raise InputError(
             f"[solve] precision = {scene.solve.precision!r} does not work in reduced models: use precision = 'float64'"
@@ -279,14 +283,14 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
         before, after = made.pop(name, None), own.pop(name)
         if before is not None and (after > before * (1 + 1e-6) if isinstance(after, float) else after != before):
             raise InputError(
-                f"{name} = {after}, but the reduced model was trained with {before}, so its error is unknown: use "
-                "lj.reduced_error, or train a model for this value"
+                f"{name} = {after}, but the reduced model was trained with {before}, so the error of the model is "
+                "unknown: use lj.reduced_error, or train a model for this value"
             )
     changed = sorted(name for name in made.keys() | own.keys() if made.get(name) != own.get(name))
     if changed:
         raise InputError(
-            f"{changed[0]} differs from the training of the reduced model, so the error of the model is unknown: use "
-            "lj.reduced_error, or train a model with this number among its parameters"
+            f"{changed[0]} differs from the training runs of the reduced model, so the error of the model is unknown: "
+            "use lj.reduced_error, or train a model with this number among its parameters"
         )
 
 

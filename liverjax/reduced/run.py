@@ -253,7 +253,7 @@ def reduced_pressure(model: ReducedModel, scene: Scene, result: ReducedResult) -
         InputError: the scene has no porosity.
     """
     if model.pressures is None or result.pressures is None:
-        raise InputError("this reduced model has no pressures: its scene has no [porosity]")
+        raise InputError("this reduced model has no pressures, because its scene has no [porosity]")
     return jax.vmap(partial(on_middles, scene.mesh))(result.pressures @ model.pressures.modes)
 
 
@@ -283,7 +283,9 @@ def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult, corre
             has numbers that do not occur in the training runs (inside jit, grad or vmap this is not checked).
     """
     if model.correction is None:
-        raise InputError("this reduced model has no correction: train it with more runs, or use lj.reduced_error")
+        raise InputError(
+            "this reduced model has no correction: train the model with more runs, or use lj.reduced_error"
+        )
     refuse_unseen_numbers(model, scene)
     if not corrected:
         return size_at(model.correction, result.coordinates, scene.solve.dt)

@@ -115,8 +115,8 @@ def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> 
         value = jnp.asarray(values[name], model.fields.dtype)
         if not isinstance(value, jax.core.Tracer) and not low <= value <= high:
             raise InputError(
-                f"{name} = {float(value):g} is outside of {float(low):g} to {float(high):g}: make the model with a "
-                "wider range"
+                f"{name} = {float(value):g} is outside of the training range {float(low):g} to {float(high):g}: make "
+                "the model with a wider range"
             )
         # Polynomials grow fast outside of the range, so values and derivatives would be wrong there.
         value = value * jnp.where((low <= value) & (value <= high), 1.0, jnp.nan)
@@ -148,7 +148,7 @@ def _names_and_limits(
         )
     for name, limits in ranges.items():
         if np.ndim(numbers_at(scene, name)) != 0:
-            raise InputError(f"{name} has several numbers: name one of them, e.g. {name}.0")
+            raise InputError(f"{name} is a list of numbers: name one of these numbers, e.g. {name}.0")
         if np.shape(limits) != (2,) or not np.all(np.isfinite(limits)) or not limits[0] < limits[1]:
             raise InputError(f"ranges[{name!r}] = {limits!r} is not a range: give the lowest and the highest value")
     for corner in itertools.product(*ranges.values()):

@@ -75,7 +75,7 @@ def reduce_scene(
     count = len(next(iter(values.values()), ()))
     runs = count if runs is None else runs
     if not FEWEST_RUNS <= runs <= count and runs != count:
-        raise InputError(f"runs = {runs} must be {FEWEST_RUNS} to {count}, the number of rows")
+        raise InputError(f"runs = {runs} must be from {FEWEST_RUNS} to {count} (the number of rows)")
     if runs == count:
         return _model_of(scene, _full_runs(scene, values), tolerance, most_modes, point_tolerance)
     first = 2 * runs // 3
@@ -98,7 +98,7 @@ def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
     result = simulate_batch(scene, dict(values)).result
     good = np.all(np.asarray(result.status) == status.CONVERGED, axis=1)
     if not good.any():
-        raise InputError(f"none of the {len(good)} runs converged: give smaller loads, or more and smaller steps")
+        raise InputError(f"none of the {len(good)} runs converged: give smaller loads, or more steps")
     mask = free_degrees(scene.mesh, scene.fixed, scene.displaced)
     u = np.asarray(result.positions)[good]
     u -= np.asarray(scene.mesh.points)

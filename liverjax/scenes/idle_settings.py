@@ -25,7 +25,7 @@ def refuse_idle(content: Content) -> None:
     for key in mesh:
         if key not in (*_EVERY_MESH, *_MESHES[kind]):
             what = "a mesh from a file" if kind == "file" else f"shape = {kind!r}"
-            raise InputError(f"[mesh] {key} has no effect for {what}: remove it")
+            raise InputError(f"[mesh] {key} has no effect for {what}: remove this key")
     motion = solve.get("kind", "static")
     if motion != "dynamic" and solve.get("integrator") == "newmark":
         raise InputError(
@@ -37,10 +37,10 @@ def refuse_idle(content: Content) -> None:
         )
     for key in ("fields", "reactions"):
         if motion == "harmonic" and output.get(key):
-            raise InputError(f"[output] {key} cannot be used with [solve] kind = 'harmonic': remove it")
+            raise InputError(f"[output] {key} cannot be used with [solve] kind = 'harmonic': remove this key")
     for place, key in (("solve", "dt"), ("solve", "steps"), ("porosity", "initial_pressure")):
         if motion == "harmonic" and key in content.get(place, {}):
-            raise InputError(f"[{place}] {key} cannot be used with [solve] kind = 'harmonic': remove it")
+            raise InputError(f"[{place}] {key} cannot be used with [solve] kind = 'harmonic': remove this key")
     if motion == "harmonic" and content.get("body", {}).get("mass") == "lumped":
         raise InputError(
             "[body] mass = 'lumped' cannot be used with [solve] kind = 'harmonic', which has consistent masses: remove "

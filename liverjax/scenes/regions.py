@@ -45,11 +45,12 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
         if as_word(set, f"{name}: set") not in mesh.element_sets:
             known = ", ".join(mesh.element_sets) or "none"
             raise InputError(
-                f"{name}: the mesh has no element set {set!r} (it has: {known}); use one of these sets, or where"
+                f"{name}: the mesh has no element set {set!r} (the element sets are: {known}); use one of these sets, "
+                "or where"
             )
         elements = np.asarray(mesh.element_sets[set])
         if not len(elements):
-            raise InputError(f"{name}: the element set {set!r} of the mesh is empty: correct the set, or use where")
+            raise InputError(f"{name}: the element set {set!r} of the mesh is empty; correct the set, or use where")
         return elements
     nodes = boundary.select(mesh, where, set, name)
     inside = np.flatnonzero(np.isin(np.asarray(mesh.tetrahedra), nodes).all(axis=1))
@@ -128,7 +129,9 @@ def law_number(law: Law, name: str) -> jax.Array:
     """
     value = names.get(law, name, refused_name(name))
     if isinstance(value, tuple):
-        raise InputError(f"region: {name} is a list of {len(value)} values: name one of them, for example {name}.0")
+        raise InputError(
+            f"region: {name} is a list of {len(value)} values: name one of these values, for example {name}.0"
+        )
     return value
 
 

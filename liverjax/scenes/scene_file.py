@@ -86,7 +86,7 @@ def load_scene(path: str | Path) -> Scene:
     except UnicodeDecodeError:
         raise InputError(f"{path} is not a text file: give a scene file (TOML)") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is not TOML ({error}): correct that line") from None
+        raise InputError(f"{path} is not valid TOML ({error}): correct this line") from None
     try:
         return scene_from(content, path.parent)
     except InputError as error:
@@ -151,7 +151,7 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
                 raise InputError(_of_two_kinds(name, own, [set(p.keys) for p in NAMED if p.section == section]))
             if not kinds:
                 known = (", ".join(key for key in p.keys if key not in PLACE) for p in NAMED if p.section == section)
-                raise InputError(f"{name} has only where or set: give {' or '.join(known)}")
+                raise InputError(f"{name} contains only where or set: also give {' or '.join(known)}")
             yield kinds[0].read(mesh, table, name)
 
 
@@ -206,7 +206,7 @@ def _number(name: str, value: object) -> float:
 
 def _numbers(name: str, value: object, length: int | None = None) -> np.ndarray:
     if not isinstance(value, list) or (length is not None and len(value) != length):
-        raise InputError(f"{name} = {value!r} must be a list of {length or 'some'} numbers: give such a list")
+        raise InputError(f"{name} = {value!r} must be a list of {length or 'some'} numbers: correct this list")
     return np.array([_number(name, v) for v in value])
 
 
@@ -215,7 +215,9 @@ def _mesh(table: dict, folder: Path) -> TetMesh:
     if order not in (None, 1, 2) or isinstance(order, bool):
         raise InputError(f"[mesh] order = {order!r} is not known: use 1 (linear) or 2 (quadratic tetrahedra)")
     if order == 1 and mesh.order == 2:
-        raise InputError("[mesh] order = 1, but the file contains quadratic tetrahedra: remove order, or export linear")
+        raise InputError(
+            "[mesh] order = 1, but the file contains quadratic tetrahedra: remove order, or export linear tetrahedra"
+        )
     return quadratic(mesh) if order == 2 else mesh
 
 
@@ -363,7 +365,10 @@ def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
         return Inlet(nodes=nodes, pressure=_number(f"{name} pressure", table["pressure"]), **times)
     triangles = boundary.surface_of(mesh, nodes, table.get("set"))
     if not len(triangles):
-        raise InputError(f"{name} where contains nodes but no boundary triangle: enlarge the region to a whole face")
+        raise InputError(
+            f"{name}: the selected region contains nodes, but no triangle of the boundary: enlarge the region to a "
+            "whole face"
+        )
     flux = _number(f"{name} flux", table["flux"])
     return Inlet(triangles=node_numbers(triangles), flux=flux, **times)
 
@@ -437,7 +442,10 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
         raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
     triangles: Indices = boundary.surface_of(mesh, _nodes(mesh, name, table), table.get("set"))
     if len(triangles) == 0:
-        raise InputError(f"{name} where contains nodes but no boundary triangle: enlarge the region to a whole face")
+        raise InputError(
+            f"{name}: the selected region contains nodes, but no triangle of the boundary: enlarge the region to a "
+            "whole face"
+        )
     triangles = node_numbers(triangles)
     if "pressure" in table:
         return Traction(triangles=triangles, pressure=_number(f"{name} pressure", table["pressure"]), **given)

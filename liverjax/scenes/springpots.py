@@ -53,7 +53,10 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
     bounds.check_fields(own, "springpots")
     shapes = {np.shape(a) for a in (own.times, own.exponents, own.limits) if a is not None}
     if len(shapes) != 1 or len(np.shape(own.times)) != 1:
-        raise InputError("springpots times, exponents and limits differ in length: give one of each per springpot")
+        raise InputError(
+            "the lists times, exponents and limits of [springpots] differ in length: give one number of each list per "
+            "springpot"
+        )
     check_part(own.part, law, "springpots")
 
 

@@ -72,13 +72,13 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     """Return a sentence about the mesh error of the positions at the last step, with a remedy if it is large."""
     assert result.mesh_error is not None
     if np.asarray(result.status)[-1] not in (status.CONVERGED, status.ONE_STEP):
-        return "mesh error: unknown, because the last step failed"
+        return "the mesh error is unknown, because the last step failed"
     u = np.asarray(result.positions[-1]) - np.asarray(scene.mesh.points)
     size = float(np.linalg.norm(u, axis=1).max())
     error = float(np.linalg.norm(np.asarray(result.mesh_error.positions[-1]), axis=1).max())
     nothing = _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points))
     if size <= nothing and error <= nothing and np.all(np.asarray(result.mesh_error.found)):
-        return "mesh error: zero, because the body does not move"
+        return "the mesh error is zero, because the body does not move"
     part = (
         f"{100 * error / size:.2g} % of the largest displacement ({size:.3g} m)"
         if size > nothing
@@ -88,11 +88,11 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     said = said.format(*_pressure_errors(result))
     single = next((p.section for p in scene.physics if p.pulls_single_nodes()), None)
     if single is not None:
-        said += f". Forces of [[{single}]] at single nodes depend on the mesh; this estimate does not include that"
+        said += f". Forces of [[{single}]] at single nodes depend on the mesh; the estimate does not include this"
     if not np.all(np.asarray(result.mesh_error.found)):
         return (
-            f"{said}; at some steps no estimate was found, or it inverts elements: the mesh is too coarse for a "
-            "reliable estimate"
+            f"{said}; at some steps no estimate was found, or the estimate inverts elements: the mesh is too coarse "
+            "for a reliable estimate"
         )
     if error <= _SMALL * size:
         return said
@@ -106,7 +106,7 @@ def _pressure_errors(result: Result) -> tuple[str, str]:
     if result.mesh_error.pressure is None:
         return ", without the error of the fluid's pressures", ""
     error, size = (float(np.abs(np.asarray(own[-1])).max()) for own in (result.mesh_error.pressure, result.pressure))
-    return "", f"; pressures are wrong by up to {error:.2g} Pa, the largest pressure is {size:.3g} Pa"
+    return "", f"; pressures are wrong by up to {error:.2g} Pa (the largest pressure is {size:.3g} Pa)"
 
 
 def cautions_of_mesh(mesh: TetMesh) -> list[str]:
@@ -115,21 +115,24 @@ def cautions_of_mesh(mesh: TetMesh) -> list[str]:
     size, quality = float(np.ptp(points, axis=0).max()), qualities(points, tets, np.asarray(mesh.volumes))
     said = []
     if size > LONGEST:
-        said.append(f"the body is {size:.3g} m long: check the mesh's unit, e.g. write unit = 'mm'")
+        said.append(f"the body is {size:.3g} m long: check the unit of the mesh, e.g. write unit = 'mm'")
     if size < SHORTEST:
-        said.append(f"the body is {size:.3g} m long: check its size; if its coordinates are in m, remove unit")
+        said.append(
+            f"the body is {size:.3g} m long: check this size, and remove unit if the coordinates of the mesh are in m"
+        )
     doubled = doubled_vertices(mesh)
     if doubled:
         said.append(
-            f"{doubled} nodes have the same coordinates as another node: the body is not connected there; merge these "
-            "nodes if the body should be connected"
+            f"{doubled} nodes have the same coordinates as another node, so the body is not connected there: merge "
+            "these nodes if the body should be connected"
         )
     slivers = np.flatnonzero(quality < SLIVER)
     if len(slivers):
         worst = int(np.argmin(quality))
         said.append(
-            f"{len(slivers)} of {len(tets)} elements are slivers, of quality below {SLIVER:g} (worst: element {worst}, "
-            f"{quality[worst]:.2g}; regular: 1): stresses there are unreliable; improve the mesh"
+            f"{len(slivers)} of {len(tets)} elements are slivers, with a quality below {SLIVER:g} (worst: element "
+            f"{worst} with {quality[worst]:.2g}; a regular tetrahedron has 1). Stresses there are unreliable: improve "
+            "the mesh"
         )
     return said
 
@@ -203,8 +206,8 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
         return []
     k = int(np.argmax(moving > given + 1e-3 * np.abs(work).max()))
     return [
-        f"from {float(np.asarray(result.times)[k]):.4g} s on the kinetic energy of the body exceeds the work of its "
-        "loads: with Newmark's method large motions grow if a step is as long as a period. Use a step of a twentieth "
+        f"from {float(np.asarray(result.times)[k]):.4g} s on, the kinetic energy of the body exceeds the work of its "
+        "loads. With Newmark's method, large motions grow if a step is as long as a period. Use a step of a twentieth "
         "of the period, or integrator = 'euler'"
     ]
 
@@ -233,15 +236,15 @@ def _of_histories(scene: Scene, result: Result) -> list[str]:
         if beyond[peak] > MISSED * whole.max():
             said.append(
                 f"the history of {name} has a peak at {every[peak]:.4g} s between two steps, and the run misses "
-                f"{100 * beyond[peak] / whole.max():.2g} % of it: use a smaller dt, or a dt that divides "
+                f"{100 * beyond[peak] / whole.max():.2g} % of this peak: use a smaller dt, or a dt that divides "
                 f"{every[peak]:.4g} s"
             )
             continue
         lost, everything = (np.trapezoid(a, every, axis=0).max() for a in (apart, whole))
         if lost > MISSED * everything:
             said.append(
-                f"the history of {name} bends within steps, but the run uses only its values at the ends of steps: the "
-                f"error is {100 * lost / everything:.2g} % of the integral over time. Use a smaller dt"
+                f"the history of {name} bends within steps, but the run uses only the values at the ends of steps, so "
+                f"the error is {100 * lost / everything:.2g} % of the integral over time: use a smaller dt"
             )
     return said
 
@@ -258,8 +261,9 @@ def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result,
         between, approach = missed_depth(obstacle, scene.mesh, x, moved[k])
         if between > BETWEEN * approach:
             return [
-                f"{name} is {between:.2g} m in the body between the points at which contact is tested, with an "
-                f"approach of {approach:.2g} m: the triangles are too large for its radius; refine the mesh there"
+                f"{name} penetrates the body by {between:.2g} m between the points at which contact is tested (its "
+                f"approach is {approach:.2g} m), because the triangles are too large for its radius: refine the mesh "
+                "there"
             ]
     return []
 
@@ -382,10 +386,10 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
     if layer >= height:
         return []
     return [
-        f"{when.format(seconds)} the fluid leaves a layer of about {layer:.2g} m at the drained "
-        f"nodes, but the elements there are {height:.2g} m thick. These elements lose too much fluid, so pressures "
-        "and displacements are wrong there (the mesh error shows by how much). Use thinner elements there, or no "
-        "drained nodes if nothing should flow"
+        f"{when.format(seconds)} the fluid leaves a layer of about {layer:.2g} m at the drained nodes, but the "
+        f"elements there are {height:.2g} m thick. These elements lose too much fluid, so pressures and displacements "
+        "are wrong there (the mesh error shows how much). Use thinner elements there, or no drained nodes if nothing "
+        "should flow"
     ]
 
 
@@ -445,7 +449,7 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
         return []
     return [
         f"{said}: use a dt of {enough:.2g} s or more, or elements of "
-        f"{np.sqrt(float(scene.solve.dt) * flow / _FOLLOWS):.2g} m there (they are {height:.2g} m thick)"
+        f"{np.sqrt(float(scene.solve.dt) * flow / _FOLLOWS):.2g} m there (the elements are {height:.2g} m thick)"
     ]
 
 
@@ -478,7 +482,8 @@ def _of_volumes(scene: Scene, result: Result) -> list[str]:
 
 
 def _extremes(mesh: TetMesh, positions: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Return for each element (E,): minimum J, its step (from 0), maximum J, and its step."""
+    """Return four arrays (E,): the minimum volume ratio J of each element (at most 1), the index of the step with this
+    minimum, the maximum J (at least 1), and the index of the step with this maximum. Indices begin at 0."""
 
     def one(carry: tuple, given: tuple) -> tuple[tuple, None]:
         least, when_least, most, when_most = carry

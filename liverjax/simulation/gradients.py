@@ -63,7 +63,7 @@ def value_and_gradient(
     if mode not in MODES:
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
     if not at:
-        raise InputError("no parameters for the derivatives: give some, e.g. {'law.mu': 770.0}")
+        raise InputError("no parameters are given for the derivatives: give e.g. {'law.mu': 770.0}")
     gradient_checkpoints.number_kept(store, scene.solve.steps)
     values = {name: jnp.asarray(value, float) for name, value in at.items()}
     numbers = {name: value for name, value in values.items() if name != START}

@@ -142,7 +142,9 @@ def simulate(
     if start is not None:
         start = jnp.array(start, scene.mesh.points.dtype)
         if start.shape != scene.mesh.points.shape:
-            raise InputError(f"start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}")
+            raise InputError(
+                f"the argument start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}"
+            )
     if mesh_error:
         refuse(scene)
         if start is not None:
@@ -223,7 +225,7 @@ def _ready(scene: Scene) -> Scene:
     if scene.solve.reduced:
         file = scene.solve.reduced
         raise InputError(
-            f"[solve] reduced = {file!r} is only for python -m liverjax simulate: in Python remove it and call "
+            f"[solve] reduced = {file!r} is only for python -m liverjax simulate: in Python, remove reduced and call "
             "lj.simulate_reduced(lj.load_reduced(file), scene)"
         )
     scene = automatic.chosen(by_element(scene))

@@ -243,7 +243,7 @@ def _true(kind: Kind, dtype: Any) -> jax.Array:
 #: stiffness between nodes that is not in the matrix.
 _Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Between, ...]]
 
-# The functions below are called several times in a compiled program. With jit, JAX evaluates them only once.
+# The functions below are called several times in a compiled program. With jit, JAX traces them only once.
 
 
 @partial(jax.jit, static_argnames="name")

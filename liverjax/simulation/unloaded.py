@@ -53,8 +53,8 @@ def unload(scene: Scene) -> Unloaded:
     points, code, relative = _found_shape(resting(scene))
     if not isinstance(code, jax.core.Tracer) and int(code) != status.CONVERGED:
         raise InputError(
-            '[mesh] is = "loaded": no reference shape was found that these loads deform into the given shape '
-            f"(residual {float(relative):.1g} of the forces): use a stiffer law, smaller loads or a better mesh"
+            '[mesh] is = "loaded": no reference shape was found for the given shape under these loads (residual '
+            f"{float(relative):.1g} of the forces); use a stiffer law, smaller loads or a better mesh"
         )
     # Under jit the points are NaN if no shape was found.
     mesh = with_points(scene.mesh, jnp.where(code == status.CONVERGED, points, jnp.nan))

@@ -27,7 +27,8 @@ from liverjax.tensors.places import given
 
 
 class PointMatrix(NamedTuple):
-    """Derivative of the nodal forces and, if pressures are unknowns, of the negative balance of nodal volumes.
+    """Matrix of the linearised equations: the stiffness of the nodal forces and, if pressures are unknowns, the
+    derivatives of the volumes with respect to positions, and the block of the vertex pressures.
 
     Each of E elements has Q integration points.
     """

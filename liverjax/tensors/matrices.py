@@ -160,7 +160,9 @@ def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
             last node, without an error.
     """
     if jnp.shape(x) != mesh.points.shape:
-        raise InputError(f"positions have shape {jnp.shape(x)}: give one row of 3 per node, {mesh.points.shape}")
+        raise InputError(
+            f"the positions have shape {jnp.shape(x)}: give one row of 3 per node, shape {mesh.points.shape}"
+        )
     edges = mesh.edges([x[:, c] for c in range(3)])
     D = mesh.gradients
     return tuple(tuple(sum(edges[a][i] * D[a, j] for a in range(3)) for j in range(3)) for i in range(3))

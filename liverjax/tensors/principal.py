@@ -116,7 +116,7 @@ def _(left, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _counted_one(left: int, C: tuple) -> jax.Array:
-    """Return the number 1, which can be differentiated `left` times.
+    """Return an array of ones with the shape of C[0]. JAX can differentiate it `left` times.
 
     A further derivative would be wrong, so it raises an error.
     """
@@ -126,7 +126,9 @@ def _counted_one(left: int, C: tuple) -> jax.Array:
 @_counted_one.defjvp
 def _(left, primals, tangents):
     if left == 0:
-        raise NotImplementedError("stretch-based laws: derivatives with respect to positions exist up to third order")
+        raise NotImplementedError(
+            "derivatives of stretch-based laws with respect to positions exist only up to third order"
+        )
     return _counted_one(left, *primals), 0.0 * _counted_one(left - 1, *primals) * sum(tangents[0])
 
 
@@ -153,7 +155,9 @@ _PAIRS_OF_NODES = ((0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1))  # indices i and j of
 
 
 def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -> jax.Array:
-    """Return the expansion of the module docstring for (J^(-1/3) lambda)^alpha, differentiable in alpha, X and ln J.
+    """Return the sum over m of (J^(-1/3) lambda_m)^alpha, minus 3, computed with the expansion in the module docstring.
+
+    JAX can differentiate this function with respect to alpha, X and ln J.
 
     Divided differences of the same kind are computed as one array. So only a tenth of the operations must be compiled.
     """

@@ -17,7 +17,9 @@ T = TypeVar("T")
 class Subsets(NamedTuple):
     """A partition of the elements: every element is in exactly one subset."""
 
-    elements: tuple[jax.Array, ...]  # element numbers (1, n) of each subset; no array of element values has this shape
+    #: Element numbers (1, n) of each subset. The first axis distinguishes these arrays from arrays (n,) of element
+    #: values.
+    elements: tuple[jax.Array, ...]
     places: jax.Array  # (E,), or (1, E) with several integration points: position of each element in the joined subsets
 
     @property

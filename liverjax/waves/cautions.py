@@ -32,13 +32,13 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
     for name, physics in named_physics(scene):
         if isinstance(physics, Ligament) and physics.is_straight_without_tension(scene.mesh, x):
             said.append(
-                f"{name} is straight but has no tension. A real ligament can only pull, but in harmonic motion "
-                "this one also pushes"
+                f"{name} is straight but has no tension. A real ligament can only pull, but in harmonic motion this "
+                "ligament also pushes"
             )
         if isinstance(physics, Obstacle) and touches_without_pressure(physics, scene.mesh, x):
             said.append(
-                f"{name} touches the body without pressure. A real obstacle can only push, but in harmonic "
-                "motion this one also pulls"
+                f"{name} touches the body without pressure. A real obstacle can only push, but in harmonic motion this "
+                "obstacle also pulls"
             )
     if scene.solve.frequencies is None:
         return said

@@ -105,19 +105,23 @@ def harmonic(
     number, elements = len(omegas), mesh.number_of_elements
     factors = _factors(scene, omegas) if factors is None else jnp.asarray(factors, complex)
     if factors.shape not in ((number,), (number, elements)):
-        raise InputError(f"factors have shape {factors.shape}: give ({number},) or ({number}, {elements})")
+        raise InputError(f"the argument factors has shape {factors.shape}: give ({number},) or ({number}, {elements})")
     if motion is None:
         motion = prescribed(mesh, tuple(replace(d, times=None, history=None) for d in scene.displaced), 0.0, 1.0)
     motion = jnp.asarray(motion, complex)
     if motion.shape not in (mesh.points.shape, (number, *mesh.points.shape)):
-        raise InputError(f"motion has shape {motion.shape}: give {mesh.points.shape}, or one such array per frequency")
+        raise InputError(
+            f"the argument motion has shape {motion.shape}: give {mesh.points.shape}, or one such array per frequency"
+        )
     if about is not None and scene.porosity is not None and not _drains(scene.porosity):
         raise InputError(
             "a loaded state (gravity, about) does not determine the pressure in a porous body that cannot drain: give "
             "porosity.drained"
         )
     if about is not None and jnp.shape(about) != mesh.points.shape:
-        raise InputError(f"about has shape {jnp.shape(about)}: give positions of shape {mesh.points.shape}")
+        raise InputError(
+            f"the argument about has shape {jnp.shape(about)}: give positions of shape {mesh.points.shape}"
+        )
     motion = jnp.broadcast_to(motion, (number, *mesh.points.shape))
     return _answer(scene, (factors, omegas), motion, about, mass)
 
@@ -199,7 +203,7 @@ def _frequencies(frequencies_Hz: Any) -> jax.Array:
     ):
         raise InputError(
             f"frequencies_Hz = {np.asarray(frequencies_Hz).tolist()} must be a list of numbers above 0, at most "
-            f"{HIGHEST_HZ:g}"
+            f"{HIGHEST_HZ:g}: correct these numbers"
         )
     return found
 
@@ -227,12 +231,13 @@ def _small(scene: Scene, mass: str) -> Scene:
         raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
     if scene.points_are == "loaded":
         raise InputError(
-            '[mesh] is = "loaded" cannot be used in harmonic motion: use the scene of lj.unloaded(scene), and '
-            "give the last positions of its run as the argument about"
+            '[mesh] is = "loaded" cannot be used in harmonic motion: use the scene of lj.unloaded(scene), and give the '
+            "last positions of a run of this scene as the argument about"
         )
     if any(isinstance(physics, RoughObstacle | PressedObstacle) for physics in scene.physics):
         raise InputError(
-            "friction and pressed obstacles cannot be used in harmonic motion: remove them, or do a transient run"
+            "friction and pressed obstacles cannot be used in harmonic motion: remove friction and force, or do a "
+            "transient run"
         )
     if follows(scene.traction):
         raise InputError("a pressure that follows the body cannot be used in harmonic motion: give a traction as value")

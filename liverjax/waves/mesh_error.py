@@ -68,7 +68,8 @@ def harmonic_errors(
     nodes = scene.mesh.number_of_nodes
     if found.displacement.shape[1] != nodes:
         raise InputError(
-            f"the result has {found.displacement.shape[1]} nodes, but the scene {nodes}: give the scene of the result"
+            f"the result has {found.displacement.shape[1]} nodes, but the scene has {nodes}: give the scene of the "
+            "result"
         )
     about = under_its_weight(scene) if about is None else about
     finer = scene.porosity is not None and can_be_refined(scene)

@@ -98,7 +98,7 @@ class _Order(NamedTuple):
 
     pairs: np.ndarray  # (n n E,) index of the block for each pair of nodes of an element
     blocks: "scipy.sparse.csr_array"  # (V, V): pairs of nodes with a common element
-    free: np.ndarray  # numbers of the free unknowns
+    free: np.ndarray  # indices of the free unknowns
     entries: "scipy.sparse.csr_array | None"  # positions of the free entries in the blocks; None if others exist
     plan: list[multifrontal.Front]
 

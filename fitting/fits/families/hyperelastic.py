@@ -142,9 +142,12 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
         )
     notes = []
     if zero:
-        notes.append(f"{', '.join(zero)} kept at 0 as given")
+        notes.append(f"the given value 0 is kept for {', '.join(zero)}")
     if absent:
-        notes.append(f"{', '.join(absent)} not fitted (to fit them, give them values in a law FILE.py:LAW)")
+        notes.append(
+            f"no value is given or fitted for {', '.join(absent)} (to fit such a parameter, give a value in a law "
+            "FILE.py:LAW)"
+        )
     told = f"{label}: the fitted parameters are {', '.join(f.name for f in fitted)}; " + "; ".join(notes)
     return fitted, (told,) if notes else ()
 

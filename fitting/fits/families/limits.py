@@ -83,7 +83,7 @@ def still_relaxing(storage: np.ndarray, noise: float, longest: float) -> list[st
         return []
     return [
         f"G' falls by {100 * fall / storage[1]:.2g} % in the lowest half decade and by "
-        f"{100 * next_fall / storage[2]:.2g} % in the next. The equilibrium modulus is the modulus after "
+        f"{100 * next_fall / storage[2]:.2g} % in the next half decade. The equilibrium modulus is the modulus after "
         f"{longest:.3g} s, the longest relaxation time of the model. It is unknown how much of this modulus relaxes "
         "later. The stated error does not contain this part: measure at lower frequencies"
     ]

@@ -294,8 +294,8 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     return [
         *out,
         f"{second.kind.name} explains the data about as well as {chosen.kind.name} (criterion {apart:.2g} higher; 10 "
-        "is strong evidence). The data do not decide between these models, whose moduli may differ much outside the "
-        "measured band",
+        "is strong evidence). The data do not decide between these models, and their moduli may differ much outside "
+        "the measured band",
     ]
 
 

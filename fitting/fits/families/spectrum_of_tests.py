@@ -166,7 +166,7 @@ def _as_a_fit(
     sentences = []
     if made.error > as_prony_modes.ALLOWED:
         sentences.append(
-            f"{len(made.times)} Prony modes represent the spectrum only with errors of up to {100 * made.error:.2g} %"
+            f"{len(made.times)} Prony modes represent the spectrum with errors of up to {100 * made.error:.2g} %"
         )
     details: Content = {
         "conversion": {"modes": len(spread.values) // 2, "largest_relative_error": made.error},

@@ -109,7 +109,7 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
         own = _of_such_noise(own, fit.kind.values, u, alike.root, alike.independent)
     sentence = (
         f"the noise of neighbouring values is correlated, or the model is inadequate. The {len(r)} values carry the "
-        f"information of {alike.independent:.0f} independent values; the standard errors include this"
+        f"information of {alike.independent:.0f} independent values; the standard errors include this effect"
     )
     details = fit.details | {INDEPENDENT: float(alike.independent)}
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, sentence), details=details)

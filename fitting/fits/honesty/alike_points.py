@@ -21,7 +21,7 @@ INDEPENDENT = "independent_moduli"
 OF_INDEPENDENT = "errors_of_independent_noise"
 #: Words about the standard errors in the warning about structured residuals, if the noise of neighbouring frequencies
 #: is correlated.
-CONTAINED = "the standard errors contain it as correlated noise of neighbours"
+CONTAINED = "the standard errors contain it, as correlated noise of neighbours"
 #: First words of the warning about noise that is correlated between neighbouring frequencies.
 SHARED = "the noise of neighbouring frequencies is correlated"
 
@@ -39,7 +39,7 @@ def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
         own = not_below(own, fit.kind.values, u, alike.root)
     told = (
         f"{SHARED}, or the model is inadequate. The {2 * len(fit.storage)} moduli carry the information of "
-        f"{alike.independent:.0f} independent moduli; the standard errors include this"
+        f"{alike.independent:.0f} independent moduli; the standard errors include this effect"
     )
     fluid = uncertainty.like_a_fluid(modes, uncertainty.LOWER) if fit.kind.name == "prony" else []
     # The warning about a fluid may have been given before, with the smaller errors.

@@ -43,8 +43,7 @@ def told(fit: Together, relative: float = 0.0) -> list[str]:
     )
     if abs(np.log(factor)) < 2 * np.sqrt(2) * relative:
         return [
-            said + "errors in the sizes of the samples explain this factor. The total errors contain the "
-            "errors of these sizes"
+            said + "errors in the sizes of the samples explain this factor, and the total errors contain these errors"
         ]
     return [
         said

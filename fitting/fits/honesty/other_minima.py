@@ -51,8 +51,8 @@ def of_other_minima(
         if not 1 / _RATIO < ratios[k] < _RATIO:
             numbers = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, other, strict=True))
             return [
-                f"other parameter values fit these tests equally well ({numbers}). At a stretch of "
-                f"{stretches[k]:.2g}, they give {ratios[k]:.2g} times the stress of the fitted values: add a test in "
-                "tension or compression"
+                f"other parameter values fit these tests equally well ({numbers}). At a stretch of {stretches[k]:.2g}, "
+                f"these values give {ratios[k]:.2g} times the stress of the fitted values: add a test in tension or "
+                "compression"
             ]
     return []

@@ -51,13 +51,13 @@ def _assumed_between_rows(test: TimeTest) -> str:
     begin, end = test.time[test.jumps[0] - 1], test.time[test.jumps[0]]
     if test.rise == BEFORE_ROWS:
         return (
-            f"no row shows how the load rose before {end:.4g} s: a linear rise is assumed. "
-            "If the load was a step at 0 s,"
+            f"no row shows how the load rose before {end:.4g} s, so a linear rise is assumed. If the load was a step "
+            "at 0 s,"
         )
     more = f", and in {len(test.jumps) - 1} more jumps" if len(test.jumps) > 1 else ""
     steps = "the changes were steps at the later rows" if more else f"the change was a step at {end:.4g} s"
     return (
-        f"no row shows how the load changed between {begin:.4g} and {end:.4g} s{more}: linear changes are assumed. "
+        f"no row shows how the load changed between {begin:.4g} and {end:.4g} s{more}, so linear changes are assumed. "
         f"If {steps},"
     )
 

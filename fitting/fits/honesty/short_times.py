@@ -43,16 +43,17 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
         what = "stress" if test.kind == "relaxation" else "relaxation modulus"
         told = (
             f"the {what} falls by {100 * fall / whole:.2g} % in the first half decade of the record, and by "
-            f"{100 * max(next_fall, 0.0) / whole:.2g} % in the next. It is unknown how much relaxed before {first:.3g} "
-            "s, and G0 does not contain this part: begin the record earlier, or compare --model auto"
+            f"{100 * max(next_fall, 0.0) / whole:.2g} % in the next half decade. It is unknown which part relaxed "
+            f"before {first:.3g} s, and G0 does not contain this part: begin the record earlier, or compare --model "
+            "auto"
         )
         return fit._replace(warnings=(*fit.warnings, told))
     missing = fall * ratio / (1 - ratio) - (whole - G[0])
     if missing <= SHOWN * error:
         return fit
     told = (
-        f"G0 may be {missing:.2g} Pa larger, if the modulus fell before {first:.3g} s in the same way as after it. "
-        "The chosen modes do not contain this part (it is in the total error): begin the record earlier, or compare "
+        f"G0 may be {missing:.2g} Pa larger, if the modulus fell before {first:.3g} s in the same way as after it. The "
+        "chosen modes do not contain this part (the total error contains it): begin the record earlier, or compare "
         "--model auto"
     )
     return fit._replace(warnings=(*fit.warnings, told), details=fit.details | {MISSING: float(missing)})

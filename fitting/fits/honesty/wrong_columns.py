@@ -28,8 +28,8 @@ class _Cause(NamedTuple):
     function `driven` computes the true driven quantity from (driven column, number). The function `column` computes the
     values in the stress column from (nominal stress, true driven quantity, number).
 
-    The number is the same for all curves. During the fit, it is divided by the stress scale of the first curve if it is
-    a stress, otherwise by the range of the driven column of this curve.
+    `number` is the fitted offset, the same for all curves. The optimiser uses it in dimensionless form: divided by the
+    stress scale of the first curve if it is a stress, otherwise by the range of the driven column of this curve.
     """
 
     words: str
@@ -66,8 +66,8 @@ def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> 
     curve = min(odd, key=lambda c: runs[c.label][1])
     (count, chance), names = runs[curve.label], ", ".join(c.label for c in odd)
     said = (
-        f"{names}: structured misfit of {fit.label}. The residuals change sign only {count - 1} times in "
-        f"{len(curve.stress)} points (probability by chance {chance:.1g})"
+        f"{names}: structured misfit of {fit.label}. In the curve {curve.label}, the residuals change sign only "
+        f"{count - 1} times in {len(curve.stress)} points (by chance, the probability of this is {chance:.1g})"
     )
     cause = _named_cause(curves, odd, fit)
     if cause:

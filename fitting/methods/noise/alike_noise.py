@@ -50,7 +50,7 @@ ROWS = 500
 class Alike(NamedTuple):
     """Correlated noise of neighbouring points, estimated from the residuals of a fit with p unknowns."""
 
-    length: float  # [m]
+    length: float  # correlation length [m]; in results of `along_rows`, the unit is one row
     part: float  # correlated part a of the variance
     level: float  # level s: standard deviation divided by the stated standard deviation
     root: np.ndarray  # (p, p) square root of the covariance of the unknowns
@@ -120,8 +120,8 @@ def _determined(J: np.ndarray) -> np.ndarray:
 
 
 def along_rows(counts: list[int], r: np.ndarray, J: np.ndarray, deviation: float, inverse: np.ndarray) -> Alike | None:
-    """Estimate correlated noise (see `alike_noise`) for series that were measured one row after the other. Lengths are
-    numbers of rows.
+    """Estimate correlated noise (see `alike_noise`) for series that were measured one row after the other. The unit of
+    the correlation length is one row.
 
     Args:
         counts: number of rows of each series. The noise of different series is uncorrelated.

@@ -27,7 +27,8 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
         if quantity == "phase":
             if np.nanmax(written) <= 0.5 * np.pi:
                 raise InputError(
-                    f"{path}: column {column.name} may be in degrees or radians; name it phase_deg or phase_rad"
+                    f"{path}: column {column.name} may be in degrees or radians; name this column phase_deg or "
+                    "phase_rad"
                 )
             unit = "deg"
         notes.append(f"column {column.name!r} states no unit; {unit} is assumed")
@@ -37,8 +38,8 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
     seen = written[np.isfinite(written)]
     if column.quantity == "phase" and unit.startswith(("deg", "°")) and seen.size and seen.max() <= 0.5 * np.pi:
         notes.append(
-            f"column {column.name!r} has {seen.min():.3g} to {seen.max():.3g} degrees, less than "
-            "in tissues: if these are radians, name it phase_rad"
+            f"column {column.name!r} has {seen.min():.3g} to {seen.max():.3g} degrees, which is less than in tissues: "
+            "if the numbers are radians, name the column phase_rad"
         )
     if quantity == "frequency":
         return written * _of_frequency(path, column, unit)
@@ -48,13 +49,13 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
 def _of_frequency(path: str, column: Column, unit: str) -> float:
     if is_angular(column) and unit.lower() == "hz":
         raise InputError(
-            f"{path}: column {column.name} is an angular frequency in Hz; "
-            "name it frequency_Hz or angular_frequency_rad_s"
+            f"{path}: column {column.name} is an angular frequency in Hz; name this column frequency_Hz or "
+            "angular_frequency_rad_s"
         )
     if not is_angular(column) and unit.lower() in PER_SECOND:
         raise InputError(
-            f"{path}: column {column.name} in {unit} may be in Hz or rad/s; "
-            "name it frequency_Hz or angular_frequency_rad_s"
+            f"{path}: column {column.name} in {unit} may be in Hz or rad/s; name this column frequency_Hz or "
+            "angular_frequency_rad_s"
         )
     return FREQUENCY_UNITS[unit.lower()]
 
@@ -64,7 +65,7 @@ def fault_of(column: Column, written: float, value: float, smallest: float, larg
     as written in the file."""
     if not np.isfinite(value):
         if np.isnan(written):
-            return f"{column.name} is empty", "fill it in or remove the line"
+            return f"{column.name} is empty", "fill this cell, or remove the line"
         problem, remedy = "is not finite", "remove the line"
     elif value <= 0:
         problem, remedy = "is not positive", "correct the sign or remove the line"
@@ -94,7 +95,7 @@ def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
     if not tensile:
         return []
     names = " and ".join(dict.fromkeys(columns[q][0].name for q in tensile))
-    return [f"{names} are of tension or bending: G = E / 3 is used (incompressible material)"]
+    return [f"{names} are of tension or bending, so G = E / 3 is used (incompressible material)"]
 
 
 def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
@@ -124,5 +125,5 @@ def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[st
         for name, (factor, slope) in zip(("storage", "loss"), by_angle, strict=True):
             out[f"{name}_sd"] = np.hypot(factor * of_size, size * slope * of_angle)
     elif any(f"{q}_sd" in values for q in pair):
-        notes.append("only one of these two columns has standard deviations: they are not used")
+        notes.append("only one of these two columns has standard deviations, so the deviations are not used")
     return out

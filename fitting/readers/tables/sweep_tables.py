@@ -77,7 +77,7 @@ def choose_table(
         return k, []
     why = f"{'the first' if counts.count(counts[k]) > 1 else 'the one'} with most {what}, {counts[k]}"
     listed = f"the file holds {len(tables)} tables: {', '.join(names)}"
-    return k, [f"{listed}; table {names[k]} is used, {why}; choose another with --table NUMBER or NAME"]
+    return k, [f"{listed}; table {names[k]} is used, {why}; choose another table with --table NUMBER or NAME"]
 
 
 def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int:
@@ -119,7 +119,11 @@ def tables_of(path: str, lines: list[str]) -> list[Table]:
         )
     lacks = first_missing(named[best])
     viscous = any(c.quantity == "viscosity" for c in named[best])
-    hint = "; viscosities are not read: |G*| is omega |eta*|, give it as complex_modulus_Pa" if viscous else ""
+    hint = (
+        "; viscosities are not read (convert them to |G*| = omega |eta*|, and name the column complex_modulus_Pa)"
+        if viscous
+        else ""
+    )
     raise InputError(f"{path}: no column for {lacks} in the header {shown!r}; add {NEEDED[lacks]}{hint}")
 
 
@@ -165,8 +169,8 @@ def _nameless_deviations(cells: list[str]) -> list[str]:
     if not found:
         return []
     return [
-        f"columns {', '.join(map(repr, found))} are not used: their headings do not show to which modulus they "
-        "belong; name them storage_modulus_sd_Pa and loss_modulus_sd_Pa"
+        f"columns {', '.join(map(repr, found))} are not used, because the headings do not show to which modulus the "
+        "columns belong; name them storage_modulus_sd_Pa and loss_modulus_sd_Pa"
     ]
 
 
@@ -185,8 +189,9 @@ def _perhaps_tensile(cells: list[str], columns: list[Column]) -> list[str]:
         return []
     names = " and ".join(dict.fromkeys(c.name for c in moduli))
     return [
-        f"{names}: read as shear moduli G, although the column {sign.strip()!r} belongs to tests in tension, "
-        "compression or bending; if these are moduli E, three times as large, name them E' and E''"
+        f"{names}: these columns are read as shear moduli G, although the column {sign.strip()!r} belongs to tests in "
+        "tension, compression or bending; if the numbers are moduli E, three times as large, name the columns E' and "
+        "E''"
     ]
 
 
@@ -273,7 +278,7 @@ def _rows_below(path, columns, lines, k, delimiter, width):
         k += 1
         if len([c for c in cells if c]) > width:
             raise InputError(
-                f"{path}: line {k}: {len(cells)} cells under {width} headings; write decimals with a point"
+                f"{path}: line {k}: there are {len(cells)} cells under {width} headings; write decimals with a point"
             )
         every.append(cells)
         numbers.append(k)

@@ -25,24 +25,26 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
         if path.is_dir():
             raise InputError(f"{path} is a folder: give the CSV file of {what}")
         if not path.exists():
-            raise InputError(f"{path}: no such file; give the CSV file of {what}")
+            raise InputError(f"{path} does not exist; give the CSV file of {what}")
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; give the CSV file of {what}") from None
     if not data.strip():
-        raise InputError(f"{path} is empty: export it again")
+        raise InputError(f"{path} is empty: export the file again")
     if workbook.is_one(data):
         return workbook.text(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}")
     text = _decoded(path, data)
     long = next((k for k, line in enumerate(text.splitlines(), 1) if len(line) > LONGEST_LINE), None)
     if long is not None and not text.lstrip().startswith("{"):
         raise InputError(
-            f"{path}: line {long} has more than {LONGEST_LINE} characters, which no table has: export it again"
+            f"{path}: line {long} has more than {LONGEST_LINE} characters, which no table has; export the file again"
         )
     if text.lstrip().startswith("{"):
         found = trios_json.tables(text)
         if found is None:
-            raise InputError(f"{path} is JSON, but not the export of TRIOS (it has no Results): give CSV or text")
+            raise InputError(
+                f"{path} is JSON, but not an export of TRIOS, because the entry Results is missing: give CSV or text"
+            )
         return found
     return _with_whole_headings(text)
 

@@ -140,14 +140,16 @@ def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[s
     if not len(time):
         raise InputError(f"{path}: every row has an empty cell or one that is not finite; give numbers")
     if len(time) > 2 and np.all(np.diff(time) < 0):
-        raise InputError(f"{path}: the rows run backwards, from {time[0]:g} s to {time[-1]:g} s: reverse their order")
+        raise InputError(
+            f"{path}: the times decrease from {time[0]:g} s to {time[-1]:g} s; reverse the order of the rows"
+        )
     if np.any(np.diff(time) <= 0) or time[0] < 0:
         k = int(np.argmax(np.diff(time) <= 0)) + 1
         order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"
         if time[0] >= 0 and time[k] == time[k - 1]:
             raise InputError(
-                f"{path}: two rows have the time {time[k]:g} s: write times with more digits, or "
-                "replace both rows by their mean"
+                f"{path}: two rows have the time {time[k]:g} s; write times with more digits, or replace both rows by "
+                "their mean"
             )
         raise InputError(f"{path}: {order}; the times must begin at 0 s or later, and increase")
     return columns, notes
@@ -249,8 +251,8 @@ def _names_a_test(cells: list[str]) -> bool:
 
 
 def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """Return for each quantity the column index and unit of the first cell that names the quantity. If there are
-    several times, the step time is used."""
+    """Return for each quantity the column index and unit of the first cell that names the quantity. If
+    several columns contain times, the column of the step time is used."""
     found: dict[str, tuple[int, str | None]] = {}
     for k, cell in sorted(enumerate(cells), key=lambda each: not _is_own_time(each[1])):
         text = cell.strip().strip('"')
@@ -364,11 +366,14 @@ def _in_si(path, found, rows, units):
             notes.append(f"the column of {quantity} states no unit; {unit} is assumed")
             most = float(np.nanmax(np.abs(rows[:, j]), initial=0.0))
             if quantity.endswith("strain") and most > LARGE:
-                notes[-1] += f", so that the strain reaches {100 * most:.4g} %: if it is in percent, name it strain_%"
+                notes[-1] += (
+                    f", so that the strain reaches {100 * most:.4g} %: if the strain is in percent, name the column "
+                    "strain_%"
+                )
         if not _known_column(quantity, unit):
             raise InputError(f"{path}: unit {unit!r} of {quantity} is not known; {_known_units(quantity)}")
         columns[quantity] = rows[:, j] * TIME_TEST_UNITS[quantity][_plain_heading(unit)]
     good = np.all(np.isfinite(rows), axis=1)
     if not good.all():
-        notes.append(f"{(~good).sum()} of {len(good)} rows are ignored: a cell in them is empty or not finite")
+        notes.append(f"{(~good).sum()} of {len(good)} rows are ignored, because a cell is empty or not finite")
     return {q: v[good] for q, v in columns.items()}, notes

@@ -51,22 +51,26 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
     if found.parts is not None and found.labels is not None:
         few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus)).all(axis=0)
         for label in found.labels[few]:
-            told.append(f"region {label}: its standard error exceeds its modulus, because it has too few voxels")
+            told.append(
+                f"region {label}: the standard error of its modulus exceeds this modulus, because the region has too "
+                "few voxels"
+            )
         told += _of_small_regions(organ.field, found.labels[~few])
         far = np.abs(found.parts.farther).max(axis=0) > 1
         if far.any():
             names = ", ".join(str(label) for label, beyond in zip(found.labels, far, strict=True) if beyond)
             told.append(
-                f"regions {names}: according to the waves, their edges are more than a voxel away from the edges of "
-                "the labels (edges_farther_out_voxels): check the labels"
+                f"regions {names}: from the waves, the edges of these regions are more than a voxel away from the "
+                "edges of the labels (edges_farther_out_voxels): check the labels"
             )
     if drawn is not None and not drawn.distance <= FAR:
         told.append(
-            f"the map stopped {drawn.distance:.2g} standard deviations from its minimum: compare the map with regions"
+            f"the search for the map stopped {drawn.distance:.2g} standard deviations from the minimum: compare the "
+            "map with regions"
         )
     if drawn is not None and drawn.noise_factor.max() > CORRELATED * np.sqrt(max(1.0, drawn.chi2 / drawn.components)):
         told.append(
-            "map: its residuals at neighbouring voxels are correlated, so the standard deviations of the map are "
+            "map: the residuals at neighbouring voxels are correlated, so the standard deviations of the map are "
             f"enlarged {drawn.noise_factor.max():.3g} times"
         )
     # The mean of n squares has the standard deviation sqrt(2/n). ROUGH is added because the noise that divides the
@@ -95,8 +99,8 @@ def _of_small_regions(field: WaveField, labels: np.ndarray) -> list[str]:
     if not small:
         return []
     return [
-        f"regions {', '.join(small)}: below a radius of {LEAST_RADIUS:g} voxels, a modulus is not reliable, and its "
-        "error does not show this. Measure with smaller voxels, or give the region the label of its surroundings"
+        f"regions {', '.join(small)}: below a radius of {LEAST_RADIUS:g} voxels, a modulus is not reliable, although "
+        "its standard error may be small. Measure with smaller voxels, or give the region the label of its surroundings"
     ]
 
 
@@ -113,7 +117,7 @@ def _of_no_motion(field: WaveField, f: int) -> list[str]:
         return []
     return [
         f"{field.frequencies[f]:g} Hz: the displacements ({size:.2g} m) are hardly larger than their noise "
-        f"({field.noise[f]:.2g} m), so the waves are unknown: remove the data of this frequency"
+        f"({field.noise[f]:.2g} m), so the waves are unknown; remove the data of this frequency"
     ]
 
 
@@ -134,9 +138,9 @@ def _of_long_waves(hertz: float, found: Found, f: int) -> list[str]:
         half = 2 * e / G**2
         top = f"{1 / (1 / G - half):.3g} Pa" if half < 1 / G else "any value above"
         told.append(
-            f"{hertz:g} Hz: {_modulus_named(found, r)} has an error of {100 * e / G:.2g} %. Waves much longer than "
-            "the organ determine 1/G rather than G. From the error of 1/G, the size of G is "
-            f"{1 / (1 / G + half):.3g} Pa to {top} (95 %): measure at a higher frequency"
+            f"{hertz:g} Hz: {_modulus_named(found, r)} has an error of {100 * e / G:.2g} %. Waves much longer than the "
+            f"organ determine 1/G rather than G. From the error of 1/G, the size of G is {1 / (1 / G + half):.3g} Pa "
+            f"to {top} (95 %); measure at a higher frequency"
         )
     return told
 
@@ -152,7 +156,7 @@ def _of_voxel_size(hertz: float, found: Found, f: int) -> list[str]:
         return []
     return [
         f"{hertz:g} Hz: the size of the voxels changes {_modulus_named(found, r)} by {100 * bias[r]:.2g} % (standard "
-        f"error {100 * error[r]:.2g} %): subtract mesh_bias, or measure with smaller voxels"
+        f"error {100 * error[r]:.2g} %); subtract mesh_bias, or measure with smaller voxels"
     ]
 
 
@@ -173,14 +177,14 @@ def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: boo
     if alike:
         told.append(
             f"{hertz:g} Hz: the residuals of neighbouring voxels are correlated ({each.correlations[f].beyond:.2g} "
-            f"above independent noise): {'the voxels are coarse (mesh_bias), ' if coarse else ''}the data are "
-            "smoothed, or the organ is less uniform than its "
-            f"{uniform}; {_enlarged(each.noise_factor[f].max())}"
+            f"above independent noise). Possible causes: {'the voxels are coarse (mesh_bias), ' if coarse else ''}the "
+            f"data are smoothed, or the organ is less uniform than its {uniform}; "
+            f"{_enlarged(each.noise_factor[f].max())}"
         )
     if ratio < TOO_NEAR and each.components >= FEW:
         told.append(
-            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation. The motion scatters {np.sqrt(ratio):.2g} times as much as "
-            "the stated noise, and the standard errors are too large: give a smaller --noise, or none"
+            f"{hertz:g} Hz: chi2 is {ratio:.3g} per equation. The motion scatters {np.sqrt(ratio):.2g} times as much "
+            "as the stated noise, and the standard errors are too large; give a smaller --noise, or none"
         )
     if ratio > WRONG:
         told.append(
@@ -190,15 +194,15 @@ def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: boo
         )
     elif ratio > TOO_FAR and not alike:
         told.append(
-            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {uniform}. The organ is less uniform, or the "
-            "noise is larger; the standard errors are multiplied by the square root of this chi2"
+            f"{hertz:g} Hz: chi2 is {ratio:.3g} per equation with uniform {uniform}, so the organ is less uniform, or "
+            "the noise is larger. The standard errors are multiplied by the square root of this chi2"
         )
     return told
 
 
 def _enlarged(factor: float) -> str:
     if factor < 1.005:
-        return "standard errors do not contain this"
+        return "standard errors do not contain this effect"
     return f"standard errors are enlarged {factor:.3g} times"
 
 
@@ -227,13 +231,13 @@ def _of_scales(organ: Organ, found: Found) -> list[str]:
     odd = np.flatnonzero(~((speeds > SLOW) & (speeds < FAST)))
     if odd.size:
         told.append(
-            f"waves of {omega[odd[0]] / (2 * np.pi):g} Hz run at {speeds[odd[0]]:.2g} m/s, but in soft tissue at "
-            f"{SLOW:g} to {FAST:g} m/s: check the spacing (metres) and the frequencies (Hz, not rad/s)"
+            f"waves of {omega[odd[0]] / (2 * np.pi):g} Hz run at {speeds[odd[0]]:.2g} m/s, but waves in soft tissue "
+            f"run at {SLOW:g} to {FAST:g} m/s: check the spacing (metres) and the frequencies (Hz, not rad/s)"
         )
     elif _in_radians(omega / (2 * np.pi)):
         told.append(
             f"the frequencies {', '.join(f'{f:.6g}' for f in omega / (2 * np.pi))} are whole numbers times 2 pi: if "
-            "they are in rad/s, the moduli are 39 times too large; give frequencies in Hz"
+            "the given numbers are in rad/s, the moduli are 39 times too large; give frequencies in Hz"
         )
     for a, b in itertools.pairwise(range(len(omega))):
         span = np.log(omega[b] / omega[a])
@@ -265,7 +269,7 @@ def _sign(organ: Organ, found: Found) -> list[str]:
         return []
     return [
         f"the loss modulus is negative at {', '.join(wrong)}, which no tissue has. Here the motion is the real part of "
-        "U exp(+i omega t): if your waves have the other sign, use their complex conjugate"
+        "U exp(+i omega t): if your waves have the other sign, use the complex conjugate of the displacements"
     ]
 
 

@@ -120,7 +120,7 @@ def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
         assert u is not None
         if off > MISSED:
             told.append(
-                f"{name}: the {fit.kind.name} misses the moduli over the frequencies by {100 * off:.2g} % on average: "
+                f"{name}: the {fit.kind.name} misses the moduli over the frequencies by {100 * off:.2g} % on average; "
                 "use the moduli of each frequency"
             )
         found[name] = {

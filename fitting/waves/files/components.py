@@ -47,8 +47,9 @@ def order_sentence(field: WaveField) -> str | None:
     whole = -1 if sum(signs) < 0 else 1  # a common sign of all components does not matter
     names = ", ".join(("-" if whole * s < 0 else "") + "xyz"[c] for c, s in zip(order, signs, strict=True))
     return (
-        f"the components of the displacement may have a wrong order or sign: as ({names}), they change the volume much "
-        "less, as expected for shear waves. Give the components in the order and with the signs of the voxel axes"
+        f"the components of the displacement may have a wrong order or sign: with order and signs ({names}), the "
+        "displacements change the volume much less, as expected for shear waves. Give the components in the order and "
+        "with the signs of the voxel axes"
     )
 
 

@@ -52,7 +52,7 @@ def arrays(path: Path) -> Content:
         InputError: the file does not exist or cannot be read.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file: give a .npz, .npy, .h5, .mat, .csv, .nii or .nii.gz file")
+        raise InputError(f"{path} does not exist: give a .npz, .npy, .h5, .mat, .csv, .nii or .nii.gz file")
     ending = "".join(path.suffixes[-2:]).lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
     readers = {
         ".npz": _numpy,
@@ -66,7 +66,7 @@ def arrays(path: Path) -> Content:
     readers |= dict.fromkeys(HDF5, _hdf5)
     if ending not in readers:
         raise InputError(
-            f"{path}: the ending {ending!r} is not known: give .npz, .npy, .h5, .mat, .csv, .nii or .nii.gz"
+            f"{path}: the ending {ending!r} is not known; give .npz, .npy, .h5, .mat, .csv, .nii or .nii.gz"
         )
     try:
         return readers[ending](path)
@@ -74,9 +74,9 @@ def arrays(path: Path) -> Content:
         raise
     except (OSError, ValueError, KeyError, EOFError) as error:
         reason = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: cannot be read as {ending} ({reason}): write the file again") from None
+        raise InputError(f"{path} cannot be read as {ending} ({reason}): write the file again") from None
     except Exception as error:  # damaged files raise many kinds of errors: zip, zlib, NIfTI headers
-        raise InputError(f"{path}: the file is damaged ({type(error).__name__}): write the file again") from None
+        raise InputError(f"{path}: the file is damaged ({type(error).__name__}); write the file again") from None
 
 
 def single(path: Path, name: str, spacing_given: bool = False) -> tuple[np.ndarray, object, object]:
@@ -94,7 +94,7 @@ def single(path: Path, name: str, spacing_given: bool = False) -> tuple[np.ndarr
     own = [v for k, v in found.items() if k in ("displacement", "mask", "labels") and v is not None]
     if len(own) != 1:
         raise InputError(
-            f"{path}: no array of the file has the name {name}: give this name to the array that contains the {name}"
+            f"{path}: no array of the file has the name {name}; give this name to the array that contains the {name}"
         )
     a = np.asarray(own[0])
     a = a.reshape(a.shape[:3]) if a.ndim > 3 and a.size == np.prod(a.shape[:3]) else a
@@ -109,7 +109,7 @@ def _numpy(path: Path) -> Content:
             found = {name: file[name] for name in file} | _nearly_known(file)
     except ValueError:  # NumPy's message is about pickled objects, even for a text file
         raise InputError(
-            f"{path}: the file has no arrays of numbers: write it with numpy.save or numpy.savez"
+            f"{path}: the file has no arrays of numbers; write the file with numpy.save or numpy.savez"
         ) from None
     return _with_plain_unit(found)
 
@@ -201,7 +201,7 @@ def _without_units(path: Path, head: list[str]) -> tuple[list[str], dict[str, st
         kind = match[1][0] if match[1][0] == "u" else "x"
         if units.setdefault(kind, match[2]) != match[2]:
             raise InputError(
-                f"{path}: heading {name} has a unit other than {units[kind]}: use the same unit in all these headings"
+                f"{path}: heading {name} has a unit other than {units[kind]}; use the same unit in all these headings"
             )
     bare = next((name for name in head if name in COLUMNS and ("u" if name[0] == "u" else "x") in units), None)
     if bare is not None:
@@ -221,17 +221,18 @@ def _voxel_table(path: Path) -> Content:
     head, units = _without_units(path, [ALSO.get(name, name) for name in head])
     twice = next((name for k, name in enumerate(head) if name in head[:k] and name in _KNOWN), None)
     if twice is not None:
-        raise InputError(f"{path}: two columns contain {twice}: remove one of them")
+        raise InputError(f"{path}: two columns contain {twice}; remove one of them")
     missing = [name for name in COLUMNS if name not in head]
     if missing:
         raise InputError(
-            f"{path}: no column {missing[0]}: give {','.join(COLUMNS)}, and frequency if there are several frequencies"
+            f"{path}: the column {missing[0]} is missing; give {','.join(COLUMNS)}, and frequency if there are "
+            "several frequencies"
         )
     rows = np.full((len(lines) - 1, len(head)), np.nan)
     for k, (number, line) in enumerate(lines[1:]):
         cells = [_quick_number(cell, between) for cell in split_cells(line, between)[: len(head)]]
         if None in cells:
-            raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is not a number: correct this row")
+            raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is not a number; correct this row")
         rows[k, : len(cells)] = cells
     column = dict(zip(head, rows.T, strict=True))
     places = _LENGTHS[units.get("x", "m")] * np.stack([column[a] for a in "xyz"], axis=1)
@@ -241,13 +242,15 @@ def _voxel_table(path: Path) -> Content:
         empty = np.flatnonzero(~np.isfinite(column["frequency"]))
         if len(empty):
             raise InputError(
-                f"{path}: row {lines[1 + empty[0]][0]} has no frequency: give a frequency in Hz in every row"
+                f"{path}: row {lines[1 + empty[0]][0]} has no frequency; give a frequency in Hz in every row"
             )
         hertz, of = np.unique(column["frequency"], return_inverse=True)
     if len(np.unique(np.column_stack([of, at]), axis=0)) < len(at):
         unknown = [name for name in head if name and name not in _KNOWN]
-        perhaps = f", or rename column {unknown[0]} to frequency if it contains the frequencies" if unknown else ""
-        raise InputError(f"{path}: a voxel has two rows of the same frequency: remove one of them{perhaps}")
+        perhaps = (
+            f", or rename column {unknown[0]} to frequency if this column contains the frequencies" if unknown else ""
+        )
+        raise InputError(f"{path}: a voxel has two rows of the same frequency; remove one of them{perhaps}")
     U = np.full((1 if hertz is None else len(hertz), *shape, 3), np.nan + 0j)
     for c, axis in enumerate("xyz"):
         U[(of, *at.T, np.full(len(at), c))] = column[f"u_re_{axis}"] + 1j * column[f"u_im_{axis}"]
@@ -262,7 +265,7 @@ def _voxel_table(path: Path) -> Content:
             if len(changed):
                 number = lines[1 + changed[0]][0]
                 raise InputError(
-                    f"{path}: row {number}: {name} differs from another frequency: give each voxel only one {name}"
+                    f"{path}: row {number}: {name} differs from another frequency; give each voxel only one {name}"
                 )
             found |= {key: values}
     return found
@@ -281,12 +284,14 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
     """Return the grid indices (n, 3) of the points X (n, 3) [m], and the spacing [m], origin [m] and shape of their
     regular grid."""
     if not np.all(np.isfinite(X)) or not len(X):
-        raise InputError(f"{path}: no rows, or rows without x, y, z: give the position of every voxel in metres")
+        raise InputError(
+            f"{path}: the file has no rows, or some rows have no x, y, z; give the position of every voxel in metres"
+        )
     spacing = np.empty(3)
     for a in range(3):
         steps = np.diff(np.unique(np.round(X[:, a], 9)))
         if not len(steps):
-            raise InputError(f"{path}: all voxels have the same {'xyz'[a]}: waves need a volume, not a single slice")
+            raise InputError(f"{path}: all voxels have the same {'xyz'[a]}; waves need a volume, not a single slice")
         spacing[a] = steps[steps < 1.5 * steps.min()].mean()
     origin = X.min(axis=0)
     # Positions in a file are rounded, so the total length gives a more exact spacing than single steps.
@@ -294,7 +299,7 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
     at = np.rint((X - origin) / spacing).astype(int)
     off = np.abs(X - origin - at * spacing).max(axis=0) / spacing
     if off.max() > 0.05:
-        raise InputError(f"{path}: {'xyz'[int(off.argmax())]} is not on a regular grid: give voxels with equal spacing")
+        raise InputError(f"{path}: {'xyz'[int(off.argmax())]} is not on a regular grid; give voxels with equal spacing")
     return at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1)
 
 
@@ -304,7 +309,7 @@ def _nifti(path: Path) -> Content:
     try:
         import nibabel
     except ImportError:
-        raise InputError(f"{path}: NIfTI files need nibabel: pip install '.[nifti]', or give a .npz file") from None
+        raise InputError(f"{path}: NIfTI files need nibabel; pip install '.[nifti]', or give a .npz file") from None
     image: Any = nibabel.load(path)
     data = np.asarray(image.dataobj)
     unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm if the unit is not stated
@@ -314,7 +319,7 @@ def _nifti(path: Path) -> Content:
     if _has_place(image) and not np.allclose(stated, size, rtol=0.01):
         found[CONFLICT] = (
             f"{path}: the header states the voxel size {stated.tolist()}, but the affine matrix gives "
-            f"{size.round(6).tolist()}: correct the wrong one"
+            f"{size.round(6).tolist()}; correct the wrong one"
         )
     found |= {PLACE: axes} if _has_place(image) else {}
     if not np.iscomplexobj(data):
@@ -337,5 +342,5 @@ def _voxel_size(path: Path, image: "nibabel.Nifti1Image") -> np.ndarray:
     columns = np.asarray(image.affine)[:3, :3]
     size = np.linalg.norm(columns, axis=0)
     if not np.all(size > 0) or np.abs(columns.T @ columns / np.outer(size, size) - np.eye(3)).max() > 1e-3:
-        raise InputError(f"{path}: the axes of the voxels are not perpendicular: resample to rectangular voxels")
+        raise InputError(f"{path}: the axes of the voxels are not perpendicular; resample to rectangular voxels")
     return size

@@ -27,12 +27,12 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
     measured = phases[np.isfinite(phases)]
     if not measured.size or np.abs(measured).max() > np.pi * (1 + 1e-3):
         largest = np.abs(measured).max() if measured.size else np.nan
-        raise InputError(f"{name}: wrapped phases reach {largest:.3g}: give radians between -pi and pi")
+        raise InputError(f"{name}: wrapped phases reach {largest:.3g}; give radians between -pi and pi")
     try:
         from skimage.restoration import unwrap_phase
     except ImportError:
         raise InputError(
-            f"{name}: wrapped phases need scikit-image: pip install '.[unwrap]', or unwrap the phases first"
+            f"{name}: wrapped phases need scikit-image; pip install '.[unwrap]', or unwrap the phases first"
         ) from None
     out = np.full(phases.shape, np.nan)
     for f, t, c in np.ndindex(phases.shape[0], phases.shape[1], phases.shape[-1]):

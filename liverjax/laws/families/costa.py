@@ -74,12 +74,14 @@ class Costa(Law):
         f, s = np.asarray(self.fibre, float), np.asarray(self.sheet, float)
         if f.shape[-1:] != (3,) or s.shape[-1:] != (3,):
             raise InputError(
-                f"law costa: fibre and sheet have shapes {f.shape} and {s.shape}: give (3,), or (E, 3) for E elements"
+                f"law costa: 'fibre' and 'sheet' have the shapes {f.shape} and {s.shape}; give (3,), or (E, 3) for E "
+                "elements"
             )
         size = np.linalg.norm(f, axis=-1) * np.linalg.norm(s, axis=-1)
         if np.any(np.linalg.norm(np.cross(f, s), axis=-1) <= 1e-9 * size):
             raise InputError(
-                "law costa: sheet is parallel to fibre, or one of the two is zero: give two different directions"
+                "law costa: the directions 'fibre' and 'sheet' are parallel, or one of them is zero; give two "
+                "different directions"
             )
 
     @classmethod

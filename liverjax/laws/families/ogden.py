@@ -47,5 +47,6 @@ class Ogden(Law):
         """Raise `InputError` if mu and alpha have different numbers of terms."""
         if len(self.mu) != len(self.alpha):
             raise InputError(
-                f"law ogden has {len(self.mu)} mu and {len(self.alpha)} alpha: give one mu and one alpha for each term"
+                f"law ogden has {len(self.mu)} values of mu and {len(self.alpha)} values of alpha: give one mu and "
+                "one alpha for each term"
             )

@@ -102,7 +102,7 @@ def centre_lines(points: np.ndarray, triangles: np.ndarray, name: str = "vessel"
         away = _from_one_end(graph, own)[own]
         found.append(_pieces(here, _rings_of(here, corners, away)))
     if not found or not sum(len(lines.begin) for lines in found):
-        raise InputError(f"{name} surface is too short or too coarse for a centre line: give line and radius")
+        raise InputError(f"{name} surface is too short or too coarse to find its centre line: give line and radius")
     return CentreLines(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
 
 

@@ -22,18 +22,18 @@ class Elements(NodalForce):
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
         """Return the node numbers (n, m) of m elements with n nodes each."""
-        raise TypeError(f"{type(self).__name__} lacks nodes(mesh)")
+        raise TypeError(f"{type(self).__name__} must define nodes(mesh)")
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
         """Return the factors p_ka (d, n, Q, m) [1/m] of d tangent vectors and n nodes, at Q points of m elements."""
-        raise TypeError(f"{type(self).__name__} lacks tangents(mesh)")
+        raise TypeError(f"{type(self).__name__} must define tangents(mesh)")
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
         """Return the energies (Q, m) [J] at Q integration points of m elements.
 
         `C` are the components of the metric: C_11 (Q, m), or C_11, C_12 and C_22.
         """
-        raise TypeError(f"{type(self).__name__} lacks energies(mesh, C)")
+        raise TypeError(f"{type(self).__name__} must define energies(mesh, C)")
 
     def away(self) -> jax.Array | None:
         """Return vectors (d, 3, Q, m) to subtract from the d tangent vectors, at Q points of m elements.

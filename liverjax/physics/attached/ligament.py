@@ -59,7 +59,7 @@ class Ligament(Physics):
             nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
             return cls(nodes=jnp.asarray(nodes[None], jnp.int32), weights=jnp.ones((1, len(nodes))), to=to, **given)
         if "where" in table or "set" in table:
-            raise InputError(f"{name} has points, and also where or set: remove one of them")
+            raise InputError(f"{name} has both points and a selection (where or set): remove one of them")
         ends = table["points"]
         if not isinstance(ends, list) or len(ends) != 2:
             raise InputError(f"{name} points = {ends!r} must be two points of the body: write [[x, y, z], [x, y, z]]")
@@ -77,7 +77,7 @@ class Ligament(Physics):
             raise InputError(f"{name} needs either pre_tension in N or rest_length in m: give one of them")
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
         if np.any(lengths <= 0):
-            raise InputError(f"{name} has a fibre without length: move one of its ends")
+            raise InputError(f"{name} has a fibre of length 0: move one of the ends of this fibre")
         if self.pre_tension is not None and np.any(rest <= 0):
             most = float(np.asarray(self.stiffness) * lengths.min())
             raise InputError(

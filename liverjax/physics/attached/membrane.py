@@ -50,7 +50,10 @@ class Membrane(Physics):
         nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), place)
         triangles = selection.surface_of(mesh, nodes, table.get("set"))
         if not len(triangles):
-            raise InputError(f"{place} selects nodes but no boundary triangle: enlarge the region to a whole face")
+            raise InputError(
+                f"{place}: the selected region contains nodes, but no triangle of the boundary: enlarge the region to "
+                "a whole face"
+            )
         law = layers.read_layer(table["law"], name)
         return cls(triangles=jnp.asarray(triangles, jnp.int32), thickness=table["thickness"], law=law)
 

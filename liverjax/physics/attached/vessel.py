@@ -54,23 +54,28 @@ class Vessel(Physics):
                 f"{name} needs line = [[x, y, z], …] with radius in m, or surface = 'tube.stl', and [vessel.law]"
             )
         if "where" in table or "set" in table:
-            raise InputError(f"{name} has where or set, but its line already gives the position: remove where and set")
+            raise InputError(
+                f"{name} has where or set, but the position of a vessel is given by its line or surface: remove where "
+                "and set"
+            )
         given = {"wall": table["wall"]} if "wall" in table else {}
         law = layers.read_layer(table["law"], name)
         if "surface" in table:
             lines = _lines_of_surface(table, name)
             return crossing(mesh, lines, law, name=name, **given)
         if "radius" not in table or "unit" in table:
-            raise InputError(f"{name} line needs radius, and both are in m: give radius, and remove unit")
+            raise InputError(
+                f"{name} line needs radius, and cannot be used with unit: give radius and line in m, and remove unit"
+            )
         line, radius = (bounds.array_of(table[key]) for key in ("line", "radius"))
         line, radius = (np.empty(0) if v is None else v for v in (line, radius))
         if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2 or radius.shape not in ((), (len(line),)):
             raise InputError(
-                f"{name} needs line = [[x, y, z], …] with two points or more, and radius one number or one per point: "
-                "give finite numbers"
+                f"{name} needs line = [[x, y, z], …] with two or more points, and radius as one number, or as one "
+                "number per point: correct line and radius"
             )
         if not np.all(np.any(np.diff(line, axis=0) != 0, axis=1)):
-            raise InputError(f"{name} line has the same point twice in succession: remove one of the two")
+            raise InputError(f"{name} line contains the same point twice in succession: remove one of the two points")
         return along(mesh, line, radius, law, name=name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
@@ -78,7 +83,8 @@ class Vessel(Physics):
         numbers = np.asarray(self.element)
         if numbers.ndim != 1 or not numbers.size or numbers.max() >= mesh.number_of_elements:
             raise InputError(
-                f"{name} has no elements, or an element number above {mesh.number_of_elements - 1}: correct its line"
+                f"{name} has no elements, or an element number above {mesh.number_of_elements - 1}: correct the line "
+                "of the vessel"
             )
         for key in ("enters", "leaves"):
             bounds.check_shape(f"{name}.{key}", getattr(self, key), (4, len(numbers)))
@@ -115,7 +121,7 @@ def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
     if radius is None:
         return lines
     if isinstance(radius, bool) or not isinstance(radius, (int, float)):
-        raise InputError(f"{name} radius = {radius!r} of a surface must be one number in m: correct it, or remove it")
+        raise InputError(f"{name} radius = {radius!r} of a surface must be one number in m: correct or remove radius")
     return lines._replace(radius=np.full(len(lines.radius), float(radius)))
 
 
@@ -149,7 +155,7 @@ def crossing(mesh: TetMesh, lines: CentreLines, law: Law, name: str = "vessel", 
 def _cut(mesh: TetMesh, begin: np.ndarray, end: np.ndarray, name: str) -> locate.Pieces:
     cut = locate.pieces(mesh, begin, end)
     if not len(cut.element):
-        raise InputError(f"{name} lies outside the body: move it, or check its unit")
+        raise InputError(f"{name} lies outside the body: move the vessel, or check its unit")
     return cut
 
 

@@ -111,7 +111,9 @@ class Obstacle(Physics):
         bounds.check_shape(f"{name}.stiffness", self.stiffness, (), (len(self.triangles),))
         for key, idle in (("radius", 0.0), ("half_angle", 45.0)):
             if key not in _numbers_of_shape(self.shape) and np.any(np.asarray(getattr(self, key)) != idle):
-                raise InputError(f"{name}.{key} = {getattr(self, key)} has no effect on a {self.shape}: remove it")
+                raise InputError(
+                    f"{name}.{key} = {getattr(self, key)} has no effect on a {self.shape}: remove this key"
+                )
         if "radius" in SHAPES[self.shape] and not np.all(np.asarray(self.radius) > 0):
             raise InputError(f"{name} radius = {self.radius} of a {self.shape} must be above 0: give it in m")
         if self.shape == "cone" and not np.all(np.asarray(self.half_angle) < 90):
@@ -119,26 +121,29 @@ class Obstacle(Physics):
                 f"{name} half_angle = {self.half_angle} must be below 90 degrees: use shape = 'plane' for 90"
             )
         if abs(np.linalg.norm(np.asarray(self.axis, float)) - 1) > 1e-6:
-            raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
+            raise InputError(f"{name} axis = {self.axis} must be of length 1: divide this vector by its length")
         history.check_times(self.times, self.history, name)
         if self.history is not None and np.ndim(self.history) == 2 and self.by is not None:
-            raise InputError(f"{name} has by and a history of displacements: remove one of them")
+            raise InputError(f"{name} has both 'by' and a history of displacements: remove one of them")
         if self.history is not None and np.ndim(self.history) == 1 and getattr(self, self.driven) is None:
-            raise InputError(f"{name} history has factors for the vector by, but by is missing: give by")
+            raise InputError(
+                f"{name} history contains factors that multiply the vector 'by', but 'by' is missing: give 'by'"
+            )
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
         """Raise InputError if the obstacle is inside the body at the beginning."""
         size, deepest = float(np.ptp(np.asarray(mesh.points), axis=0).max()), float(_depth_at_beginning(self, mesh))
         if deepest > 1e-9 * size:
             raise InputError(
-                f"{name} position = {np.asarray(self.position).tolist()} begins {deepest:.3g} m inside the body: move "
-                "it out of the body"
+                f"{name} position = {np.asarray(self.position).tolist()}: at the beginning, the obstacle is "
+                f"{deepest:.3g} m inside the body; move the obstacle out of the body"
             )
         centre = np.asarray(self.position, float) + np.asarray(self.displacement(0, 1, 0.0))
         axis = np.asarray(self.axis, float)
         if in_body(self.shape, axis, mesh, np.asarray(mesh.points), centre[None], np.asarray(self.triangles)).any():
             raise InputError(
-                f"{name} position = {np.asarray(self.position).tolist()} is inside the body: move it out of the body"
+                f"{name} position = {np.asarray(self.position).tolist()} is inside the body: move the obstacle out of "
+                "the body"
             )
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:

@@ -64,13 +64,14 @@ class PressedObstacle(Obstacle):
         if self.history is not None and np.any(np.asarray(self.history) < 0):
             least = float(np.min(np.asarray(self.history)))
             raise InputError(
-                f"{name} history has the factor {least:g}, but the force can only press: give factors of 0 or more"
+                f"{name} history contains the factor {least:g}, but the force of an obstacle can only press: give "
+                "factors of 0 or more"
             )
         if self.by is not None:
-            raise InputError(f"{name} has both force and by: remove one of them")
+            raise InputError(f"{name} has both 'force' and 'by': remove one of them")
         force = np.asarray(self.force, float)
         if force.shape != (3,) or not np.all(np.isfinite(force)) or not np.any(force):
-            raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give such numbers")
+            raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give a force")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
         """Raise InputError as `Obstacle.check_place` does, and if the force moves the obstacle past the body."""
@@ -78,8 +79,8 @@ class PressedObstacle(Obstacle):
         if not self._meets(mesh, contact_points):
             if self._meets(mesh, near_points):
                 raise InputError(
-                    f"{name} passes between the points at which contact is tested: the triangles are too large for "
-                    "its radius, so refine the mesh there"
+                    f"{name} passes between the points at which contact is tested, because the triangles are too large "
+                    "for its radius: refine the mesh there"
                 )
             force = np.asarray(self.force, float).tolist()
             raise InputError(f"{name} force = {force} presses the obstacle past the body: change force or position")

@@ -55,7 +55,10 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
         parts = [part for own in U.pieces() for part in own.summands() if isinstance(part, Volumetric)]
         kinds |= {(part.volumetric, part.below) for part in parts}
     if len(kinds) != 1 or next(iter(kinds))[1] is not None:
-        raise InputError(f"{name} needs one kind of volumetric energy in all laws: give all laws the same volumetric")
+        raise InputError(
+            f"{name} needs the same kind of volumetric energy in all laws: give the same value of volumetric to all "
+            "laws"
+        )
 
 
 def strain(kind: str, J: jax.Array) -> jax.Array:

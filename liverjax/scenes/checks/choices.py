@@ -37,21 +37,24 @@ def check_choices(scene: Scene) -> None:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
     if (scene.solve.kind == "harmonic") != (scene.solve.frequencies is not None):
         raise InputError(
-            "[solve] kind = 'harmonic' and frequencies = [60.0] (Hz) need each other: give both, or neither"
+            "[solve] kind = 'harmonic' can be used only together with frequencies: give both, e.g. frequencies = "
+            "[60.0] (Hz), or neither"
         )
     if scene.solve.frequencies is not None and not np.size(scene.solve.frequencies):
         raise InputError("[solve] frequencies = [] contains no frequency: give e.g. frequencies = [60.0] (Hz)")
     if scene.solve.reduced and scene.solve.kind == "harmonic":
         raise InputError("[solve] reduced cannot be used with kind = 'harmonic': remove reduced")
     if scene.springpots is not None and scene.solve.kind != "harmonic":
-        raise InputError("[springpots] need kind = 'harmonic': use [viscosity], a Prony series, in a transient run")
+        raise InputError("[springpots] needs kind = 'harmonic': use [viscosity], a Prony series, in a transient run")
     if scene.solve.kind == "harmonic":
         _refuse_what_moves_in_time(scene)
     _loaded(scene)
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
-        raise InputError("[solve] linear_solver = 'direct' cannot be used with a follower pressure: use cg")
+        raise InputError(
+            "[solve] linear_solver = 'direct' cannot be used with a follower pressure: use linear_solver = 'cg'"
+        )
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
-        raise InputError("[solve] linear_solver = 'direct' cannot be used with a rigid plate: use cg")
+        raise InputError("[solve] linear_solver = 'direct' cannot be used with a rigid plate: use linear_solver = 'cg'")
     if scene.solve.volumetric in ("nodal", "mixed"):
         _own_volumes(scene)
     if scene.solve.volumetric == "mixed":
@@ -69,13 +72,14 @@ def _refuse_what_moves_in_time(scene: Scene) -> None:
     for name, part in named_physics(scene):
         if getattr(part, "by", None) is not None:
             raise InputError(
-                f"{name}.by cannot be used with kind = 'harmonic': remove by, and give the displaced position"
+                f"{name}.by cannot be used with kind = 'harmonic': remove 'by', and give the position after the "
+                "displacement"
             )
 
 
 def _loaded(scene: Scene) -> None:
     if scene.points_are not in ("reference", "loaded"):
-        raise InputError(f"[mesh] is = {scene.points_are!r} is not known: use reference or loaded")
+        raise InputError(f'[mesh] is = {scene.points_are!r} is not known: use "reference" or "loaded"')
     if scene.points_are == "loaded" and scene.porosity is not None:
         raise InputError('[mesh] is = "loaded" cannot be used with a fluid: remove [porosity]')
     if scene.points_are == "loaded" and any(physics.ties for physics in scene.physics):

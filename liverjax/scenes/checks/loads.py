@@ -50,9 +50,9 @@ def _check_motion(motion: Displaced, name: str) -> None:
     by: Any = motion.by
     shape = (3,) if isinstance(by, tuple | list) and len(by) == 3 and np.ndim(by[0]) == 0 else np.shape(by)
     if by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
-        raise InputError(f"{name} by has shape {shape}: give three numbers in m, or three per node")
+        raise InputError(f"{name} 'by' has shape {shape}: give three numbers in m, or three per node")
     if motion.by is None and motion.history is None:
-        raise InputError(f"{name} needs either by (3,) or times and history: give one of them")
+        raise InputError(f"{name} needs either 'by' (3,), or times and history: give one of them")
 
 
 def _check_body(body: Body, nodes: int) -> None:
@@ -62,7 +62,7 @@ def _check_body(body: Body, nodes: int) -> None:
     gravity = (len(body.gravity),) if isinstance(body.gravity, tuple) else np.shape(body.gravity)
     density = np.shape(body.density)
     if density not in ((), (nodes,)):
-        raise InputError(f"body density has shape {density}: give one number or one per node ({nodes},), in kg/m^3")
+        raise InputError(f"[body] density has shape {density}: give one number or one per node ({nodes},), in kg/m^3")
     history.check_times(body.times, body.history, "body")
     if gravity != (3,):
-        raise InputError(f"body gravity has shape {gravity}: give three numbers in m/s^2")
+        raise InputError(f"[body] gravity has shape {gravity}: give three numbers in m/s^2")

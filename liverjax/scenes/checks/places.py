@@ -27,7 +27,9 @@ def check_known_nodes(scene: Scene) -> None:
     if not isinstance(mesh.volumes, jax.core.Tracer):
         wrong = int(np.sum(~(np.asarray(mesh.volumes) > 0)))
         if wrong:
-            raise InputError(f"mesh has {wrong} elements that are inverted or have no volume: correct their vertices")
+            raise InputError(
+                f"the mesh has {wrong} elements that are inverted or have no volume: correct their vertices"
+            )
 
 
 def check_places(scene: Scene) -> None:
@@ -72,14 +74,14 @@ def _inlets_that_act(sponge: Porosity) -> None:
         own = set(np.asarray(inlet.nodes).tolist())
         if any(own <= place for place in given):
             raise InputError(
-                f"porosity.inlet.{k} gives a pressure where all nodes are drained or have a given pressure: select "
-                "different nodes"
+                f"porosity.inlet.{k} gives a pressure at nodes that are all drained or already have a given pressure: "
+                "select different nodes"
             )
         given.append(own)
     for k, inlet in enumerate(sponge.inlet):
         corners = set() if inlet.triangles is None else set(np.ravel(inlet.triangles).tolist())
         if inlet.nodes is None and any(corners <= place for place in given):
             raise InputError(
-                f"porosity.inlet.{k} is a flux through a surface with drained or given pressures, so it has no effect: "
-                "select another surface"
+                f"porosity.inlet.{k} is a flux through a surface with drained or given pressures, so this flux has no "
+                "effect: select another surface"
             )

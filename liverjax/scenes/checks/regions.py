@@ -63,16 +63,19 @@ def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> No
         return
     if prony is None:
         raise InputError(
-            f"{name}: viscosity needs [viscosity] in the scene. Add it, with ratios = [0.0] if the rest is elastic"
+            f"{name} has a viscosity, which needs [viscosity] in the scene: add [viscosity], with ratios = [0.0] if "
+            "the rest of the body is elastic"
         )
     unknown = sorted(set(own) - set(VISCOUS))
     if unknown:
-        raise InputError(f"{name}: viscosity has {unknown[0]}, but only {' and '.join(VISCOUS)} can differ in a region")
+        raise InputError(
+            f"{name}: viscosity contains {unknown[0]}, but only {' and '.join(VISCOUS)} can differ in a region"
+        )
     modes = np.shape(prony.ratios)[0]
     for key, value in own.items():
         if np.shape(value) != (modes,):
             n = np.size(value)
-            raise InputError(f"{name}: viscosity.{key} has {n} numbers, but the scene has {modes} modes: give {modes}")
+            raise InputError(f"{name}: viscosity.{key} has {n} numbers, but the scene has {modes} modes; give {modes}")
     if any(isinstance(value, jax.core.Tracer) for value in (*own.values(), prony.ratios)):
         return
     changed: Content = {key: np.asarray(value, float) for key, value in own.items()}
@@ -92,12 +95,12 @@ def check_region_porosity(porosity: Porosity | None, region: Region, name: str) 
     if not own:
         return
     if porosity is None:
-        raise InputError(f"{name}: porosity needs [porosity] in the scene. Add [porosity]")
+        raise InputError(f"{name} has a porosity, which needs [porosity] in the scene: add [porosity]")
     for key, value in own.items():
         if key not in POROUS:
-            raise InputError(f"{name}: porosity has {key}, which cannot differ in a region: {hint(key, POROUS)}")
+            raise InputError(f"{name}: porosity contains {key}, which cannot differ in a region; {hint(key, POROUS)}")
         if np.ndim(value):
-            raise InputError(f"{name}: porosity.{key} has {np.size(value)} numbers: give one number")
+            raise InputError(f"{name}: porosity.{key} has {np.size(value)} numbers; give one number")
     numbers = (*own.values(), *(getattr(porosity, key) for key in POROUS))
     if any(isinstance(value, jax.core.Tracer) for value in numbers):
         return
@@ -141,6 +144,6 @@ def _check_own_laws(regions: tuple[Region, ...]) -> None:
         for later, other in enumerate(regions[k + 1 :], k + 1):
             if other.law and np.isin(np.asarray(other.elements), elements).any():
                 raise InputError(
-                    f"region.{later} changes the law of elements that have a separate law from region.{k}: select "
-                    "different elements, or write the parameters into that law"
+                    f"region.{later} changes parameters of elements whose whole law is given by region.{k}: select "
+                    "different elements, or write these parameters into that law"
                 )

@@ -42,7 +42,9 @@ def check_held(scene: Scene) -> None:
     loose = loose_piece(scene, lambda physics: physics.holds(scene.mesh))
     if loose:
         doubled = doubled_vertices(scene.mesh)
-        split = f"merge the {doubled} nodes that coincide with another node, if the mesh should be connected there, or "
+        split = (
+            f"merge the {doubled} nodes that coincide with another node (if the mesh should be connected there), or "
+        )
         remedy = f"{split if doubled else ''}add [[fixed]] or kind = 'dynamic'"
         raise InputError(f"the supports do not prevent every rigid motion of {loose}: {remedy}")
 

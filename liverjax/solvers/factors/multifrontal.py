@@ -218,7 +218,8 @@ def cores() -> int:
 
 
 def _work_in_pieces(plan: list[Front]) -> tuple[list[list[int]], list[set[int]]]:
-    """Return the groups of each piece, and the pieces that must end before each piece begins."""
+    """Divide the elimination into pieces (tasks). Return the groups of each piece, and for each piece the other pieces
+    that must be finished first."""
     n, m = (
         np.array([len(part) for part in parts], float) for parts in zip(*(front[:2] for front in plan), strict=True)
     )
