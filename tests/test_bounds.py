@@ -341,7 +341,7 @@ MEANINGLESS = (
     ),
     (
         {"mesh": lj.tet_mesh(np.asarray(MESH.points), np.asarray(MESH.tetrahedra)[:, [1, 0, 2, 3]])},
-        "mesh has 6 elements",
+        "the mesh has 6 elements",
     ),
 )
 

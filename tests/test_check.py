@@ -335,7 +335,7 @@ def test_stable_ranges_of_known_laws():
     [
         ("neo_hokean", "did you mean neo_hookean"),
         ("nothing.py:Law", "is not a file"),
-        ("mine.py", "mine.py names a file, but no law in it: use mine.py:Law"),
+        ("mine.py", "mine.py names a file, but not a law in this file: use mine.py:Law"),
         ("mine.py:Lew", "use mine.py:Law"),
         ("mine.py:number", "is not a law"),
         ("mine.py:Bare", "write @liverjax.struct"),

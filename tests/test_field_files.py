@@ -51,13 +51,13 @@ def test_bad_displacements_are_one_sentence(tmp_path, content, capsys):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--noise", "0"], "--noise 0 must be above 0"),
-        ([], "no column sd"),
+        (["--noise", "0"], "--noise 0 must be a finite number above 0"),
+        ([], "the column sd is missing"),
         (["--noise", "1e-4", "--name", "law.nu"], "not a number of the scene"),
         (["--noise", "1e-4", "--parameters", "law.mu,law.x"], "not a number of the scene"),
         (["--noise", "1e-4", "--name", "body.gravity"], "can multiply only one number"),
         (["--noise", "1e-4", "--unit", "mile"], "--unit 'mile' is not known"),
-        (["--noise", "1e-4", "--length", "-1"], "--length -1 must be above 0"),
+        (["--noise", "1e-4", "--length", "-1"], "--length -1 must be a finite number above 0"),
     ],
 )
 def test_bad_options_are_one_sentence(tmp_path, more, words, capsys):

@@ -158,7 +158,7 @@ def test_bad_histories_are_refused(table, words):
         (b"time;factor\n0;1\n1;2\n", "has one column: .* separated by commas"),
         (b"time\tfactor\n0\t1\n1\t2\n", "has one column"),
         (b"\xff\xfe\x00", "is not a text file"),
-        (b"time,force\n0,0\n1,1\n", "has columns"),
+        (b"time,force\n0,0\n1,1\n", "has the columns"),
         (b"time,factor\n0,zero\n1,1\n", "must have finite numbers"),
         (None, r"cannot be read \(No such file or directory\): give a CSV file with columns"),
     ],

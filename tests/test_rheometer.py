@@ -173,7 +173,7 @@ BAD = {
     "inf": (HEADER + ROWS.replace("400", "inf"), "is not finite"),
     "negative frequency": (HEADER + ROWS.replace("0.1", "-0.1"), "frequency_Hz = -0.1 is not positive"),
     "text": (HEADER + ROWS.replace("400", "soft"), "line 3: storage_modulus_Pa = 'soft' is not a number"),
-    "short row": (HEADER + "0.1,300,30\n1,400\n", "line 3: loss_modulus_Pa is empty; fill it in"),
+    "short row": (HEADER + "0.1,300,30\n1,400\n", "line 3: loss_modulus_Pa is empty; fill this cell"),
     "milli": (HEADER.replace("storage_modulus_Pa", "storage_modulus_mPa") + ROWS, "unit 'mPa'"),
     "angular in Hz": (HEADER.replace("frequency_Hz", "angular_frequency_Hz") + ROWS, "angular frequency in Hz"),
     "disagree": ("angular_frequency_rad_s," + HEADER + "1,1,300,30\n2,2,400,60\n", "disagree"),

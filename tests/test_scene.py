@@ -182,7 +182,7 @@ REFUSED = {
     "ratios add up": (lambda c: c["viscosity"].update(ratios=[0.5, 0.6]), "less than 1"),
     "viscosity without dt": (lambda c: c["solve"].pop("dt"), "no dt, which viscosity needs"),
     "clamp and motion": (lambda c: c["fixed"].append({"where": {"z_min": 0.1}}), "both prescribe node"),
-    "by and history": (lambda c: c["displaced"][0].update(by=[0, 0, 0]), "give time,factor"),
+    "by and history": (lambda c: c["displaced"][0].update(by=[0, 0, 0]), "give the columns time,factor"),
     "short vector": (lambda c: c["body"].update(gravity=[0, 0]), "list of 3 numbers"),
     "no density": (lambda c: c["body"].pop("density"), "needs density"),
     "text for a number": (lambda c: c["body"].update(density="1060"), "not a number"),

@@ -363,7 +363,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
     "table, sentence",
     [
         ("law.mu\n", "has no rows"),
-        ("law.mu,law.mu\n1,2\n", "names law.mu twice"),
+        ("law.mu,law.mu\n1,2\n", "has two columns law.mu"),
         ("law.mu\n1,2\n", "row 1 has 2 values for 1 names"),
         ("law.mu;law.bulk\n700;2000\n", "semicolons between its cells"),
         ("law.mu\tlaw.bulk\n700\t2000\n", "tabs between its cells"),

@@ -96,12 +96,12 @@ BAD = {
     "ramp in rows": (
         "time_s,strain,stress_Pa\n0,0,0\n1,0.5,7\n2,1,6\n3,1,5\n",
         ["--ramp", "1"],
-        "since the rows show how the load rose: remove this setting",
+        "since the rows show how the load rose; remove this setting",
     ),
     "ramp too long": (
         "time_s,strain,stress_Pa\n0,0,0\n1,1,7\n2,1,6\n3,1,5\n",
         ["--ramp", "2"],
-        "since the load rose between 0 and 1 s: remove this setting",
+        "since the load rose between 0 and 1 s; remove this setting",
     ),
     "late": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "5"], "2 usable responses remain"),
     "early": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "-1"], "--min-time -1 must be a finite number"),
@@ -387,7 +387,7 @@ def test_what_a_sensor_shows_before_the_load_is_taken_off(tmp_path, kind, offset
         driven, answer, head = 10.0 * on, 10 * creep, "time_s,stress_Pa,strain [1]"
     answer = on * answer * (1 + 0.005 * rng.standard_normal(len(t))) + offset
     test = read_time_test(write(tmp_path / "t.csv", head, t, driven, answer), kind)
-    assert any("this offset of the sensor is subtracted" in note for note in test.notes) == told
+    assert any("this sensor offset is subtracted" in note for note in test.notes) == told
     found = fits.fit(test)
     assert found.modes == 1
     G0, ratio = found.uncertainty.values[0], found.uncertainty.values[1]

@@ -78,17 +78,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
             f"{path}: row {row + 1} has u{'xyz'[axis]} = {measured[row, axis]:g} m in a body of {size:.3g} m; give "
             "--unit, or leave the cell empty if the displacement was not measured"
         )
-    if "sd" in table:
-        sd = scale * table["sd"]
-    elif noise is not None:
-        sd = np.full(n, noise)
-    else:
-        raise InputError(
-            f"{path}: the column sd is missing; add this column, or give the noise's standard deviation in metres "
-            "with --noise"
-        )
-    if not (np.all(np.isfinite(sd)) and np.all(sd > 0)):
-        raise InputError(f"{path}: sd must be positive and finite; give the noise's standard deviation")
+    sd = _deviations_of_noise(path, scale * table["sd"] if "sd" in table else None, noise, n)
     if "node" in table:
         nodes, weights = _at_nodes(path, mesh, table["node"])
     else:
@@ -103,6 +93,19 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
         measured=np.where(seen, measured, 0.0),
         sd=np.where(seen, sd[:, None], np.inf),
     )
+
+
+def _deviations_of_noise(path: Path, own: np.ndarray | None, noise: float | None, n: int) -> np.ndarray:
+    """Return the standard deviations (n,) [m] of the noise: those of the file (`own`), or else `noise` for all rows."""
+    if own is None and noise is None:
+        raise InputError(
+            f"{path}: the column sd is missing; add this column, or give the noise's standard deviation in metres "
+            "with --noise"
+        )
+    sd = np.full(n, noise) if own is None else own
+    if not (np.all(np.isfinite(sd)) and np.all(sd > 0)):
+        raise InputError(f"{path}: sd must be positive and finite; give the noise's standard deviation")
+    return sd
 
 
 #: If _SOME points or more all lie within _TOGETHER times the size of the body, their positions are assumed to be in

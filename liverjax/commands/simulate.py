@@ -76,8 +76,7 @@ def run(options: argparse.Namespace) -> int:
             ran = long_run.run(scene, text, target, options.every, options.resume, report)
     except OSError as error:
         print(
-            f"stopped, because {target} cannot be written ({error.strerror}): free disk space and continue with "
-            "--resume",
+            f"stopped, because {target} cannot be written ({error.strerror}): free disk space, then use --resume",
             file=sys.stderr,
         )
         return 1

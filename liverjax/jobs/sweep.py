@@ -93,9 +93,7 @@ def read_sweep(
     names, rows = read_table(parameters)
     for name in names:
         if np.shape(numbers_at(scene, name)):
-            raise InputError(
-                f"parameter {name!r} is a list in the scene file: name one number of the list, by its index"
-            )
+            raise InputError(f"parameter {name!r} is a list in the scene file: name one number of it, by its index")
     parts = {".".join(name.split(".")[:2]) for name in names}
     held = holding(scene, parts)
     for k, row in enumerate(rows.tolist()):

@@ -113,17 +113,24 @@ def harmonic(
         raise InputError(
             f"the argument motion has shape {motion.shape}: give {mesh.points.shape}, or one such array per frequency"
         )
-    if about is not None and scene.porosity is not None and not _drains(scene.porosity):
+    _check_about(scene, about)
+    motion = jnp.broadcast_to(motion, (number, *mesh.points.shape))
+    return _answer(scene, (factors, omegas), motion, about, mass)
+
+
+def _check_about(scene: Scene, about: jax.Array | None) -> None:
+    """Raise InputError if the positions `about` have a wrong shape, or do not determine the pressure of a fluid."""
+    if about is None:
+        return
+    if scene.porosity is not None and not _drains(scene.porosity):
         raise InputError(
             "a loaded state (gravity, about) does not determine the pressure in a porous body that cannot drain: give "
             "porosity.drained"
         )
-    if about is not None and jnp.shape(about) != mesh.points.shape:
+    if jnp.shape(about) != scene.mesh.points.shape:
         raise InputError(
-            f"the argument about has shape {jnp.shape(about)}: give positions of shape {mesh.points.shape}"
+            f"the argument about has shape {jnp.shape(about)}: give positions of shape {scene.mesh.points.shape}"
         )
-    motion = jnp.broadcast_to(motion, (number, *mesh.points.shape))
-    return _answer(scene, (factors, omegas), motion, about, mass)
 
 
 def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "consistent") -> Operator:
