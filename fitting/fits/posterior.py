@@ -412,7 +412,7 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
     test.
 
     If the noise of neighbouring measured values is correlated, the log likelihood is multiplied by the fraction of
-    independent values.
+    independent values. The error of a subtracted sensor offset is common to all values (`_beside_offset`).
     """
     test = test._replace(constant_noise=fit.details.get(time_tests.CONSTANT_NOISE, False))
     if fit.kind.values is None:
@@ -421,6 +421,25 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
     else:
         residuals = jax.jit(jax.vmap(springpots_in_time.residuals_of_springpot(fit.kind.name, test)))
     size = np.abs(fit.model.shear_modulus) * np.array([1e-2, 1.0])
-    own = target(fit.kind, lambda u: np.asarray(residuals(u)), test.resolved, size, False)
-    own = own._replace(weight=fit.details.get(INDEPENDENT, len(fit.measured)) / len(fit.measured))
-    return sample(own, len(fit.solution.u), count, seed)
+    weight = fit.details.get(INDEPENDENT, len(fit.measured)) / len(fit.measured)
+    offset = np.sqrt(weight) * test.offset_error / (time_tests.data_in_time(test)[-1] * fit.uncertainty.noise)
+    own = target(fit.kind, _beside_offset(residuals, offset), test.resolved, size, False)
+    return sample(own._replace(weight=weight), len(fit.solution.u), count, seed)
+
+
+def _beside_offset(residuals: Callable, offset: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of u (W, P): the residuals (W, m), made uncorrelated if all errors contain a common offset.
+
+    The covariance of m residuals is s^2 (I + d d^T) with the noise s. `offset`: d (m,), the change of all residuals
+    by one standard error of the offset, divided by s. The residuals are multiplied by (I + d d^T)^(-1/2).
+    """
+    square = float(offset @ offset)
+    if square == 0:
+        return lambda u: np.asarray(residuals(u))
+    reduced = (1 - 1 / np.sqrt(1 + square)) / square * offset
+
+    def uncorrelated(u: np.ndarray) -> np.ndarray:
+        r = np.asarray(residuals(u))
+        return r - (r @ offset)[..., None] * reduced
+
+    return uncorrelated

@@ -5,6 +5,7 @@ import numpy as np
 #: A single value is far from its neighbours if the distance is above these multiples of the changes beside it and of
 #: the noise, and above this fraction of the largest value.
 _FAR, _NOISES, _OF_LARGEST = 10.0, 20.0, 0.02
+_LOW = 0.5
 
 
 def noise_of_series(values: np.ndarray) -> float:
@@ -18,14 +19,16 @@ def noise_of_series(values: np.ndarray) -> float:
 
 
 def sizes_of_series(values: np.ndarray) -> np.ndarray:
-    """Return the absolute values (n,), at least the median of each value and its two neighbours.
+    """Return the absolute values (n,). A value below `_LOW` times the median of itself and its neighbours is replaced
+    by this median.
 
     With these sizes as scales of the residuals, a single value near 0 has no larger weight than its neighbours.
     """
     from scipy.ndimage import median_filter
 
     sizes = np.abs(values)
-    return np.maximum(sizes, median_filter(sizes, 3, mode="nearest"))
+    typical = median_filter(sizes, 3, mode="nearest")
+    return np.where(sizes < _LOW * typical, typical, sizes)
 
 
 def far_values(values: np.ndarray) -> np.ndarray:
