@@ -150,11 +150,12 @@ def _order(A: Any, free: np.ndarray) -> _Order:
     alone = _elements_alone(A)
     key = _digest((widths, A.points, free)) + bytes([alone])
     if key not in _orders:
-        lines, columns = (a.ravel() for a in np.broadcast_arrays(A.nodes[:, None], A.nodes[None]))
-        known, pairs = np.unique(lines.astype(np.int64) * V + columns, return_inverse=True)
-        ends = np.searchsorted(known, V * np.arange(V + 1))
-        blocks = scipy.sparse.csr_array((np.ones(len(known)), known % V, ends), shape=(V, V))
-        near = blocks
+        ends = np.arange(0, A.nodes.size + 1, len(A.nodes))
+        of_elements = scipy.sparse.csr_array((np.ones(A.nodes.size), A.nodes.T.ravel(), ends), shape=(len(ends) - 1, V))
+        near = blocks = (of_elements.T @ of_elements).tocsr()
+        blocks.sort_indices()
+        known = np.repeat(V * np.arange(V), np.diff(blocks.indptr)) + blocks.indices
+        pairs = np.searchsorted(known, (V * A.nodes.astype(np.int64)[:, None] + A.nodes[None]).ravel())
         for nodes in widths[1:]:
             at = tuple(a.ravel() for a in np.broadcast_arrays(nodes[:, None], nodes[None]))
             near = near + scipy.sparse.coo_array((np.ones(len(at[0])), at), shape=(V, V))
@@ -177,7 +178,7 @@ def _entries_of_free(blocks: "scipy.sparse.csr_array", free: np.ndarray) -> "sci
     """Return the positions of the entries of free unknowns among the entries of all blocks."""
     import scipy.sparse
 
-    every = np.arange(9 * blocks.nnz).reshape(-1, 3, 3)
+    every = np.arange(9 * blocks.nnz, dtype=np.min_scalar_type(9 * blocks.nnz)).reshape(-1, 3, 3)
     size = 3 * blocks.shape[0]
     return scipy.sparse.bsr_array((every, blocks.indices, blocks.indptr), shape=(size, size)).tocsr()[free][:, free]
 
