@@ -56,6 +56,37 @@ def test_sets_have_the_members_of_all_their_cards(tmp_path, cards, members):
     assert found["all"] == [0, 1, 2, 3, 4] and found["right"] == [1] and found["skin"] == [0, 1, 2]
 
 
+def test_sets_of_the_part_and_of_the_assembly_are_different_sets(tmp_path):
+    """Abaqus/CAE calls the first set of a part Set-1, and the first set of the assembly too. Both were merged."""
+    head = HEAD.replace("*Node, nset=all", "*Part, name=Liver\n*Node, nset=all")
+    text = (
+        head
+        + """*Nset, nset=Set-1
+11, 12
+*Nset, nset=Set-2
+13
+*End Part
+*Assembly, name=Assembly
+*Instance, name=Liver-1, part=Liver
+*End Instance
+*Node
+11, 0.05, 0.05, 0.2
+*Nset, nset=RP
+11
+*Nset, nset=Set-1, instance=Liver-1
+14
+*Nset, nset=both
+Set-1, Liver-1.Set-2
+*End Assembly
+"""
+    )
+    (tmp_path / "m.inp").write_bytes(b"\xef\xbb\xbf" + text.replace("0.1, 0, 0", "1.0D-1, 0, 0").encode())
+    mesh = lj.read_mesh(tmp_path / "m.inp")
+    found = {name: sorted(np.asarray(nodes).tolist()) for name, nodes in mesh.node_sets.items()}
+    assert mesh.number_of_nodes == 5 and found.pop("skin") == [0, 1, 2] and found.pop("all") == [0, 1, 2, 3, 4]
+    assert found == {"Liver.Set-1": [0, 1], "Set-2": [2], "RP": [], "Set-1": [3], "both": [2, 3]}
+
+
 def test_several_blocks_of_one_set_give_the_sets_of_one_block(tmp_path):
     """meshio writes one card of a set for each block of cells. Read by meshio, the sets lost members."""
     mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
@@ -81,7 +112,7 @@ def test_quadratic_elements_and_included_files(tmp_path):
 @pytest.mark.parametrize(
     ("cards", "message"),
     [
-        ("*NODE\n11, 1, 1, 1\n", "two nodes have the same number, as in a file of several parts"),
+        ("*NODE\n11, 1, 1, 1\n", "two nodes have the same number; export one part"),
         ("*ELEMENT, TYPE=C3D4\n101, 11, 12, 13, 15\n", "two elements have the same number"),
         ("*ELEMENT, TYPE=C3D4\n103, 11, 12, 13\n", r"lines of \*ELEMENT, TYPE=C3D4 are not complete"),
         ("*ELEMENT, TYPE=C3D4\n103, 11, 12, 13, 99\n", "contains node 99, but"),
@@ -93,6 +124,9 @@ def test_quadratic_elements_and_included_files(tmp_path):
         ("*NGEN\n11, 15\n", r"\*NGEN changes or makes the mesh"),
         ("*INSTANCE, NAME=one, PART=two\n0, 0, 5\n", r"\*INSTANCE changes or makes the mesh"),
         ("*INCLUDE, INPUT=none.inp\n", "none.inp cannot be read"),
+        ("*INCLUDE, INPUT=m.inp\n", "m.inp includes itself"),
+        ("*NODE, SYSTEM=C\n16, 1, 30, 1\n", r"\*NODE changes or makes the mesh"),
+        ("*PART, NAME=a\n*END PART\n*PART, NAME=b\n*END PART\n", "several parts or instances"),
     ],
 )
 def test_files_that_cannot_be_used_get_one_sentence(tmp_path, cards, message):
