@@ -14,7 +14,7 @@ from fitting.commands import together as command
 from fitting.fits import joint, together, viscoelastic
 from fitting.fits.families import springpots_in_time
 from fitting.fits.honesty import sizes_of_samples, total_error
-from fitting.methods import generalised_maxwell
+from fitting.methods import generalised_maxwell, time_response
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest, kind_of
@@ -62,6 +62,27 @@ def test_a_start_from_which_no_joint_fit_begins_is_refused(tests, start, words):
     tests = [joint.sweep(sweep(0.02))] if tests is None else tests
     with pytest.raises(InputError, match=words):
         joint.fit(tests, start, lj.laws.create("neo_hookean", mu=770.0, bulk=7700.0))
+
+
+def test_the_noise_of_every_test_is_found_if_it_differs_a_thousandfold():
+    """After three rounds, the weights of the tests had not settled: G0 was wrong by up to 5.1 standard errors."""
+    truth = Maxwell(np.float64(2000.0), np.array([0.2, 0.3, 0.3]), np.array([0.01, 0.3, 10.0]))
+    omega, at = 2 * np.pi * np.geomspace(0.1, 20, 20), np.append(0.0, np.geomspace(0.01, 100, 40))
+    G, stress = generalised_maxwell.moduli(truth, omega), np.full(41, 50.0)
+    relaxed = 2000 * (1 - (truth.ratios * (1 - np.exp(-at[:, None] / truth.relaxation_times))).sum(axis=1))
+    strain = np.asarray(time_response.strain_response(truth, np.append(0.0, at + 1e-9), np.append(0.0, stress)))[1:]
+    off = []
+    for seed in range(4):
+        one, two, three, four = np.random.default_rng(seed).standard_normal((4, 41))
+        tests = [
+            Sweep(omega, G[0] * (1 + 0.1 * one[:20]), G[1] * (1 + 0.1 * two[:20]), source="sweep.csv"),
+            TimeTest("relaxation", at, np.ones(41), relaxed * (1 + 1e-4 * three), at > 0),
+            TimeTest("creep", at, stress, strain * (1 + 0.1 * four), at > 0),
+        ]
+        fit = together.fit(tests, 3)
+        assert 0.6e-4 < fit.shares[1].misfit < 1.4e-4
+        off.append((fit.uncertainty.values[0] - 2000) / fit.uncertainty.standard_errors[0])
+    assert np.sqrt(np.mean(np.square(off))) < 2
 
 
 def test_two_tests_find_what_neither_sees_alone(found):
@@ -275,7 +296,7 @@ def test_what_no_fit_follows_is_told():
     share = together.Share("sweep", "b.csv", 38, 1.2, 1.0, 0.63, 0.44, 0.3, np.ones(3))
     assert together.disagreements([share]) == []
     assert together.missed([share]) == [
-        "the fit misses the data of b.csv by 63 %: try another --model, or look at the data"
+        "the fit misses the data of b.csv by 63 %: if this is not noise, change --model"
     ]
     assert together.missed([share._replace(misfit=0.04)]) == []
 

@@ -21,8 +21,8 @@ from fitting.readers.frequency_sweep import smooth_curve
 from liverjax.core.errors import InputError
 from liverjax.laws import Law
 
-#: If the loss tangent changes by more than this fraction over the sweep, the program warns that the relaxation depends
-#: on the strain.
+#: If the loss tangent, divided by that of the law, changes by more than this fraction over the sweep, the program warns
+#: that the relaxation depends on the strain.
 CHANGED = 0.2
 
 
@@ -161,19 +161,21 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
     """Return warnings about the fits of a strain sweep. The best fit must be the first in `fits`."""
     best = fits[0]
     told = list(best.law.warnings)
-    tangents = sweep.loss / sweep.storage
-    change = tangents[-1] / tangents[0] - 1
-    shape = [n for n, unit in zip(best.law.names, best.law.units, strict=True) if unit == "1" and n != "loss_tangent"]
+    change, of_law = (own.loss[-1] / own.storage[-1] / (own.loss[0] / own.storage[0]) for own in (sweep, best))
+    names = [name for name in best.law.names if name != "loss_tangent"]
+    shape = [n for n, unit in zip(best.law.names, best.law.units, strict=True) if unit == "1" and n in names]
+    shape = shape or names[1:]  # of moduli, the ratios to the first modulus
     if "loss_tangent" in best.law.names and shape:
         told.append(
             "without --model, the constant part of the stress is also computed with the modulus at the frequency of "
-            f"the test. {' and '.join(shape)} may be wrong by several per cent, and the standard errors do not contain "
-            "this error: give --model with the fit.json of a frequency sweep"
+            f"the test. {' and '.join(shape)} may be wrong by 5 to 20 %, and the standard errors do not contain this "
+            "error: give --model with the fit.json of a frequency sweep"
         )
-    if abs(change) > CHANGED:
+    if abs(change / of_law - 1) > CHANGED:
         told.append(
-            f"the loss tangent changes by {100 * change:+.0f} % over the sweep: a law with the same relaxation at all "
-            "strains cannot describe this change. Fit only the strains before the change (--max-strain)"
+            f"the loss tangent changes by {100 * change - 100:+.0f} % over the sweep, but that of the law by "
+            f"{100 * of_law - 100:+.0f} %: the relaxation depends on the strain. Fit only the strains before this "
+            "change (--max-strain)"
         )
     if np.sqrt(np.mean(np.abs((best.storage + 1j * best.loss) / (sweep.storage + 1j * sweep.loss) - 1) ** 2)) > 0.05:
         told.append(

@@ -25,9 +25,10 @@ from fitting.waves.dispersion import Dispersion
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: ROUNDS: number of rounds; each round is a fit, and then new weights of the tests. QUIETEST: minimum relative noise of
-#: a test. STARTS: number of starting points. FIRST: noise of every test in the first round, relative to its values.
-ROUNDS, QUIETEST, STARTS, FIRST = 3, 1e-5, 6, 0.03
+#: ROUNDS: maximum number of rounds; each round is a fit, and then new weights of the tests. SETTLED: the rounds end if
+#: no noise changes by more than this fraction. QUIETEST: minimum relative noise of a test. FIRST: the same in round 1.
+#: STARTS: number of starting points.
+ROUNDS, QUIETEST, STARTS, FIRST, SETTLED = 12, 1e-5, 6, 0.03, 0.01
 #: The tests contradict each other if the noise of a test in the common fit, divided by its noise in a fit to this test
 #: alone, exceeds this ratio.
 APART = 1.5
@@ -97,9 +98,8 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """Return the divisors for relative errors of the measured values. Mostly the divisors are the measured values. In
-    relaxation and creep, the divisors have a lower bound. If errors of the phase angle cause the scatter of the loss
-    modulus, the divisor is |G*|."""
+    """Return the divisors for relative errors of the measured values: mostly the measured values. In relaxation and
+    creep, they have a lower bound. If errors of the phase angle cause the scatter of G'', its divisor is |G*|."""
     _, measured, scales = reported_numbers(test)
     if isinstance(test, Sweep) and test.sd_estimated:
         return np.concatenate([test.storage, np.hypot(test.storage, test.loss)])
@@ -119,8 +119,7 @@ def least_noise(test: Measured) -> float:
 
 
 def first_noise(test: Measured) -> float:
-    """Return the noise in the first round, divided by the scales of the test. All tests begin with the same relative
-    noise, also if the scales are standard deviations."""
+    """Return the noise of a test in round 1, divided by its scales. The relative noise is the same for all tests."""
     return max(least_noise(test), FIRST * float(np.median(np.abs(sizes_of(test)) / reported_numbers(test)[2])))
 
 
@@ -222,6 +221,8 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
         found = from_starts(evaluate, starts, data)
         noise = noises(tests, parts, np.asarray(found.residuals), noise, len(found.u))
         starts = np.asarray(found.u)[None]  # the next round begins near the minimum
+        if np.all(np.abs(noise / used - 1) < SETTLED):
+            break
     running = time.perf_counter() - begin
     modes_found = kind.maxwell(found.u)
     shares, fitted = misfits(tests, data, np.asarray(found.residuals), noise, len(found.u))
@@ -393,8 +394,7 @@ def disagreements(shares: list[Share]) -> list[str]:
 def missed(shares: list[Share]) -> list[str]:
     """Return a warning for each test with a large misfit both in the common fit and in a fit to this test alone."""
     return [
-        f"{viscoelastic.MISSES} of {s.source or s.name} by {100 * s.misfit:.2g} %: try another --model, or look at the "
-        "data"
+        f"{viscoelastic.MISSES} of {s.source or s.name} by {100 * s.misfit:.2g} %: if this is not noise, change --model"
         for s in shares
         if s.misfit > MISSED and s.noise <= APART * s.alone
     ]

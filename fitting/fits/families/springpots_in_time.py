@@ -263,6 +263,8 @@ def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
             minimum = _minimum_of_case(case, tests, starts, data)
             noise = together.noises(tests, parts, np.asarray(minimum.residuals), noise, len(case.free))
             starts = np.asarray(minimum.u)[None]  # the next round begins near the minimum
+            if np.all(np.abs(noise / used - 1) < together.SETTLED):
+                break
         shares, fitted = together.misfits(tests, data, np.asarray(minimum.residuals), noise, len(case.free))
         found = _springpot_at(case, together.over_own_noise(minimum, shares, used / noise), spans, over_noise=True)
         own = (tests, found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
