@@ -12,6 +12,7 @@ import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.regions import select_elements
+from liverjax.scenes.scene import numbers_at, with_parameters
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -57,6 +58,20 @@ def test_every_number_of_every_law_may_differ_by_element(name):
             part = lj.tet_mesh(mesh.points, np.asarray(mesh.tetrahedra)[numbers])
             parts.append(lj.mjed.internal_force(part, one, x))
         np.testing.assert_allclose(lj.mjed.internal_force(mesh, mixed, x), parts[0] + parts[1], atol=1e-12 * scale)
+
+
+def test_one_number_of_a_list_of_a_region_has_a_name():
+    """A sweep could not vary a relaxation time of a region: the name with the index led nowhere."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 2))
+    prony = lj.Prony(ratios=jnp.array([0.3, 0.1]), relaxation_times=jnp.array([0.2, 0.05]))
+    region = (lj.Region(elements=jnp.arange(6), viscosity={"relaxation_times": jnp.array([0.3, 0.04])}),)
+    scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=700.0, bulk=7000.0), viscosity=prony, region=region)
+    name = "region.0.viscosity.relaxation_times"
+    assert numbers_at(scene, f"{name}.1") == 0.04
+    changed = with_parameters(scene, {f"{name}.0": 0.9})
+    assert np.array_equal(numbers_at(changed, name), [0.9, 0.04])
+    with pytest.raises(lj.InputError, match="'2' is not a name or index here: use an index from 0 to 1"):
+        numbers_at(scene, f"{name}.2")
 
 
 @pytest.mark.slow

@@ -115,8 +115,10 @@ def _keys(thing: Any, path: list[str], refusal: str, before: str) -> tuple[list,
     word, rest = path[0], path[1:]
     if dataclasses.is_dataclass(thing):
         return _keys_of_struct(thing, path, refusal, before)
-    if isinstance(thing, dict) and ".".join(path) in thing:
-        return [".".join(path)], []
+    if isinstance(thing, dict):  # a key may contain points, and an index of its array may follow
+        ends = (n for n in range(len(path), 0, -1) if ".".join(path[:n]) in thing)
+        if end := next(ends, 0):
+            return [".".join(path[:end])], path[end:]
     several = isinstance(thing, tuple) or np.ndim(thing)
     if _is_place(word) and several and int(word) < len(thing):
         return [int(word)], rest
