@@ -443,10 +443,8 @@ RESTING, OFFSET = 3, 0.003
 
 
 def _without_offset(test: TimeTest) -> tuple[np.ndarray, float, list[str]]:
-    """Return the responses, the standard error of the subtracted offset, and a note.
-
-    If the mean before the load clearly exceeds its error, this mean is subtracted from all responses.
-    """
+    """Return the responses, the standard error of the subtracted offset, and a note. The mean before the load is
+    subtracted from all responses if it clearly exceeds its error."""
     rest = np.isfinite(test.answer) & (test.time < test.begun) & ~((test.time == 0) & (test.answer == 0))
     count, size = int(rest.sum()), float(np.nanmax(np.abs(test.answer)))
     if count < RESTING:
