@@ -41,6 +41,7 @@ class Test(NamedTuple):
     measured: np.ndarray  # (n,)
     sd: np.ndarray  # (n,) standard deviation of the noise
     mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) change on an infinitely fine mesh; None: no mesh
+    time_step_error: Callable[[Law, Prony], np.ndarray] | None = None  # (n,) change with infinitely small time steps
 
 
 def sweep(data: Sweep) -> Test:
@@ -101,7 +102,7 @@ def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
         readings, codes = glued.read(rig, law, viscosity)
         return readings, jnp.max(codes)
 
-    return Test(name, predict, measured, sd, partial(glued.mesh_error, rig))
+    return Test(name, predict, measured, sd, partial(glued.mesh_error, rig), partial(glued.time_step_error, rig))
 
 
 def fit(
@@ -115,8 +116,9 @@ def fit(
     """Fit the Maxwell parameters to all tests, and return them with standard errors. `uncertainty.parameter_names`
     gives the names of these parameters.
 
-    If tests are simulated in rigs, `mesh_bias` is the error of each parameter due to the meshes. Subtract `mesh_bias`
-    to correct the parameter. A warning is given if this error is larger than the standard error.
+    If tests are simulated in rigs, `mesh_bias` is the error of each parameter due to the meshes, and `time_step_bias`
+    the error due to their time steps. Subtract both to correct the parameter. A warning is given if one of these errors
+    is larger than the standard error.
 
     Args:
         tests: one or more tests.
@@ -159,8 +161,10 @@ def fit(
     converged = bool(found.converged) and all(c == status.CONVERGED for c in worst)
     estimate = estimated(names, parameter_vector, found, len(found.residuals))
     if any(test.mesh_error for test in tests):
-        missing = _missing(tests, material(found.u)[:2])
-        estimate = estimate._replace(mesh_bias=mesh_bias(found, parameter_vector, missing))
+        own = material(found.u)[:2]
+        of_mesh, of_steps = (_missing(tests, own, name) for name in ("mesh_error", "time_step_error"))
+        biases = [mesh_bias(found, parameter_vector, missing) for missing in (of_mesh, of_steps)]
+        estimate = estimate._replace(mesh_bias=biases[0], time_step_bias=biases[1])
         for sentence in bias_sentences(estimate):
             warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=tuple(worst), seconds=time.perf_counter() - begin)
@@ -188,11 +192,11 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
         raise InputError(f"start: relaxation_times = {times.tolist()} must be above 0 s; correct the times")
 
 
-def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> np.ndarray:
-    """Return the errors (n,) of all n readings due to the meshes, divided by the standard deviations of their noise."""
-    return np.concatenate(
-        [
-            np.zeros(len(test.sd)) if test.mesh_error is None else np.asarray(test.mesh_error(*material)) / test.sd
-            for test in tests
-        ]
-    )
+def _missing(tests: Sequence[Test], material: tuple[Law, Prony], name: str) -> np.ndarray:
+    """Return the errors (n,) of all n readings, divided by the standard deviations of their noise. `name`: function of
+    the tests that computes the errors due to their meshes or their time steps."""
+    rows = []
+    for test in tests:
+        error = getattr(test, name)
+        rows.append(np.zeros(len(test.sd)) if error is None else np.asarray(error(*material)) / test.sd)
+    return np.concatenate(rows)

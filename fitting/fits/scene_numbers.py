@@ -3,6 +3,7 @@
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from fitting.methods.least_squares import Solution, levenberg_marquardt_host
 from fitting.methods.noise.alike_noise import alike_noise
 from fitting.methods.noise.uneven_noise import uneven_root
 from fitting.readers.displacements import Displacements, weighted_differences
+from fitting.rigs.time_steps import change_with_small_steps
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
@@ -74,9 +76,9 @@ def fit(
         problem: scenes and data.
         unknowns: u, and the functions from u to the parameters of the scenes and to the reported parameters.
         max_iterations, progress: see `levenberg_marquardt_host`.
-        mesh_error: whether to estimate the error due to the meshes, and the change of each parameter that it causes
-            (`mesh_bias`). A warning is given if a parameter changes by more than its standard error. The estimate needs
-            one more run, and one linear solve per step.
+        mesh_error: whether to estimate the errors due to the meshes and the time steps, and the change of each
+            parameter that they cause (`mesh_bias`, `time_step_bias`). A warning is given if a parameter changes by more
+            than its standard error. The estimate needs more runs, and one linear solve per step.
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
     start, values_of, natural_of, names = unknowns
@@ -102,13 +104,33 @@ def fit(
     estimate = estimated(names, natural_of, found, problem.components)
     estimate = _of_alike_noise(problem, natural_of, found, estimate)
     known = np.all(np.isfinite(estimate.standard_errors))  # an infinite error means that a parameter ran to a limit
-    left_out = missing_or_none(problem, values_of(found.u)) if mesh_error and known else None
-    if left_out is not None:
-        size = float(np.sqrt(np.sum(left_out**2) / problem.components))
-        estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, left_out), mesh_over_noise=size)
+    if mesh_error and known:
+        estimate = _with_biases(problem, values_of(found.u), (estimate, found, natural_of))
         for sentence in bias_sentences(estimate):
             warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=ended, seconds=seconds), found
+
+
+def _with_biases(problem: Problem, values: Content, fitted: tuple[Estimate, Solution, Callable]) -> Estimate:
+    """Return the estimate with the changes of the parameters due to the meshes, and due to the time steps if a scene
+    has time steps. `values`: parameters of the scenes. `fitted`: estimate, solution, and function from u to the
+    reported parameters."""
+    estimate, found, natural_of = fitted
+    left_out = missing_or_none(problem, values)
+    if left_out is not None:
+        size = float(np.sqrt(np.sum(left_out**2) / problem.components))
+        estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, left_out), mesh_over_noise=size)
+    if any(scene.solve.dt is not None for scene in problem.scenes):
+        rows = [
+            change_with_small_steps(lj.with_parameters(scene, values), partial(_all_differences, data, scene))
+            for scene, data in zip(problem.scenes, problem.data, strict=True)
+        ]
+        estimate = estimate._replace(time_step_bias=mesh_bias(found, natural_of, np.concatenate(rows)))
+    return estimate
+
+
+def _all_differences(data: Displacements, scene: Scene, result: lj.Result) -> jax.Array:
+    return weighted_differences(data, scene, result.positions)
 
 
 def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, estimate: Estimate) -> Estimate:

@@ -175,10 +175,10 @@ UNKNOWN = 100.0
 
 def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], missing: np.ndarray) -> np.ndarray:
     """Return the change (P,) of the parameters due to the errors of the meshes, to first order. `missing` (n,): errors
-    of the meshes in the simulated data, divided by the noise.
+    of the meshes in the simulated data, divided by the noise. The same function is used for errors of time steps.
 
     The change of the unknowns u is J^+ `missing`, with the Jacobian J of the residuals. This estimate is accurate if
-    the mesh errors are below 25 % and the parameters are not nearly dependent. Subtract the result once to correct the
+    the errors are below 25 % and the parameters are not nearly dependent. Subtract the result once to correct the
     parameters.
     """
     J, (_, to_natural) = np.asarray(found.jacobian), with_slope(natural_of, found.u)
@@ -188,32 +188,38 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
 
 
 def bias_sentences(estimate: Estimate) -> list[str]:
-    """Return warnings if the mesh changes a parameter by more than its standard error, or too much for a first-order
-    estimate."""
-    bias, values = estimate.mesh_bias, np.asarray(estimate.values)
+    """Return warnings if the mesh or the time step changes a parameter by more than its standard error, or too much for
+    a first-order estimate."""
+    of_mesh = _sentences_of(estimate, estimate.mesh_bias, ("the mesh", "mesh_bias", "refine the mesh"))
+    steps = ("the time step", "time_step_bias", "use smaller time steps")
+    return list(dict.fromkeys([*of_mesh, *_sentences_of(estimate, estimate.time_step_bias, steps)]))
+
+
+def _sentences_of(estimate: Estimate, bias: np.ndarray | None, source: tuple[str, str, str]) -> list[str]:
+    """Return warnings about one kind of bias. `source`: its source, its name and a remedy."""
     if bias is None:
         return []
-    errors = estimate.standard_errors
+    values, errors, (what, name, remedy) = np.asarray(estimate.values), estimate.standard_errors, source
     unknown = np.flatnonzero(np.isfinite(errors) & (errors > UNKNOWN * np.abs(values)))
     if len(unknown):  # their bias is only amplified roundoff
         names = ", ".join(estimate.names[k] for k in unknown)
         return [
             f"the data do not determine {names}: the standard errors are more than {UNKNOWN:g} times the values, and "
-            "another mesh does not help. Displacements without a force determine only ratios of moduli. Give a "
+            "another mesh or step does not help. Displacements without a force determine only ratios of moduli. Give a "
             "traction or a measured force, or fit fewer parameters"
         ]
     lost = np.flatnonzero(~(np.abs(bias) <= LARGEST_BIAS * np.abs(values)) & ~(np.abs(bias) <= errors))
     if len(lost):
         names = ", ".join(estimate.names[k] for k in lost)
         return [
-            f"the error of the mesh changes {names} by a third or more, so the data do not determine these parameters "
-            "with this mesh: refine the mesh"
+            f"the error of {what} changes {names} by a third or more, so the data do not determine these parameters "
+            f"in this simulation: {remedy}"
         ]
     more = np.flatnonzero(np.abs(bias) > estimate.standard_errors)
     if not len(more):
         return []
     each = ", ".join(f"{estimate.names[k]} by {bias[k]:.2g}" for k in more)
     return [
-        f"the error of the mesh changes fitted values by more than their standard errors ({each}): subtract mesh_bias, "
-        "or refine the mesh"
+        f"the error of {what} changes fitted values by more than their standard errors ({each}): subtract {name}, or "
+        f"{remedy}"
     ]

@@ -86,7 +86,10 @@ def of_numbers(found: Estimate, with_mesh: bool = False) -> Content:
     return {
         "values": dict(zip(found.names, found.values.tolist(), strict=True)),
         "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
-        "mesh_bias": None if found.mesh_bias is None else dict(zip(found.names, found.mesh_bias.tolist(), strict=True)),
+        **{
+            key: None if bias is None else dict(zip(found.names, bias.tolist(), strict=True))
+            for key, bias in (("mesh_bias", found.mesh_bias), ("time_step_bias", found.time_step_bias))
+        },
         "correlation": found.correlation.tolist(),
         "chi2_per_component": found.chi2 / found.components,
         "noise_factor": found.noise,
@@ -197,12 +200,16 @@ def map_figure(mesh: TetMesh, found: Field) -> "Figure":
 
 
 def table_of_numbers(found: Estimate) -> str:
-    """Return a table of names, values, standard errors and mesh bias of the parameters, for the terminal."""
+    """Return a table of names, values, standard errors and biases of the parameters, for the terminal. The bias of the
+    time step is given only if the scenes have time steps."""
     width = max(map(len, found.names))
-    rows = [f"{'parameter':{width}}  {'value':>11}  {'standard error':>14}  {'mesh bias':>11}"]
-    bias = ["not known"] * len(found.names) if found.mesh_bias is None else [f"{b:.3g}" for b in found.mesh_bias]
-    for name, value, error, b in zip(found.names, found.values, found.standard_errors, bias, strict=True):
-        rows.append(f"{name:{width}}  {value:11.5g}  {error:14.3g}  {b:>11}")
+    biases = {"mesh bias": found.mesh_bias}
+    if found.time_step_bias is not None:
+        biases["step bias"] = found.time_step_bias
+    rows = [f"{'parameter':{width}}  {'value':>11}  {'standard error':>14}" + "".join(f"  {own:>11}" for own in biases)]
+    for k, (name, value, error) in enumerate(zip(found.names, found.values, found.standard_errors, strict=True)):
+        each = ("not known" if bias is None else f"{bias[k]:.3g}" for bias in biases.values())
+        rows.append(f"{name:{width}}  {value:11.5g}  {error:14.3g}" + "".join(f"  {own:>11}" for own in each))
     rows.append(f"chi2 per component {found.chi2 / found.components:.3f} of {found.components}, {found.seconds:.1f} s")
     return "\n".join(rows)
 

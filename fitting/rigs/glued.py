@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import liverjax as lj
+from fitting.rigs.time_steps import change_with_small_steps
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Array, Indices, Numbers, param, replace, static, struct
 from liverjax.laws import Law
@@ -92,6 +93,16 @@ def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
     result = lj.simulate(_with(rig, law, prony), mesh_error=True)
     assert result.mesh_error is not None
     return result.mesh_error.change(lambda x, force: _reading(rig, x, force), result)[1]
+
+
+def time_step_error(rig: Rig, law: Law, prony: Prony | None) -> np.ndarray:
+    """Estimate how each reading (T,) [N] or [m] would change with infinitely small time steps. The load rises during
+    the first step of the rig, also with smaller steps."""
+    scene = _with(rig, law, prony)
+    dt, steps = scene.solve.dt, scene.solve.steps
+    rise = {"times": jnp.array([0.0, dt, (steps + 1) * dt]), "history": jnp.array([0.0, 1.0, 1.0])}
+    scene = replace(scene, traction=tuple(replace(pull, **rise) for pull in scene.traction))
+    return change_with_small_steps(scene, lambda run: _reading(rig, run.positions, run.reactions))
 
 
 def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:

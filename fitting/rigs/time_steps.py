@@ -1,0 +1,42 @@
+"""Error of simulated tests due to their time steps, from a second run with half the step (Richardson 1911, Phil. Trans.
+R. Soc. A 210, 307)."""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+import liverjax as lj
+from liverjax.core import status
+from liverjax.core.struct import replace
+from liverjax.scenes.scene import Scene
+
+
+def order_of_steps(scene: Scene) -> int:
+    """Return the order, in the time step, of the error of a run. If parts of the scene have different orders, the
+    smallest order is returned."""
+    dynamic_euler = scene.solve.kind == "dynamic" and scene.solve.integrator == "euler"
+    old_recursion = scene.viscosity is not None and scene.viscosity.scheme == "backward_euler"
+    return 1 if dynamic_euler or old_recursion or scene.porosity is not None else 2
+
+
+def change_with_small_steps(scene: Scene, readings: Callable[[lj.Result], jax.Array]) -> np.ndarray:
+    """Estimate how each reading of a run would change with infinitely small time steps.
+
+    Args:
+        scene: a scene with known numbers (not inside jit, grad or vmap).
+        readings: function from a run of T steps to its readings, with any shape (T, …).
+
+    Returns:
+        The change, in the shape of the readings. It is 0 if the scene has no time steps, and NaN if a run fails.
+    """
+    run = lj.simulate(scene)
+    coarse = np.asarray(readings(run))
+    if scene.solve.dt is None:
+        return np.zeros(coarse.shape)
+    fine = lj.simulate(replace(scene, solve=replace(scene.solve, dt=scene.solve.dt / 2, steps=2 * scene.solve.steps)))
+    if np.any(np.concatenate([run.status, fine.status]) != status.CONVERGED):
+        return np.full(coarse.shape, np.nan)
+    every_second = replace(fine, positions=fine.positions[1::2], reactions=fine.reactions[1::2])
+    order = order_of_steps(scene)
+    return (np.asarray(readings(every_second)) - coarse) * 2**order / (2**order - 1)

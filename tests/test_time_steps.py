@@ -1,0 +1,107 @@
+"""Error of simulated tests due to their time steps: the estimate against runs with many small steps, and in fits."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from fitting.fits import joint, scene_numbers
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.displacements import Displacements
+from fitting.rigs import glued
+from fitting.rigs.time_steps import change_with_small_steps, order_of_steps
+from liverjax.core.struct import replace
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+def block(dt: float | None, steps: int, scheme: str = "exponential", rise: float = 0.2, **solve) -> lj.Scene:
+    """A viscous block that is pulled by a traction that rises for 0.2 s."""
+    mesh = lj.shapes.box((0.02, 0.02, 0.02), (1, 1, 1))
+    top = lj.boundary.boundary_triangles(mesh, np.asarray(mesh.node_sets["z_max"]))
+    rises = {} if dt is None else {"times": jnp.array([0.0, rise, 9.0]), "history": jnp.array([0.0, 1.0, 1.0])}
+    prony = lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([0.3]), scheme=scheme)
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=800.0, bulk=2000.0),
+        viscosity=None if dt is None else prony,
+        fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),),
+        traction=(lj.Traction(triangles=top, value=jnp.array([0.0, 0.0, 60.0]), **rises),),
+        body=lj.Body(density=1000.0, gravity=jnp.zeros(3)),
+        solve=lj.Solve(dt=dt, steps=steps, **solve),
+    )
+
+
+def tops(run: lj.Result) -> jnp.ndarray:
+    return run.positions[:, -1, 2]
+
+
+WAVE = {"kind": "dynamic", "rise": 0.02}
+
+
+@pytest.mark.parametrize(
+    ("dt", "options", "order"),
+    [
+        (0.1, {}, 2),
+        pytest.param(0.1, {"scheme": "backward_euler"}, 1, marks=pytest.mark.slow),
+        pytest.param(0.002, WAVE, 1, marks=pytest.mark.slow),
+        (0.004, WAVE | {"integrator": "newmark"}, 2),
+    ],
+)
+def test_the_estimate_is_the_change_with_many_small_steps(dt, options, order):
+    scene = block(dt, 6, **options)
+    assert order_of_steps(scene) == order
+    found = change_with_small_steps(scene, tops)
+    fine = lj.simulate(block(dt / 16, 6 * 16, **options)).check().positions[15::16, -1, 2]
+    true = np.asarray(fine) - np.asarray(tops(lj.simulate(scene)))
+    assert np.abs(true).max() > 1e-7  # of a displacement of 1 mm
+    assert np.linalg.norm(found - true) < 0.35 * np.linalg.norm(true)
+
+
+def test_a_scene_without_time_steps_has_no_such_error():
+    assert np.all(change_with_small_steps(block(None, 1), tops) == 0)
+
+
+def test_a_run_that_fails_gives_no_estimate():
+    scene = block(0.1, 2)
+    pulled = replace(scene, traction=tuple(replace(t, value=-1e9 * t.value) for t in scene.traction))
+    assert np.all(np.isnan(change_with_small_steps(pulled, tops)))
+
+
+@pytest.mark.filterwarnings("ignore:the error of the mesh changes")
+def test_a_fit_states_what_its_time_step_does_to_the_numbers():
+    """The data come from steps of 1/32. Ratio and relaxation time are wrong by more than their standard errors, as
+    stated, and a third remains after correction."""
+    coarse, n = block(0.05, 12, "backward_euler"), 12
+    fine = lj.simulate(block(0.05 / 32, 12 * 32, "backward_euler")).check().positions[31::32]
+    nodes = np.asarray(coarse.mesh.node_sets["z_max"])
+    moved = np.asarray(fine - coarse.mesh.points[None])[:, nodes]
+    data = Displacements(
+        step=np.repeat(np.arange(n), len(nodes)),
+        nodes=np.tile(nodes[:, None], (n, 4)),
+        weights=np.tile([[1.0, 0.0, 0.0, 0.0]], (n * len(nodes), 1)),
+        measured=moved.reshape(-1, 3),
+        sd=np.full((n * len(nodes), 3), 1e-6),
+    )
+    names = ["viscosity.ratios", "viscosity.relaxation_times"]
+    with pytest.warns(UserWarning, match="the error of the time step changes "):
+        found = scene_numbers.fit_numbers(scene_numbers.Problem((coarse,), (data,)), names)
+    off = found.values - [0.5, 0.3]
+    assert np.all(np.abs(off) > 3 * found.standard_errors)
+    assert np.all(np.abs(off - found.time_step_bias) < 0.5 * np.abs(off)), (off, found.time_step_bias)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the error of the ")
+def test_a_rig_states_what_its_time_step_does_to_the_numbers():
+    model = Maxwell(jnp.asarray(800.0), jnp.array([0.4]), jnp.array([0.6]))
+    law = lj.laws.NeoHookean(mu=1.0, bulk=20.0)
+    viscosity = lj.Prony(ratios=model.ratios, relaxation_times=model.relaxation_times)
+    rig = glued.creep(0.01, 0.01, 1.0, 5, 20.0, 0.004)
+    fine = glued.creep(0.01, 0.01, 1.0 / 16, 80, 20.0, 0.004)
+    rise = {"times": jnp.array([0.0, 1.0, 99.0]), "history": jnp.array([0.0, 1.0, 1.0])}
+    scene = replace(fine.scene, traction=tuple(replace(pull, **rise) for pull in fine.scene.traction))
+    readings = np.asarray(glued.read(replace(fine, scene=scene), lj.laws.scaled(law, 800.0), viscosity)[0])[15::16]
+    found = joint.fit([joint.through("creep", rig, readings, 1e-3 * readings[-1])], model, law)
+    off = found.values - np.array([800.0, 0.4, 0.6])
+    assert np.all(np.abs(off - found.time_step_bias) < 0.5 * np.abs(off)), (off, found.time_step_bias)
