@@ -72,6 +72,7 @@ def test_numbers_that_no_mesh_determines_are_not_blamed_on_the_mesh():
     finer mesh.
     """
     found = {"names": ("mu", "law.mu"), "values": np.array([938.0, 2900.0]), "mesh_bias": np.array([2e3, 3e3])}
+    found["time_step_bias"] = None
     (said,) = bias_sentences(SimpleNamespace(**found, standard_errors=np.array([7e9, 1e10])))
     assert said.startswith("the data do not determine mu, law.mu") and "refine" not in said
     (said,) = bias_sentences(SimpleNamespace(**found, standard_errors=np.array([10.0, 10.0])))

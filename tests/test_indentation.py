@@ -177,7 +177,7 @@ def test_the_right_column_of_several_is_read(tmp_path, header):
     (tmp_path / "c.csv").write_text("\n".join([header, *lines, ""]))
     curve = read_indentation(tmp_path / "c.csv")
     assert np.allclose(curve.depth, DEPTH) and np.allclose(curve.force, hertz(DEPTH - START))
-    told = any("not used: 'Displacement (um)'" in note for note in curve.notes)
+    told = any("not from 'Displacement (um)'" in note for note in curve.notes)
     assert told == header.startswith("Displacement (um)")
 
 

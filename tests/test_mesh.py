@@ -415,5 +415,7 @@ def test_gmsh_groups_without_their_entities_are_named(tmp_path):
     data.field_data = {"top": np.array([1, 2]), "body": np.array([3, 3])}
     data.point_data["gmsh:dim_tags"] = np.tile([3, 3], (len(points), 1))
     data.write(tmp_path / "groups.msh", file_format="gmsh", binary=False)
-    with pytest.raises(lj.InputError, match=r"\(the entry 1 is missing\); export the mesh as VTU or Gmsh 2.2"):
+    with pytest.raises(
+        lj.InputError, match=r"\(the entry 1 is missing in the file\); export the mesh as VTU or Gmsh 2.2"
+    ):
         lj.read_mesh(tmp_path / "groups.msh")

@@ -105,7 +105,7 @@ def test_raw_columns_without_a_unit_are_named_and_degrees_are_read(tmp_path):
     head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa,torque_uN.m,angle_deg,raw_phase"
     np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header=head, comments="")
     s = read_sweep(tmp_path / "d.csv")
-    assert [n for n in s.notes if "column 'raw_phase' is not used" in n and "name it e.g. raw_phase_deg" in n]
+    assert [n for n in s.notes if "column 'raw_phase' is not used" in n and "name this column e.g. raw_phase_deg" in n]
     assert without_inertia(s, RADIUS, HEIGHT).inertia[0] == pytest.approx(INERTIA * OMEGA[0] ** 2 / K, rel=1e-3)
 
 

@@ -116,20 +116,18 @@ def fit(
     """Fit the Maxwell parameters to all tests, and return them with standard errors. `uncertainty.parameter_names`
     gives the names of these parameters.
 
-    If tests are simulated in rigs, `mesh_bias` is the error of each parameter due to the meshes, and `time_step_bias`
-    the error due to their time steps. Subtract both to correct the parameter. A warning is given if one of these errors
-    is larger than the standard error.
+    If tests are simulated in rigs, `mesh_bias` and `time_step_bias` are the errors of each parameter due to meshes and
+    time steps. Subtract both to correct the parameter. A warning is given if one is larger than the standard error.
 
     Args:
         tests: one or more tests.
-        start: starting point of the parameters; the number of modes does not change.
+        start: starting point of the parameters, which sets the number of modes.
         law: one law for all tests. The fit scales its shear modulus to G0.
         part: which part of the stress relaxes, see `Prony`.
         max_iterations, progress: see `levenberg_marquardt_host`.
     """
     _check_joint(tests, start, law)
-    begin = time.perf_counter()
-    worst: list[int] = []
+    begin, worst = time.perf_counter(), list[int]()
 
     def material(u):
         model = generalised_maxwell.natural(u)
@@ -161,10 +159,9 @@ def fit(
     converged = bool(found.converged) and all(c == status.CONVERGED for c in worst)
     estimate = estimated(names, parameter_vector, found, len(found.residuals))
     if any(test.mesh_error for test in tests):
-        own = material(found.u)[:2]
-        of_mesh, of_steps = (_missing(tests, own, name) for name in ("mesh_error", "time_step_error"))
-        biases = [mesh_bias(found, parameter_vector, missing) for missing in (of_mesh, of_steps)]
-        estimate = estimate._replace(mesh_bias=biases[0], time_step_bias=biases[1])
+        missing = (_missing(tests, material(found.u)[:2], name) for name in ("mesh_error", "time_step_error"))
+        of_mesh, of_steps = (mesh_bias(found, parameter_vector, rows) for rows in missing)
+        estimate = estimate._replace(mesh_bias=of_mesh, time_step_bias=of_steps)
         for sentence in bias_sentences(estimate):
             warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=tuple(worst), seconds=time.perf_counter() - begin)

@@ -105,13 +105,13 @@ def fit(
     estimate = _of_alike_noise(problem, natural_of, found, estimate)
     known = np.all(np.isfinite(estimate.standard_errors))  # an infinite error means that a parameter ran to a limit
     if mesh_error and known:
-        estimate = _with_biases(problem, values_of(found.u), (estimate, found, natural_of))
+        estimate = _of_discretisation(problem, values_of(found.u), (estimate, found, natural_of))
         for sentence in bias_sentences(estimate):
             warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=ended, seconds=seconds), found
 
 
-def _with_biases(problem: Problem, values: Content, fitted: tuple[Estimate, Solution, Callable]) -> Estimate:
+def _of_discretisation(problem: Problem, values: Content, fitted: tuple[Estimate, Solution, Callable]) -> Estimate:
     """Return the estimate with the changes of the parameters due to the meshes, and due to the time steps if a scene
     has time steps. `values`: parameters of the scenes. `fitted`: estimate, solution, and function from u to the
     reported parameters."""
