@@ -47,6 +47,10 @@ def sets_of(tmp_path, cards):
         ("*Nset, nset=odd, generate\n11, 15, 2\n", {"odd": [0, 2, 4]}),
         ("*NSET, NSET=foot, GENERATE\n11, 13\n*ELSET, ELSET=both, GENERATE\n101, 102\n", {"foot": [0, 1, 2]}),
         ("*NSET, NSET=foot, INSTANCE=Part-1-1\n11\n*NSET, NSET=tip\nPart-1-1.15\n", {"foot": [0], "tip": [4]}),
+        ("*NSET, NSET=foot, ELSET=right\n", {"foot": [1, 2, 3, 4]}),
+        ("*ELSET, ELSET=hard\nlater\n*ELSET, ELSET=later\n101,\n", {"hard": [0], "later": [0]}),
+        ("*ELEMENT, TYPE=S4, ELSET=quad\n9, 11, 12, 15, 13\n*ELSET, ELSET=hard\nquad, 101\n", {"hard": [0]}),
+        ("*ELSET, ELSET=hard,\n101, 102\n", {"hard": [0, 1]}),
         ("*NODE PRINT, NSET=foot\nU\n*NSET, NSET=foot\n11\n", {"foot": [0]}),
     ],
 )
@@ -87,6 +91,16 @@ Set-1, Liver-1.Set-2
     assert found == {"Liver.Set-1": [0, 1], "Set-2": [2], "RP": [], "Set-1": [3], "both": [2, 3]}
 
 
+def test_nodes_and_elements_of_an_instance_are_read(tmp_path):
+    """Abaqus/CAE writes an independent instance like this. Its part is empty."""
+    mesh = HEAD.partition("** a comment\n")[2] + "*Nset, nset=foot\n11, 12\n"
+    text = f"*Part, name=A\n*End Part\n*Assembly\n*Instance, name=A-1, part=A\n{mesh}*End Instance\n"
+    (tmp_path / "m.inp").write_text(text + "*Nset, nset=tip, instance=A-1\n15\n*End Assembly\n")
+    read = lj.read_mesh(tmp_path / "m.inp")
+    assert read.number_of_nodes == 5 and read.node_sets["foot"].tolist() == [0, 1]
+    assert read.node_sets["tip"].tolist() == [4]
+
+
 def test_several_blocks_of_one_set_give_the_sets_of_one_block(tmp_path):
     """meshio writes one card of a set for each block of cells. Read by meshio, the sets lost members."""
     mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
@@ -117,9 +131,9 @@ def test_quadratic_elements_and_included_files(tmp_path):
         ("*ELEMENT, TYPE=C3D4\n103, 11, 12, 13\n", r"lines of \*ELEMENT, TYPE=C3D4 are not complete"),
         ("*ELEMENT, TYPE=C3D4\n103, 11, 12, 13, 99\n", "contains node 99, but"),
         ("*ELEMENT, TYPE=C3D8\n103, 11, 12, 13, 14, 11, 12, 13, 14\n", "contains hexahedron in addition"),
+        ("*ELEMENT, TYPE=C3D27\n103" + 27 * ", 11" + "\n", "contains hexahedron27 in addition"),
         ("*NODE\n16, 1, one, 1\n", "contains a wrong number"),
-        ("*NSET, NSET=foot\nnobody\n", "contains nobody, which is no earlier set"),
-        ("*NSET, NSET=foot, ELSET=right\n", "selects the nodes of an element set"),
+        ("*NSET, NSET=foot\nnobody\n", "contains nobody, but the file does not define this set"),
         ("*NSET, NSET=foot, GENERATE\n1, 2, 0\n", "give first, last, step"),
         ("*NGEN\n11, 15\n", r"\*NGEN changes or makes the mesh"),
         ("*INSTANCE, NAME=one, PART=two\n0, 0, 5\n", r"\*INSTANCE changes or makes the mesh"),

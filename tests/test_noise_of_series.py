@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fitting.fits import time_tests
-from fitting.readers.noise_of_series import far_values, noise_of_series, sizes_of_series
+from fitting.readers.noise_of_series import far_values, noise_of_series, sizes_of_series, told_of_far_values
 from fitting.readers.time_tests import read_time_test
 
 pytestmark = pytest.mark.quick_to_compile
@@ -35,6 +35,16 @@ def test_true_courses_have_no_wrong_values():
         assert far_values(series).size == 0
         assert np.all(sizes_of_series(series) >= np.abs(series))
     assert np.array_equal(sizes_of_series(steps), steps)
+
+
+def test_a_peak_at_a_change_of_the_load_is_no_fault():
+    """The response to a second step may relax within one row."""
+    load, answer = np.repeat([1.0, 2.0], 10), np.full(20, 1.0)
+    answer[10] = 50.0
+    assert far_values(answer).tolist() == [10]
+    assert told_of_far_values(np.arange(20.0), load, answer) == []
+    assert len(told_of_far_values(np.arange(20.0), np.ones(20), answer)) == 1
+    assert np.array_equal(sizes_of_series(np.array([0.0, 90.0, 80.0, 70.0])), [90.0, 90.0, 80.0, 70.0])
 
 
 @pytest.mark.parametrize("value", [0.0, 100.0])

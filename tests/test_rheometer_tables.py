@@ -169,6 +169,14 @@ def test_all_labelled_rows_below_a_mean_are_summaries(tmp_path):
     assert list(s.storage) == [1000, 1100, 1200, 1400] and len(s.notes) == 2
 
 
+@pytest.mark.parametrize("remark", ["max", "n", "range", "valid"])
+def test_a_remark_on_the_last_row_marks_no_summary(tmp_path, remark):
+    """The last measured row of a table with remarks was ignored."""
+    text = "Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa),remark\n0.1,1000,100,\n1,1200,150,\n"
+    s = read_sweep(_write(tmp_path, f"{text}10,1500,260,{remark}\n"))
+    assert list(s.storage) == [1000, 1200, 1500] and s.notes == ()
+
+
 def test_the_label_of_a_summary_may_be_in_the_last_column(tmp_path):
     text = "Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa),remark\n0.1,1000,100,\n1,1200,150,\n10,1500,260,\n"
     s = read_sweep(_write(tmp_path, text + "5,1233,170,Mean\n4,200,60,SD\n"))
@@ -181,6 +189,8 @@ def test_the_label_of_a_summary_may_be_in_the_last_column(tmp_path):
         "mean,0.1,1000,100\nmean,1,1200,150\nmean,10,1500,260\n",
         "A,0.1,1000,100\nMax,1,1200,150\nMax,10,1500,260\n",
         "Auto,0.1,1000,100\nMean,1,1200,150\nAuto,10,1500,260\n",
+        "Adventitia,0.1,1000,100\nMedia,1,1200,150\nIntima,10,1500,260\n",
+        "a,0.1,1000,100\nmean,1,1200,150\nb,10,1500,260\n",
     ],
 )
 def test_a_word_of_a_label_marks_no_summary(tmp_path, rows):

@@ -85,6 +85,22 @@ def test_the_noise_of_every_test_is_found_if_it_differs_a_thousandfold():
     assert np.sqrt(np.mean(np.square(off))) < 2
 
 
+@pytest.mark.parametrize("points", [4, 8])
+def test_the_noise_of_a_short_test_does_not_run_to_zero(points):
+    """Parameters can fit a few values exactly. Their noise then fell in every round, and their weight grew without
+    bound: a relaxation time was wrong by hundreds of standard errors."""
+    at, off = np.append(0.0, np.geomspace(0.1, 100, points)), []
+    for seed in range(6):
+        noise = np.random.default_rng(seed).standard_normal((3, len(OMEGA)))
+        loud = sweep(0.0)
+        loud = loud._replace(storage=loud.storage * (1 + 0.1 * noise[0]), loss=loud.loss * (1 + 0.1 * noise[1]))
+        few = TimeTest("relaxation", at, np.ones(len(at)), modulus(at) * (1 + 0.03 * noise[2, : len(at)]), at > 0)
+        fit = together.fit([loud, few], 2)
+        assert fit.shares[1].noise > 0.005
+        off.append((fit.uncertainty.values - [800, 0.3, 0.4, 30, 0.1]) / fit.uncertainty.standard_errors)
+    assert np.abs(off).max() < 4.5 and np.sqrt(np.mean(np.square(off))) < 1.5
+
+
 def test_two_tests_find_what_neither_sees_alone(found):
     errors = found.uncertainty.standard_errors
     values = np.array([800, 0.3, 0.4, 30, 0.1])

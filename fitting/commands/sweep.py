@@ -253,7 +253,9 @@ def _check(options: argparse.Namespace) -> None:
             meant = f"{value / 1000:g}" if 0.2 < value <= 200 else "0.004"
             raise InputError(f"--{name} {value} cannot be a plate {name} in metres: give e.g. --{name} {meant}")
     if options.gap_error is not None and not (options.height and 0 <= options.gap_error < options.height):
-        raise InputError(f"--gap-error {options.gap_error:g} must be in metres, and below --height: give both options")
+        raise InputError(
+            f"--gap-error {options.gap_error:g} must be 0 or more and below --height, both in metres: give both"
+        )
     _check_friction(options)
     if options.density is not None and not 100 <= options.density <= 25000:
         raise InputError(f"--density {options.density} is not possible in kg/m^3: give e.g. --density 1060")

@@ -422,7 +422,8 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
         residuals = jax.jit(jax.vmap(springpots_in_time.residuals_of_springpot(fit.kind.name, test)))
     size = np.abs(fit.model.shear_modulus) * np.array([1e-2, 1.0])
     weight = fit.details.get(INDEPENDENT, len(fit.measured)) / len(fit.measured)
-    offset = np.sqrt(weight) * test.offset_error / (time_tests.data_in_time(test)[-1] * fit.uncertainty.noise)
+    noise = time_tests.data_in_time(test)[-1] * max(fit.uncertainty.noise, QUIETEST)
+    offset = np.sqrt(weight) * test.offset_error / noise
     own = target(fit.kind, _beside_offset(residuals, offset), test.resolved, size, False)
     return sample(own._replace(weight=weight), len(fit.solution.u), count, seed)
 

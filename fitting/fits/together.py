@@ -17,7 +17,7 @@ from fitting.fits.viscoelastic import FLUID, Kind
 from fitting.methods import generalised_maxwell, host, kramers_kronig, time_response, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation, spread
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.least_squares import Solution, from_starts
+from fitting.methods.least_squares import Solution, degrees_of_freedom, from_starts
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 from fitting.waves import shear_waves
@@ -27,8 +27,8 @@ from liverjax.core.struct import Content
 
 #: ROUNDS: maximum number of rounds; each round is a fit, and then new weights of the tests. SETTLED: the rounds end if
 #: no noise changes by more than this fraction. QUIETEST: minimum relative noise of a test. FIRST: the same in round 1.
-#: STARTS: number of starting points.
-ROUNDS, QUIETEST, STARTS, FIRST, SETTLED = 12, 1e-5, 6, 0.03, 0.01
+#: STARTS: number of starting points. LEAST_FREEDOM: least degrees of freedom with which a test determines its noise.
+ROUNDS, QUIETEST, STARTS, FIRST, SETTLED, LEAST_FREEDOM = 12, 1e-5, 6, 0.03, 0.01, 3.0
 #: The tests contradict each other if the noise of a test in the common fit, divided by its noise in a fit to this test
 #: alone, exceeds this ratio.
 APART = 1.5
@@ -219,18 +219,16 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
         used = noise
         data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
         found = from_starts(evaluate, starts, data)
-        noise = noises(tests, parts, np.asarray(found.residuals), noise, len(found.u))
+        noise = noises(tests, parts, np.asarray(found.residuals), noise, np.asarray(found.jacobian))
         starts = np.asarray(found.u)[None]  # the next round begins near the minimum
         if np.all(np.abs(noise / used - 1) < SETTLED):
             break
     running = time.perf_counter() - begin
-    modes_found = kind.maxwell(found.u)
     shares, fitted = misfits(tests, data, np.asarray(found.residuals), noise, len(found.u))
     found = over_own_noise(found, shares, used / noise)
     spreads = uncertainty.estimate(found, True, kind.maxwell)
-    model = Maxwell(*(np.asarray(v) for v in modes_found))
-    converged = bool(found.converged)
-    return Together(tests, kind, model, found, spreads, converged, shares, fitted, [], (), running, 0.0)
+    model = Maxwell(*(np.asarray(v) for v in kind.maxwell(found.u)))
+    return Together(tests, kind, model, found, spreads, bool(found.converged), shares, fitted, [], (), running, 0.0)
 
 
 def misfits(
@@ -275,15 +273,17 @@ def _size_of_noise(residuals: np.ndarray, freedom: float) -> float:
     return float(np.sqrt(np.sum(residuals**2) / max(1.0, freedom)))
 
 
-def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: float) -> np.ndarray:
+def noises(
+    tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, taken: np.ndarray | float
+) -> np.ndarray:
     """Return the noise of each test, relative to its scales: the root of the sum of its squared residuals divided by
-    its degrees of freedom. `used`: noise that was used in the fit. `free`: number of parameters."""
+    its degrees of freedom. A test with less than `LEAST_FREEDOM` keeps its noise `used`, which was used in the fit.
+    `taken`: Jacobian of the residuals, or effective number of parameters."""
     counts = np.array([len(y) for _, y, _ in parts])
-    left = np.split(residuals, np.cumsum(counts)[:-1])
-    out = []
-    for test, r, s, count in zip(tests, left, used, counts, strict=True):
-        out.append(max(least_noise(test), s * _size_of_noise(r, count * (1 - free / counts.sum()))))
-    return np.array(out)
+    left = np.split(residuals[: counts.sum()], np.cumsum(counts)[:-1])
+    freedoms = degrees_of_freedom(taken, counts) if np.ndim(taken) else counts * (1 - taken / counts.sum())
+    found = [s if f < LEAST_FREEDOM else s * _size_of_noise(r, f) for r, s, f in zip(left, used, freedoms, strict=True)]
+    return np.maximum(found, [least_noise(test) for test in tests])
 
 
 def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:

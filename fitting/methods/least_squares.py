@@ -127,6 +127,22 @@ def solution(s: State) -> Solution:
     return Solution(s.u, s.r, s.J, _cost(s.r), s.iterations, cosine, s.converged)
 
 
+def degrees_of_freedom(jacobian: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the degrees of freedom (K,) of K groups of residuals: their numbers minus the sums of their leverages.
+
+    A group that the parameters fit exactly has none (Cook and Weisberg 1982, Residuals and Influence in Regression).
+
+    Args:
+        jacobian: Jacobian (n, P) of all residuals. Rows of a prior may follow the rows of the groups.
+        counts: numbers (K,) of residuals of the groups.
+    """
+    if not np.all(np.isfinite(jacobian)):
+        return counts * max(0.0, 1 - jacobian.shape[1] / counts.sum())
+    U, sizes, _ = np.linalg.svd(jacobian, full_matrices=False)
+    leverages = np.sum(U[:, sizes > 1e-12 * sizes.max(initial=0.0)] ** 2, axis=1)
+    return counts - np.add.reduceat(leverages[: counts.sum()], np.append(0, np.cumsum(counts)[:-1]))
+
+
 def with_jacobian(residuals: Callable[..., jax.Array]) -> Callable[..., tuple[jax.Array, jax.Array]]:
     """Convert a residual function of (u, …) to a function that returns (r, dr/du), in one pass of forward-mode
     differentiation."""

@@ -185,7 +185,7 @@ def _column(file: Path, rows: list[dict], name: str, default: float | None = Non
     values = []
     if name not in rows[0] and default is None:
         headings = ", ".join(key for key in rows[0] if key != "row")
-        raise InputError(f"{file} has no column {name}, only {headings}: give {name} without a unit (1 is undeformed)")
+        raise InputError(f"{file} has no column {name}, only {headings}: add this column, without a unit")
     for row in rows:
         text = row.get(name, "")
         if not text and default is not None:

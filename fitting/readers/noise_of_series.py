@@ -27,7 +27,7 @@ def sizes_of_series(values: np.ndarray) -> np.ndarray:
     from scipy.ndimage import median_filter
 
     sizes = np.abs(values)
-    typical = median_filter(sizes, 3, mode="nearest")
+    typical = median_filter(sizes, 3, mode="mirror")
     return np.where(sizes < _LOW * typical, typical, sizes)
 
 
@@ -44,10 +44,13 @@ def far_values(values: np.ndarray) -> np.ndarray:
     return 2 + np.flatnonzero(off > np.maximum(_FAR * beside, least))
 
 
-def told_of_far_values(time: np.ndarray, values: np.ndarray) -> list[str]:
-    """Return a note for each of the `far_values` of a series. `time`: times (n,) [s]."""
+def told_of_far_values(time: np.ndarray, load: np.ndarray, values: np.ndarray) -> list[str]:
+    """Return a note for each of the `far_values` of the response (n,) to a `load` (n,), at the times `time` (n,) [s]. A
+    value beside a change of the load may be a true peak."""
+    still = np.abs(np.diff(load)) <= _OF_LARGEST * np.max(np.abs(load))
     return [
         f"the response {values[k]:.4g} at {time[k]:.4g} s is far from its neighbours {values[k - 1]:.4g} and "
         f"{values[k + 1]:.4g}: if it is a fault of the measurement, remove this row"
         for k in far_values(values)
+        if still[k - 1] and still[k]
     ]

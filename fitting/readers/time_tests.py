@@ -495,5 +495,5 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         )
     if np.sum(test.time <= test.begun) > 2:
         told = [*told, f"the load begins at {test.begun:.3g} s: the rows before it are not fitted"]
-    told = [*told, *told_of_far_values(test.time[used], answer[used])]
+    told = [*told, *told_of_far_values(test.time[used], driven[used], answer[used])]
     return test._replace(driven=driven, answer=answer, used=used, notes=(*test.notes, *told), offset_error=error)

@@ -33,6 +33,7 @@ class PathStep(NamedTuple):
         if isinstance(owner, tuple):
             return (*owner[:key], value, *owner[key + 1 :])
         numbers = jnp.asarray(owner)
+        numbers = numbers.astype(float) if jnp.issubdtype(numbers.dtype, jnp.integer) else numbers
         return numbers.at[key].set(jnp.asarray(value, numbers.dtype))
 
 

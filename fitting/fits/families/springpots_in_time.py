@@ -261,7 +261,7 @@ def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
         for _ in range(together.ROUNDS):
             used, data = noise, [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
             minimum = _minimum_of_case(case, tests, starts, data)
-            noise = together.noises(tests, parts, np.asarray(minimum.residuals), noise, len(case.free))
+            noise = together.noises(tests, parts, np.asarray(minimum.residuals), noise, np.asarray(minimum.jacobian))
             starts = np.asarray(minimum.u)[None]  # the next round begins near the minimum
             if np.all(np.abs(noise / used - 1) < together.SETTLED):
                 break

@@ -171,33 +171,37 @@ def means_nothing(cells: Iterable[str]) -> bool:
     return not any(re.match(r"[-+]?[.,]?\d|nan|[-+]?inf", cell.strip('" ').lower()) for cell in cells)
 
 
-#: Labels of rows with means of other rows, for example "Mean (n = 3)", and labels of other summaries.
+#: Labels of rows with means of other rows, for example "Mean (n = 3)"; with their deviations; and with other summaries.
 _MEAN = r"mean|average|avg|mw|mittelwert|mittel|moyenne|media|promedio|gemiddelde"
-_OTHER = (
-    r"median|mediane?|s\.?d|std|st\.? ?dev|std\.? ?dev|stdev\.?[sp]?|stdabw\.?|std\.?[- ]?abw\.?|standardabweichung"
-    r"|standard[ -]deviation|s\.?e\.?m|s\.?e|std\.? ?error|standard[ -]error|min|max|minimum|maximum|range|cv|rsd"
-    r"|variance|varianz|n|count|.cart[- ]type|(95 ?%? ?)?c\.?i\.?( ?95 ?%?)?|confidence( interval)?"
+_DEVIATION = (
+    r"s\.?d|std|st\.? ?dev|std\.? ?dev|stdev\.?[sp]?|stdabw\.?|std\.?[- ]?abw\.?|standardabweichung"
+    r"|standard[ -]deviation|s\.?e\.?m|s\.?e|std\.? ?error|standard[ -]error|cv|rsd|variance|varianz|.cart[- ]type"
+    r"|(95 ?%? ?)?c\.?i\.?( ?95 ?%?)?|confidence( interval)?"
 )
+_OTHER = r"median|mediane?|min|max|minimum|maximum|range|n|count"
 _AROUND = r"±? ?({})( value)?\.?( ?± ?\w+)?( ?%)?( ?[(\[][^)\]]*[)\]])?:?"
-_OF_MEANS, _OF_SUMMARIES = (re.compile(_AROUND.format(each), re.I) for each in (_MEAN, f"{_MEAN}|{_OTHER}"))
+_OF_MEANS = re.compile(_AROUND.format(_MEAN), re.I)
+_BEFORE_NUMBERS = re.compile(_AROUND.format(f"{_MEAN}|{_DEVIATION}|{_OTHER}"), re.I)
+_AFTER_NUMBERS = re.compile(_AROUND.format(f"{_MEAN}|{_DEVIATION}"), re.I)
 
 
 def is_summary(label: str) -> bool:
     """Return whether a cell is the label of a summary of rows, such as "Mean" or "SD"."""
-    return bool(_OF_SUMMARIES.fullmatch(label))
+    return bool(_BEFORE_NUMBERS.fullmatch(label))
 
 
 def summary_rows(rows: list[list[str]]) -> dict[int, str]:
     """Return the indices of rows such as "Mean" and "SD" at the end of a table, and the label of each row.
 
-    The label is the first cell that is no number. A mean and all labelled rows below it are summaries, unless a label
-    is that of another row too: such a label may be the name of a sample or of a range.
+    The label is a cell before the first number. Only the label of a mean or deviation may also be a later cell, because
+    words such as "max" in later cells may be remarks on a measured row. If no row above has a label, all labelled rows
+    below a mean are summaries. A label that another row has too is no summary: it may be the name of a sample.
     """
     labels = [_label(row) for row in rows]
     end = len(rows)
     while end and is_summary(labels[end - 1]):
         end -= 1
-    means = [k for k, label in enumerate(labels) if _OF_MEANS.fullmatch(label) and all(labels[k:])]
+    means = [k for k, own in enumerate(labels) if _OF_MEANS.fullmatch(own) and all(labels[k:]) and not any(labels[:k])]
     end = min([end, *means])
     own = labels[end:]
     distinct = len(set(own)) == len(own) and not set(own) & set(labels[:end])
@@ -205,6 +209,10 @@ def summary_rows(rows: list[list[str]]) -> dict[int, str]:
 
 
 def _label(row: list[str]) -> str:
-    """Return the first cell that is no number, or an empty string."""
-    cells = (cell.strip('" ') for cell in row)
-    return next((cell for cell in cells if cell.lower() not in EMPTY and to_number(cell, ";") is None), "")
+    """Return the label of a row (see `summary_rows`), or an empty string."""
+    cells = [cell.strip('" ') for cell in row]
+    words = [bool(cell) and cell.lower() not in EMPTY and to_number(cell, ";") is None for cell in cells]
+    first = next((k for k, cell in enumerate(cells) if cell and not words[k]), len(cells))
+    before = next((cells[k] for k in range(first) if words[k]), "")
+    after = (cells[k] for k in range(first, len(cells)) if words[k] and _AFTER_NUMBERS.fullmatch(cells[k]))
+    return before or next(after, "")

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 #: Pattern of Abaqus' element types, with the number of nodes -> meshio's names of the cells. Elements of other types
 #: (lines, quadrilaterals, …) are ignored.
 _CELLS = {
-    r"[AD]?C3D(\d+)[A-Z]*": {
+    r"(?:[AD]?C3D|SC|COH3D)(\d+)[A-Z]*": {
         4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 15: "wedge15", 20: "hexahedron20",
+        27: "hexahedron27",
     },
     r"(?:S|DS|STRI|M3D|SFM3D|R3D|CPS|CPE)(3|6)5?[A-Z]*": {3: "triangle", 6: "triangle6"},
 }  # fmt: skip
@@ -62,9 +63,9 @@ def read_abaqus(path: Path) -> "meshio.Mesh":
         blocks = {k: _read_block(card, nodes) for k, card in enumerate(cards) if _kind_of_cells(card) is not None}
         elements = [label for block in blocks.values() for label in block.labels]
         _check_unique(elements, "elements")
+        element_sets = _sets(cards, "ELSET", {k: block.labels for k, block in blocks.items()}, {})
         by_card = {k: [int(line[0]) for line in card.lines] for k, card in _cards_of(cards, "NODE")}
-        node_sets = _sets(cards, "NSET", by_card)
-        element_sets = _sets(cards, "ELSET", {k: block.labels for k, block in blocks.items()})
+        node_sets = _sets(cards, "NSET", by_card, _nodes_of(element_sets, blocks, list(nodes)))
     except _Wrong as error:
         raise InputError(f"mesh file {path}: {error}") from None
     return meshio.Mesh(
@@ -94,6 +95,10 @@ def _cards(path: Path, outer: tuple[Path, ...]) -> Iterator[_Card]:
     for line in text.splitlines():
         if line.startswith("**") or not line.strip():
             continue
+        if begun and not line.startswith("*") and "=" not in line and not re.search("[A-Za-z]", line):
+            begun = begun.rstrip(",")  # a data line follows a comma that is not needed
+            yield from () if card is None else _with_included(card, outer)
+            card, begun = _card(begun), ""
         if begun or line.startswith("*"):
             begun += line.strip()
             if not begun.endswith(","):  # otherwise the keyword line continues on the next line
@@ -131,9 +136,17 @@ def _of_one_part(cards: list[_Card]) -> list[_Card]:
         return cards
     if len(parts) > 1 or len(_cards_of(cards, "INSTANCE")) > 1:
         raise _Wrong("the file has several parts or instances; export one part with one mesh")
-    begin, end = parts[0][0], next((k for k, _ in _cards_of(cards, "END PART")), len(cards))
-    marked = [card._replace(inside=begin < k < end) for k, card in enumerate(cards)]
-    return [card for card in marked if card.inside or card.keyword not in ("NODE", "ELEMENT")]
+    inside, depth = [], 0  # an instance may contain the nodes and elements, if the part is empty
+    for card in cards:
+        depth -= card.keyword in ("END PART", "END INSTANCE")
+        inside.append(depth > 0)
+        depth += card.keyword in ("PART", "INSTANCE")
+    marked = [card._replace(inside=own) for card, own in zip(cards, inside, strict=True)]
+    # A set of removed nodes or elements stays, as an empty set.
+    kept = [card for card in marked if card.inside or card.keyword not in ("NODE", "ELEMENT")]
+    return kept + [
+        card._replace(lines=[]) for card in marked if not card.inside and card.keyword in ("NODE", "ELEMENT")
+    ]
 
 
 def _cards_of(cards: list[_Card], keyword: str) -> list[tuple[int, _Card]]:
@@ -186,47 +199,73 @@ def _read_block(card: _Card, nodes: dict[int, int]) -> _Block:
     return _Block(kind, rows[:, 0].tolist(), np.array(places, int).reshape(-1, size))
 
 
-def _sets(cards: list[_Card], key: str, by_card: dict[int, list[int]]) -> dict[str, set[int]]:
+def _sets(
+    cards: list[_Card], key: str, by_card: dict[int, list[int]], of_elements: dict[str, set[int]]
+) -> dict[str, set[int]]:
     """Return the numbers of the members of all sets. Abaqus does not distinguish capital letters in names of sets.
 
     Args:
         cards: cards of the file.
         key: "NSET" or "ELSET".
         by_card: {index of a card: numbers of the nodes or elements that this card defines}.
+        of_elements: {name of a set of elements: numbers of their nodes}.
     """
+    making = {"NSET": "NODE", "ELSET": "ELEMENT"}[key]
     names: dict[str, str] = {}  # names in small letters -> names as the file first writes them
-    scopes: dict[bool, dict[str, set[int]]] = {True: {}, False: {}}  # sets of the part, and sets of the assembly
+    found: dict[tuple[bool, str], list[int]] = {}  # (whether the set is of the part, name) -> its cards
     for k, card in enumerate(cards):
-        if key in card.parameters and (k in by_card or card.keyword == key):
-            name, sets = card.parameters[key].lower(), scopes[card.inside]
+        if key in card.parameters and card.keyword in (key, making):
+            name = card.parameters[key].lower()
             names.setdefault(name, card.parameters[key])
-            known = scopes[True] | sets  # data lines may name sets of the part and of the assembly
-            sets.setdefault(name, set()).update(by_card[k] if k in by_card else _members(card, known))
+            found.setdefault((card.inside, name), []).append(k)
+
+    def members(own: tuple[bool, str], outer: tuple[tuple[bool, str], ...]) -> set[int]:
+        together: set[int] = set()
+        for k in () if own in outer else found[own]:
+            numbers, others = _listed(cards[k], of_elements) if cards[k].keyword == key else (by_card.get(k, ()), ())
+            together.update(numbers)
+            for other in others:
+                prefix, _, last = other.rpartition(".")  # the prefix is the name of the part
+                at = next((each for each in ((own[0] or bool(prefix), last), (True, last)) if each in found), None)
+                if at is None:
+                    raise _Wrong(f"*{key} contains {other}, but the file does not define this set; define it")
+                together |= members(at, (*outer, own))
+        return together
+
     part = next((card.parameters.get("NAME", "part") for _, card in _cards_of(cards, "PART")), "")
-    own = {f"{part}.{names[name]}" if name in scopes[False] else names[name]: m for name, m in scopes[True].items()}
-    return own | {names[name]: members for name, members in scopes[False].items()}
+    return {
+        f"{part}.{names[name]}" if inside and (False, name) in found else names[name]: members((inside, name), ())
+        for inside, name in found
+    }
 
 
-def _members(card: _Card, sets: dict[str, set[int]]) -> set[int]:
-    """Return the numbers in a card of a set. A data line contains numbers and names of earlier sets, or with GENERATE
-    the first and last number and the step."""
-    found: set[int] = set()
-    if len(card.parameters.keys() & {"NSET", "ELSET"}) > 1:
-        raise _Wrong(f"*{card.keyword} selects the nodes of an element set, which is not implemented; list the nodes")
-    if not card.inside and "INSTANCE" not in card.parameters:  # numbers without a name are those of reference points
-        card = card._replace(lines=[[cell for cell in line if not cell.isdigit()] for line in card.lines])
+def _listed(card: _Card, of_elements: dict[str, set[int]]) -> tuple[set[int], list[str]]:
+    """Return the numbers and the names of other sets (in small letters) in a card of a set."""
+    if card.keyword == "NSET" and "ELSET" in card.parameters:
+        return of_elements.get(card.parameters["ELSET"].lower(), set()), []
+    numbers, others = set(), []
     for line in card.lines:
         cells = [cell for cell in line if cell]
         if "GENERATE" in card.parameters and cells:
-            found |= _range_of(card, cells)
+            numbers |= _range_of(card, cells)
             continue
         for cell in cells:
-            number = cell.rpartition(".")[2]  # a number or a name may follow the name of its part
-            name = number.lower() if cell.lower() not in sets else cell.lower()
-            if not number.isdigit() and name not in sets:
-                raise _Wrong(f"*{card.keyword} contains {cell}, which is no earlier set; define this set before")
-            found |= {int(number)} if number.isdigit() else sets[name]
-    return found
+            last = cell.rpartition(".")[2]  # a number may follow the name of its part
+            # In the assembly, numbers without the name of an instance are those of reference points.
+            if last.isdigit() and (card.inside or "INSTANCE" in card.parameters or last != cell):
+                numbers.add(int(last))
+            elif not last.isdigit():
+                others.append(cell.lower())
+    return numbers, others
+
+
+def _nodes_of(element_sets: dict[str, set[int]], blocks: dict[int, _Block], labels: list[int]) -> dict[str, set[int]]:
+    """Return {name of a set of elements in small letters: numbers of the nodes of its elements}."""
+    every = {own: nodes for block in blocks.values() for own, nodes in zip(block.labels, block.nodes, strict=True)}
+    return {
+        name.lower(): {labels[node] for own in members & every.keys() for node in every[own].tolist()}
+        for name, members in element_sets.items()
+    }
 
 
 def _range_of(card: _Card, cells: list[str]) -> set[int]:
