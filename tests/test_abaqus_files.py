@@ -51,6 +51,7 @@ def sets_of(tmp_path, cards):
         ("*ELSET, ELSET=hard\nlater\n*ELSET, ELSET=later\n101,\n", {"hard": [0], "later": [0]}),
         ("*ELEMENT, TYPE=S4, ELSET=quad\n9, 11, 12, 15, 13\n*ELSET, ELSET=hard\nquad, 101\n", {"hard": [0]}),
         ("*ELSET, ELSET=hard,\n101, 102\n", {"hard": [0, 1]}),
+        ("*ELSET, ELSET=Lobe.a\n101\n*ELSET, ELSET=hard\nLobe.a\n", {"hard": [0], "Lobe.a": [0]}),
         ("*NODE PRINT, NSET=foot\nU\n*NSET, NSET=foot\n11\n", {"foot": [0]}),
     ],
 )
@@ -132,6 +133,7 @@ def test_quadratic_elements_and_included_files(tmp_path):
         ("*ELEMENT, TYPE=C3D4\n103, 11, 12, 13, 99\n", "contains node 99, but"),
         ("*ELEMENT, TYPE=C3D8\n103, 11, 12, 13, 14, 11, 12, 13, 14\n", "contains hexahedron in addition"),
         ("*ELEMENT, TYPE=C3D27\n103" + 27 * ", 11" + "\n", "contains hexahedron27 in addition"),
+        ("*ELEMENT, TYPE=C3D9\n103" + 9 * ", 11" + "\n", "elements of type C3D9; export tetrahedra"),
         ("*NODE\n16, 1, one, 1\n", "contains a wrong number"),
         ("*NSET, NSET=foot\nnobody\n", "contains nobody, but the file does not define this set"),
         ("*NSET, NSET=foot, GENERATE\n1, 2, 0\n", "give first, last, step"),

@@ -180,8 +180,10 @@ def _kind_of_cells(card: _Card) -> tuple[str, int] | None:
         kind = card.parameters.get("TYPE", "").upper()
         for pattern, names in _CELLS.items():
             match = re.fullmatch(pattern, kind)
+            if match and int(match[1]) not in names:
+                raise _Wrong(f"it contains elements of type {kind}; export tetrahedra of 4 or 10 nodes")
             if match:
-                return names.get(int(match[1]), kind), int(match[1])
+                return names[int(match[1])], int(match[1])
     return None
 
 
@@ -225,8 +227,9 @@ def _sets(
             numbers, others = _listed(cards[k], of_elements) if cards[k].keyword == key else (by_card.get(k, ()), ())
             together.update(numbers)
             for other in others:
-                prefix, _, last = other.rpartition(".")  # the prefix is the name of the part
-                at = next((each for each in ((own[0] or bool(prefix), last), (True, last)) if each in found), None)
+                last = other.rpartition(".")[2]  # the name of the part may precede the name of the set
+                places = ((own[0], other), (True, other), (True, last))
+                at = next((place for place in places if place in found), None)
                 if at is None:
                     raise _Wrong(f"*{key} contains {other}, but the file does not define this set; define it")
                 together |= members(at, (*outer, own))
@@ -244,15 +247,16 @@ def _listed(card: _Card, of_elements: dict[str, set[int]]) -> tuple[set[int], li
     if card.keyword == "NSET" and "ELSET" in card.parameters:
         return of_elements.get(card.parameters["ELSET"].lower(), set()), []
     numbers, others = set(), []
+    # In the assembly, numbers without the name of an instance are those of reference points.
+    of_part = card.inside or "INSTANCE" in card.parameters
     for line in card.lines:
         cells = [cell for cell in line if cell]
-        if "GENERATE" in card.parameters and cells:
-            numbers |= _range_of(card, cells)
+        if "GENERATE" in card.parameters:
+            numbers |= _range_of(card, cells) if cells and of_part else set()
             continue
         for cell in cells:
             last = cell.rpartition(".")[2]  # a number may follow the name of its part
-            # In the assembly, numbers without the name of an instance are those of reference points.
-            if last.isdigit() and (card.inside or "INSTANCE" in card.parameters or last != cell):
+            if last.isdigit() and (of_part or last != cell):
                 numbers.add(int(last))
             elif not last.isdigit():
                 others.append(cell.lower())
