@@ -84,7 +84,7 @@ def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
     noise = np.random.default_rng(0).normal(size=phases.shape) * 0.1 * np.std(phases)
     np.savez(tmp_path / "phases.npz", phases=phases + noise, spacing=H)
     (note,) = wave_field.read_waves(tmp_path / "phases.npz", list(HERTZ)).notes
-    assert "the 9 instants fit a period of 8 steps better" in note
+    assert "a period of 8 steps fits the 9 instants better" in note
 
 
 def test_an_array_of_hdf5_may_name_its_own_unit_spacing_and_frequencies(tmp_path):

@@ -29,7 +29,9 @@ def test_gaps_within_the_organ_are_told():
 def test_voxels_in_no_element_are_told():
     assert not elastography.notes_on_layers(plane_waves((9, 9, 13)))
     (note,) = elastography.notes_on_layers(plane_waves((10, 9, 8)))
-    assert f"{720 - 9 * 9 * 7} of 720 voxels are in no element" in note and "along x (10 voxels), z (8 voxels)" in note
+    assert (
+        f"{720 - 9 * 9 * 7} of 720 voxels are in outer layers" in note and "along x (10 voxels), z (8 voxels)" in note
+    )
 
 
 def test_columns_of_the_table_stay_apart_where_nothing_fits():

@@ -28,8 +28,8 @@ def table() -> str:
         f"{percent(max(r['truth_m'] / r['motion_m'] for r in data['moving']))} at most.",
         "The motion of a freely falling body has a closed form. With lumped masses, a body of few quadratic elements "
         "bends while it falls. The",
-        "estimate shows this error, but it is 1.5 times too large. The reason is a factor that allows for the part of "
-        "other errors that cubic functions do not show.",
+        "estimate shows this error, but it is 1.5 times too large. The reason: the estimate is multiplied by 1.5, "
+        "because in other problems cubic functions show two thirds of the error.",
         "",
         "| case | elements | number of elements | masses | motion | error | effectivity | remaining error |",
         "|---" * 8 + "|",

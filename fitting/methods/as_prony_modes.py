@@ -1,7 +1,7 @@
 """Convert any linear viscoelastic model to Prony modes for the simulation, and compute the largest error in the band.
 
-The relaxation times are fixed, equally spaced on a log axis. The strengths (moduli of the modes) minimise the squares
-of the relative errors of G' and G''; no strength is negative. As long as the same strengths are above zero, the
+The relaxation times are fixed, equally spaced on a log axis. The strengths (moduli of the modes) minimise the sum
+of the squared relative errors of G' and G''; no strength is negative. As long as the same strengths are above zero, the
 strengths are linear in the moduli of the model. So the conversion can be differentiated.
 """
 

@@ -316,7 +316,7 @@ def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: 
     names = ("stress", "strain", "creep") if kind == "relaxation" else ("strain", "stress", "relaxation")
     return [
         f"the {names[0]} is constant and the {names[1]} changes, as in a {names[2]} test: use python -m fitting "
-        f"{names[2]}. This command assumes that the {names[1]} has no noise"
+        f"{names[2]}. The command {kind} assumes that the {names[1]} has no noise"
     ]
 
 

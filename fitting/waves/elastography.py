@@ -123,9 +123,9 @@ def notes_on_layers(field: WaveField) -> list[str]:
     if every - kept < LEFT_OUT * every:
         return []
     return [
-        f"{every - kept} of {every} voxels are in no element. An element needs 3 voxels along an axis and shares the "
-        f"last voxel with the next element, so the last layer along {', '.join(axes)} is ignored: measure an odd "
-        "number of voxels along these axes"
+        f"{every - kept} of {every} voxels are in outer layers without elements. An element needs 3 voxels along an "
+        f"axis and shares the last voxel with the next element, so the last layer along {', '.join(axes)} is ignored: "
+        "measure an odd number of voxels along these axes"
     ]
 
 

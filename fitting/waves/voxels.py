@@ -44,8 +44,9 @@ def voxel_body(
     first = _corner(mask)
     cells = tuple(int(n) for n in (np.array(mask.shape) - 1 - first) // 2)
     if min(cells) < 1:
+        covered = (np.ptp(np.flatnonzero(mask.any(axis=(axis - 2, axis - 1)))) + 1 for axis in range(3))
         raise InputError(
-            f"the mask covers only {' x '.join(map(str, np.array(mask.shape) - first))} voxels: at least "
+            f"the mask covers only {' x '.join(map(str, covered))} voxels: at least "
             "3 are needed along every axis, and 5 or more are better; measure more slices"
         )
     kept = _whole_bricks(mask[tuple(slice(f, None) for f in first)], cells)

@@ -35,7 +35,7 @@ def select(
             there = ", ".join(mesh.node_sets) or "none"
             raise InputError(
                 f"{name}: the mesh has no node set {set!r} (the node sets are: {there}); use one of these sets, or "
-                "where"
+                "select the nodes with where"
             )
         nodes = np.asarray(mesh.node_sets[set])
         if not len(nodes):

@@ -100,7 +100,7 @@ def _graded(
                 f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: correct these numbers"
             )
     largest = min(cell_size, radius / 2)
-    # A ring of radius r has at least 2 pi r / largest cells. This gives a lower bound of the number of prisms.
+    # A ring of radius r has at least 2 pi r / largest cells. This gives a lower bound of the number of tetrahedra.
     _not_too_many(18 * math.ceil(radius / largest) ** 2 * math.ceil(height / cell_size), "radius, height and cell_size")
     _not_too_many(18 * math.ceil(min(radius, height) / rim_cell) ** 2 // 100, "rim_cell")
     radii = graded(radius, dict.fromkeys([*map(float, rings), float(radius)], rim_cell), largest)

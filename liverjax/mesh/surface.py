@@ -13,7 +13,8 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 #: Edges of a triangle, in the order of the middles of its edges.
 _EDGES = ((0, 1), (1, 2), (2, 0))
-#: The same edges in the direction of their functions of order 3, if the triangle's vertices are in increasing order.
+#: The same edges of a triangle with vertices in increasing order, each from its lower to its higher vertex. This is the
+#: direction of the shape function of order 3 of the edge.
 _THIRD = ((0, 1), (1, 2), (0, 2))
 
 

@@ -256,7 +256,8 @@ class NodalForce:
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
         """Return the loss of stiffness due to an eliminated unknown, for example the displacement of an obstacle.
 
-        If `definite` is true, the loss is that of the stiffness from the method `definite`, otherwise from `attached`.
+        The argument `definite` selects the stiffness that loses a part: if true, the stiffness from the method
+        `definite`, otherwise the stiffness from the method `attached`.
         Returns None if there is no such unknown.
         """
         return None
@@ -363,7 +364,8 @@ class Physics:
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Physics":
         """Return the same physics on a mesh with elements of higher order.
 
-        The function `more` adds to n node numbers (n,) the numbers of the new nodes between these nodes.
+        The function `more` takes n node numbers (n,) and returns them, followed by the numbers of the new nodes between
+        these nodes.
         """
         return self
 

@@ -155,7 +155,9 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
             scene = replace(scene, mesh=with_points(scene.mesh, value))
             continue
         if name.startswith("mesh."):
-            raise InputError(f"{_refusal(name)}; of a mesh, only all positions together can change: use mesh.points")
+            raise InputError(
+                f"{_refusal(name)}; a mesh can be changed only through all its positions together: use mesh.points"
+            )
         old = names.get(scene, name, _refusal(name))
         like = (
             tuple(value) if isinstance(old, tuple) else jnp.array(value, float) if isinstance(old, jax.Array) else value
@@ -171,7 +173,9 @@ def numbers_at(scene: Scene, name: str) -> Any:
         InputError: the scene has no value with this name, or the value is not a floating-point number.
     """
     if name.startswith("mesh.") and not name.startswith("mesh.points"):
-        raise InputError(f"{_refusal(name)}; of a mesh, only all positions together can change: use mesh.points")
+        raise InputError(
+            f"{_refusal(name)}; a mesh can be changed only through all its positions together: use mesh.points"
+        )
     found = names.get(scene, name, _refusal(name))
     # A single whole number is allowed (`mu = 770`). Arrays of whole numbers are not allowed: they are node or element
     # numbers.

@@ -35,7 +35,7 @@ class Masses(NamedTuple):
     nodes: jax.Array  # (n, E)
     signs: jax.Array  # (n, E) 1, or -1 for a shape function with reversed direction
     matrix: jax.Array  # (n, n) symmetric
-    size: jax.Array  # (E,) [kg] or [N/m]
+    size: jax.Array  # (E,) [kg] or [N/m] factor of `matrix` in each element
 
 
 #: Stiffness between nodes that is not part of the assembled matrix.

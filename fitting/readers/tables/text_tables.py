@@ -195,7 +195,7 @@ def summary_rows(rows: list[list[str]]) -> dict[int, str]:
 
     The label is a cell before the first number. Only the label of a mean or deviation may also be a later cell, because
     words such as "max" in later cells may be remarks on a measured row. If no row above has a label, all labelled rows
-    below a mean are summaries. A label that another row has too is no summary: it may be the name of a sample.
+    below a mean are summaries. If a label is repeated, no row is a summary: such labels may be names of samples.
     """
     labels = [_label(row) for row in rows]
     end = len(rows)

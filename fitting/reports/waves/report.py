@@ -22,7 +22,7 @@ FEWEST = 3
 #: A node of the map counts as different from the mean of the organ if it differs by more than this many standard
 #: deviations.
 TOLD = 3.0
-#: A warning is given if the springpot misses the moduli over the frequencies by more than this on average (relative).
+#: A warning is given if the mean relative error of the springpot model, over the frequencies, exceeds this value.
 MISSED = 0.03
 
 

@@ -304,8 +304,8 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _nifti(path: Path) -> Content:
-    """Read complex data (nx, ny, nz, 3) or (nx, ny, nz, F, 3) from a NIfTI file. Real data are regarded as labels or a
-    mask. Voxel sizes are in mm, unless the file states another unit."""
+    """Read complex data (nx, ny, nz, 3), or (nx, ny, nz, F, 3) for F frequencies, from a NIfTI file. Real data are
+    regarded as labels or a mask. Voxel sizes are in mm, unless the file states another unit."""
     try:
         import nibabel
     except ImportError:

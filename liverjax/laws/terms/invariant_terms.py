@@ -295,7 +295,8 @@ _UNIT_VECTORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def tangent(s: State | Pieces) -> list[list[Matrix]]:
-    """Return d2W/dF dF [Pa] as nested lists [J][L] of matrices (i, k): `blocks` for unit vectors e_J and e_L."""
+    """Return d2W/dF dF [Pa] as nested lists [J][L] of matrices (i, k). The function `blocks` computes these matrices,
+    with the unit vectors e_J and e_L as shape vectors."""
     pairs = tuple((J, L) for J in range(3) for L in range(3))
     A = blocks(s, list(_UNIT_VECTORS), pairs)
     return [A[3 * J : 3 * J + 3] for J in range(3)]

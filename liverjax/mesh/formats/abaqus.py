@@ -35,7 +35,7 @@ class _Card(NamedTuple):
     keyword: str  # in capital letters
     parameters: dict[str, str]  # names in capital letters
     lines: list[list[str]]  # cells of the data lines
-    inside: bool = True  # whether the card belongs to the part, or to a file without parts; otherwise to the assembly
+    inside: bool = True  # True: the card is in the part, or the file has no parts. False: it is in the assembly.
 
 
 class _Block(NamedTuple):

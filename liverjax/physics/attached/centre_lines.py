@@ -65,7 +65,7 @@ def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.nd
 class _Rings(NamedTuple):
     """r rings with p points on a surface with n corners, and the bands between the rings."""
 
-    points: np.ndarray  # (p, 3) [m] points where edges of the surface cross a level of the distance
+    points: np.ndarray  # (p, 3) [m] where edges of the surface cross a level of the distance from one end of the tube
     ring: np.ndarray  # (p,) number of the ring of each point
     below: np.ndarray  # (r,) number of the band on the side of each ring with smaller distances
     above: np.ndarray  # (r,) number of the band on the other side of each ring
