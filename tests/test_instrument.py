@@ -265,4 +265,4 @@ def test_the_command_widens_the_errors_by_the_gap(tmp_path, capsys):
     assert errors[1]["ratios"] == pytest.approx(errors[0]["ratios"])
     for wrong in ("0.005", "-1"):
         assert main([*plain, "--gap-error", wrong, "--out", str(tmp_path)]) == 2
-        assert "must be in metres, and below --height" in capsys.readouterr().err
+        assert "must be 0 or more and below --height" in capsys.readouterr().err

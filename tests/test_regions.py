@@ -70,6 +70,8 @@ def test_one_number_of_a_list_of_a_region_has_a_name():
     assert numbers_at(scene, f"{name}.1") == 0.04
     changed = with_parameters(scene, {f"{name}.0": 0.9})
     assert np.array_equal(numbers_at(changed, name), [0.9, 0.04])
+    whole = replace(scene, region=(replace(region[0], viscosity={"relaxation_times": np.array([20, 2])}),))
+    assert np.array_equal(numbers_at(with_parameters(whole, {f"{name}.1": 0.5}), name), [20, 0.5])
     with pytest.raises(lj.InputError, match="'2' is not a name or index here: use an index from 0 to 1"):
         numbers_at(scene, f"{name}.2")
 

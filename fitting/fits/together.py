@@ -281,7 +281,7 @@ def noises(
     `taken`: Jacobian of the residuals, or effective number of parameters."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals[: counts.sum()], np.cumsum(counts)[:-1])
-    freedoms = degrees_of_freedom(taken, counts) if np.ndim(taken) else counts * (1 - taken / counts.sum())
+    freedoms = degrees_of_freedom(np.asarray(taken), counts) if np.ndim(taken) else counts * (1 - taken / counts.sum())
     found = [s if f < LEAST_FREEDOM else s * _size_of_noise(r, f) for r, s, f in zip(left, used, freedoms, strict=True)]
     return np.maximum(found, [least_noise(test) for test in tests])
 

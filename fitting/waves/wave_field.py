@@ -267,7 +267,7 @@ def _of_a_last_instant(u: np.ndarray) -> list[str]:
     if not missed(T - 1) < _REPEATED * missed(T):
         return []
     return [
-        f"a period of {T - 1} steps fits the {T} instants better than a period of {T} steps. If the last instant is the "
+        f"a period of {T - 1} steps fits the {T} instants better than {T} steps. If the last instant is the "
         "end of the period, this instant repeats the first one: remove the last instant"
     ]
 

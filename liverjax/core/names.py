@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -33,7 +34,8 @@ class PathStep(NamedTuple):
         if isinstance(owner, tuple):
             return (*owner[:key], value, *owner[key + 1 :])
         numbers = jnp.asarray(owner)
-        numbers = numbers.astype(float) if jnp.issubdtype(numbers.dtype, jnp.integer) else numbers
+        if jnp.issubdtype(numbers.dtype, jnp.integer) and not _is_whole(value):
+            numbers = numbers.astype(float)
         return numbers.at[key].set(jnp.asarray(value, numbers.dtype))
 
 
@@ -145,6 +147,11 @@ def _keys_of_struct(thing: Any, path: list[str], refusal: str, before: str) -> t
         raise InputError(f"{refusal}: {hint(word, known, before)}")
     places = next((len(getattr(thing, f.name)) for f in fields if isinstance(getattr(thing, f.name), tuple)), 0)
     raise InputError(f"{refusal}: {_nowhere(word, places)}")
+
+
+def _is_whole(value: object) -> bool:
+    """Return whether a value is known (no JAX tracer) and is a whole number."""
+    return not isinstance(value, jax.core.Tracer) and bool(np.all(np.asarray(value) == np.rint(np.asarray(value))))
 
 
 def _is_place(word: str) -> bool:

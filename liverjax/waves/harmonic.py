@@ -84,7 +84,8 @@ def harmonic(
         about: positions (V, 3) [m] about which the body vibrates: an equilibrium after a long time, for example from
             `simulate`. The stress in this state changes the stiffness; the fluid pressure is 0. Default: the state of
             rest under gravity and pre-tension, from a static run. Without both, this run is not done and the reference
-            shape is used. If the components of gravity are JAX tracers (inside jit, grad or vmap), the run is always done.
+            shape is used. If the components of gravity are JAX tracers (inside jit, grad or vmap), the run is always
+            done.
         motion: complex amplitudes (V, 3) or (F, V, 3) [m] that replace the prescribed motion of the scene.
         mass: "consistent" (mass matrix of each element), or "lumped" as in transient runs.
 
