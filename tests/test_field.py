@@ -401,7 +401,7 @@ def test_few_numbers_of_several_scenes(problem):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the error of the mesh changes")
+@pytest.mark.filterwarnings("ignore:the error of the (mesh|time step) changes")
 def test_viscosity_from_a_time_series(tmp_path):
     """A block creeps under its weight. Ratio and relaxation time are estimated from a few nodes over time."""
     text = _SCENE.format(mu=800.0, gravity="4, 0, -3")

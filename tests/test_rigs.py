@@ -16,7 +16,8 @@ from fitting.readers.rheometer import Sweep
 from fitting.rigs import glued, torsion
 from liverjax.core.struct import replace
 
-pytestmark = pytest.mark.quick_to_compile
+# The data come from the same time steps, so the error that the steps cause is not in these fits.
+pytestmark = [pytest.mark.quick_to_compile, pytest.mark.filterwarnings("ignore:the error of the time step changes")]
 
 LAW = lj.laws.NeoHookean(mu=jnp.asarray(800.0), bulk=jnp.asarray(2400.0))
 PRONY = lj.Prony(ratios=jnp.array([0.4]), relaxation_times=jnp.array([0.5]))
