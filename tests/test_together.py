@@ -96,7 +96,7 @@ def test_the_noise_of_a_short_test_does_not_run_to_zero(points):
         loud = loud._replace(storage=loud.storage * (1 + 0.1 * noise[0]), loss=loud.loss * (1 + 0.1 * noise[1]))
         few = TimeTest("relaxation", at, np.ones(len(at)), modulus(at) * (1 + 0.03 * noise[2, : len(at)]), at > 0)
         fit = together.fit([loud, few], 2)
-        assert fit.shares[1].noise > 0.005
+        assert fit.shares[1].noise > (0.029 if points == 4 else 0.005)
         off.append((fit.uncertainty.values - [800, 0.3, 0.4, 30, 0.1]) / fit.uncertainty.standard_errors)
     assert np.abs(off).max() < 4.5 and np.sqrt(np.mean(np.square(off))) < 1.5
 

@@ -122,10 +122,16 @@ def _of_discretisation(problem: Problem, values: Content, fitted: tuple[Estimate
         estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, left_out), mesh_over_noise=size)
     if any(scene.solve.dt is not None for scene in problem.scenes):
         rows = [
-            change_with_small_steps(lj.with_parameters(scene, values), partial(_all_differences, data, scene))
+            np.zeros(np.size(data.measured))
+            if scene.solve.dt is None
+            else change_with_small_steps(lj.with_parameters(scene, values), partial(_all_differences, data, scene))
             for scene, data in zip(problem.scenes, problem.data, strict=True)
         ]
-        estimate = estimate._replace(time_step_bias=mesh_bias(found, natural_of, np.concatenate(rows)))
+        if np.all(np.isfinite(np.concatenate(rows))):
+            return estimate._replace(time_step_bias=mesh_bias(found, natural_of, np.concatenate(rows)))
+        warnings.warn(
+            "the effect of the time step on the fit is unknown: the run with half the step failed", stacklevel=3
+        )
     return estimate
 
 

@@ -276,14 +276,15 @@ def _size_of_noise(residuals: np.ndarray, freedom: float) -> float:
 def noises(
     tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, taken: np.ndarray | float
 ) -> np.ndarray:
-    """Return the noise of each test, relative to its scales: the root of the sum of its squared residuals divided by
-    its degrees of freedom. A test with less than `LEAST_FREEDOM` keeps its noise `used`, which was used in the fit.
-    `taken`: Jacobian of the residuals, or effective number of parameters."""
+    """Return the noise of each test, relative to its scales: the root of its squared residuals per degree of freedom.
+    With less than `LEAST_FREEDOM`, this noise is at least `first_noise`. `used`: noise in the fit. `taken`: Jacobian of
+    the residuals, or effective number of parameters."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals[: counts.sum()], np.cumsum(counts)[:-1])
     freedoms = degrees_of_freedom(np.asarray(taken), counts) if np.ndim(taken) else counts * (1 - taken / counts.sum())
-    found = [s if f < LEAST_FREEDOM else s * _size_of_noise(r, f) for r, s, f in zip(left, used, freedoms, strict=True)]
-    return np.maximum(found, [least_noise(test) for test in tests])
+    known = freedoms >= LEAST_FREEDOM
+    found = [s * _size_of_noise(r, f) for r, s, f in zip(left, used, np.where(known, freedoms, counts), strict=True)]
+    return np.maximum(found, [least_noise(t) if k else first_noise(t) for t, k in zip(tests, known, strict=True)])
 
 
 def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
@@ -333,11 +334,9 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
         }
         for f in tried
     ]
-    out = (
-        []
-        if chosen.converged
-        else ["the fit did not converge, and the parameters with the smallest misfit are given: try fewer modes"]
-    )
+    out: list[str] = []
+    if not chosen.converged:
+        out.append("the fit did not converge, and the parameters with the smallest misfit are given: try fewer modes")
     out += disagreements(chosen.shares)
     out += missed(chosen.shares)
     out += structured(chosen)

@@ -24,16 +24,14 @@ def change_with_small_steps(scene: Scene, readings: Callable[[lj.Result], jax.Ar
     """Estimate how each reading of a run would change with infinitely small time steps.
 
     Args:
-        scene: a scene with known numbers (not inside jit, grad or vmap).
+        scene: a scene with time steps, with known numbers (not inside jit, grad or vmap).
         readings: function from a run of T steps to its readings, with any shape (T, …).
 
     Returns:
-        The change, in the shape of the readings. It is 0 if the scene has no time steps, and NaN if a run fails.
+        The change, in the shape of the readings. It is NaN if a run fails.
     """
     run = lj.simulate(scene)
     coarse = np.asarray(readings(run))
-    if scene.solve.dt is None:
-        return np.zeros(coarse.shape)
     fine = lj.simulate(replace(scene, solve=replace(scene.solve, dt=scene.solve.dt / 2, steps=2 * scene.solve.steps)))
     if np.any(np.concatenate([run.status, fine.status]) != status.CONVERGED):
         return np.full(coarse.shape, np.nan)
