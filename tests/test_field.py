@@ -138,7 +138,7 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
     np.testing.assert_allclose(found.sd, np.sqrt(np.diag(covariance)), rtol=0.02)
     assert np.all(found.sd < found.prior_sd)
     values = field.values_at(problem, "law.mu", base, jnp.asarray(found.log_factor))
-    bias = covariance @ J.T @ scene_numbers.missing(problem, values)
+    bias = covariance @ J.T @ scene_numbers.discretisation_errors(problem, values).mesh
     # Conjugate gradients stop at a relative residual of 0.01.
     assert np.linalg.norm(found.mesh_bias - bias) < 0.02 * np.linalg.norm(bias)
 
@@ -263,23 +263,27 @@ def test_a_scene_without_an_answer_is_no_map(problem, monkeypatch):
         field.estimate(problem, length=0.02, mesh_error=False)
 
 
-def test_the_error_of_the_mesh_counts_as_noise(problem, monkeypatch):
-    """The mesh error is one value per scene, over the measured components. Without an estimate nothing changes."""
+def test_the_errors_of_mesh_and_time_step_count_as_noise(problem, monkeypatch):
+    """Each error is one value per scene, over the measured components. Without estimates nothing changes."""
     first, second = problem.data
     sd = first.sd.copy()
     sd[0] = np.inf  # not measured
     own = problem._replace(data=(first._replace(sd=sd), second))
-    left_out = np.concatenate([np.full(first.measured.size, 3.0), np.full(second.measured.size, 0.5)])
-    left_out[:3] = 0.0
-    monkeypatch.setattr(scene_numbers, "missing_or_none", lambda *_: left_out)
-    found, sizes = scene_numbers.with_mesh_as_noise(own)
-    np.testing.assert_allclose(sizes, [3.0, 0.5], rtol=1e-12)
-    assert np.all(np.isinf(found.data[0].sd[0]))
-    np.testing.assert_allclose(found.data[0].sd[1:], np.sqrt(10) * sd[1:], rtol=1e-12)
-    np.testing.assert_allclose(found.data[1].sd, np.sqrt(1.25) * second.sd, rtol=1e-12)
-    monkeypatch.setattr(scene_numbers, "missing_or_none", lambda *_: None)
-    same, sizes = scene_numbers.with_mesh_as_noise(own)
-    assert same is own and np.all(np.isnan(sizes))
+    of_mesh = np.concatenate([np.full(first.measured.size, 3.0), np.full(second.measured.size, 0.5)])
+    of_mesh[:3] = 0.0
+    errors = [
+        scene_numbers.Discretisation(of_mesh, None),
+        scene_numbers.Discretisation(of_mesh, 2.0 * (of_mesh > 0)),
+        scene_numbers.Discretisation(None, None),
+    ]
+    for mesh, steps, factors in zip((3.0, 3.0, 0.0), (0.0, 2.0, 0.0), ((10, 1.25), (14, 5.25), (1, 1)), strict=True):
+        monkeypatch.setattr(scene_numbers, "discretisation_errors", lambda *_: errors.pop(0))
+        found, sizes = scene_numbers.with_discretisation_as_noise(own)
+        assert [one.get("mesh", 0.0) for one in sizes] == pytest.approx([mesh, mesh / 6])
+        assert all(set(one) == {k for k, e in (("mesh", mesh), ("time_step", steps)) if e} for one in sizes)
+        assert np.all(np.isinf(found.data[0].sd[0]))
+        for data, before, factor in zip(found.data, own.data, factors, strict=True):
+            np.testing.assert_allclose(data.sd[1:], np.sqrt(factor) * before.sd[1:], rtol=1e-12)
 
 
 @pytest.mark.draws
@@ -292,7 +296,7 @@ def test_a_map_is_written_at_the_nodes_of_its_mesh(tmp_path, order):
     m = prior.field_at_nodes(p, rng.normal(size=mesh.number_of_vertices))
     none, E = np.zeros_like(m), mesh.number_of_elements
     nowhere, rest = np.zeros(E, bool), (0.1, 0.02, 1.0, 9, True, 0.0, [], np.ones(3), (0,), 1.0)
-    found = field.Field("law.mu", m, np.ones(E), none + 0.1, none + 1, none, *rest, nowhere)
+    found = field.Field("law.mu", m, np.ones(E), none + 0.1, none + 1, none, none, *rest, nowhere)
     field_report.write(tmp_path, mesh, {}, found)
     with h5py.File(tmp_path / "field.h5") as f:
         factor = f["factor"][:]
@@ -320,7 +324,8 @@ def test_a_sphere_starts_where_the_map_is_known(problem):
     corner = np.linalg.norm(X, axis=1) < 0.015
     m = np.where(near, 1.0, np.where(corner, -2.0, 0.0))
     sd = np.where(corner, 3.0, 0.1)
-    found = field.Field("law.mu", m, m, sd, sd, None, 1.6, 0.02, 1.0, 9, True, 0.0, [], np.ones(3), (0,), 1.0, m > 9)
+    rest = (1.6, 0.02, 1.0, 9, True, 0.0, [], np.ones(3), (0,), 1.0)
+    found = field.Field("law.mu", m, m, sd, sd, None, None, *rest, m > 9)
     start = inclusion.start_from(problem, found)
     assert np.linalg.norm(start[:3] - [0.03, 0.02, 0.02]) < 0.01 and start[5] > 0
 

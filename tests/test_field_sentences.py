@@ -49,10 +49,17 @@ def test_a_fit_that_misses_the_data_says_so():
     ],
 )
 def test_a_map_whose_level_is_open_says_so_and_the_mesh_is_blamed_for_its_own_share(sd, bias, level, mesh):
-    found = SimpleNamespace(sd=np.array(sd), mesh_bias=np.array(bias))
+    found = SimpleNamespace(sd=np.array(sd), mesh_bias=np.array(bias), time_step_bias=None)
     assert (field.level_sentence(found) is not None) == level
-    said = field.bias_sentence(found)
-    assert said is None if mesh is None else mesh in said
+    said = field.map_bias_sentences(found)
+    assert said == [] if mesh is None else len(said) == 1 and mesh in said[0]
+    stepped = SimpleNamespace(sd=np.array(sd), mesh_bias=None, time_step_bias=np.array(bias))
+    assert field.map_bias_sentences(stepped) == [
+        one.replace("refine the mesh", "use smaller time steps")
+        .replace("mesh", "time step")
+        .replace("time step_", "time_step_")
+        for one in said
+    ]
 
 
 def test_a_number_is_named_once(tmp_path, capsys):

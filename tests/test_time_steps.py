@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from fitting.fits import joint, scene_numbers
+from fitting.fits import field, joint, scene_numbers
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.displacements import Displacements
 from fitting.rigs import glued
@@ -64,10 +64,8 @@ def test_a_run_that_fails_gives_no_estimate():
     assert np.all(np.isnan(change_with_small_steps(pulled, tops)))
 
 
-@pytest.mark.filterwarnings("ignore:the error of the mesh changes")
-def test_a_fit_states_what_its_time_step_does_to_the_numbers():
-    """The data come from steps of 1/32. Ratio and relaxation time are wrong by more than their standard errors, as
-    stated, and a third remains after correction."""
+def with_fine_data(sd: float) -> scene_numbers.Problem:
+    """The block in 12 steps, and exact displacements of its top from steps of 1/32."""
     coarse, n = block(0.05, 12, "backward_euler"), 12
     fine = lj.simulate(block(0.05 / 32, 12 * 32, "backward_euler")).check().positions[31::32]
     nodes = np.asarray(coarse.mesh.node_sets["z_max"])
@@ -77,11 +75,31 @@ def test_a_fit_states_what_its_time_step_does_to_the_numbers():
         nodes=np.tile(nodes[:, None], (n, 4)),
         weights=np.tile([[1.0, 0.0, 0.0, 0.0]], (n * len(nodes), 1)),
         measured=moved.reshape(-1, 3),
-        sd=np.full((n * len(nodes), 3), 1e-6),
+        sd=np.full((n * len(nodes), 3), sd),
     )
+    return scene_numbers.Problem((coarse,), (data,))
+
+
+def test_a_map_states_what_its_time_step_does_to_it():
+    """The truth is uniform, and the data come from the same mesh. Without its bias, the map is closer to the truth."""
+    problem = with_fine_data(2e-5)
+    found = field.estimate(problem, length=0.03, max_iterations=20, modes=5)
+    off, left = (np.sqrt(np.mean(m**2)) for m in (found.log_factor, found.log_factor - found.time_step_bias))
+    assert off > 0.01 and left < 0.5 * off, (off, left)
+    noisy, sizes = scene_numbers.with_discretisation_as_noise(problem)
+    true = np.sqrt(np.mean(np.asarray(scene_numbers.misfit(problem, {})[0]) ** 2))
+    assert true > 0.1 and abs(sizes[0]["time_step"] - true) < 0.35 * true, (sizes, true)
+    error = np.sqrt(sum(size**2 for size in sizes[0].values()))
+    np.testing.assert_allclose(noisy.data[0].sd, 2e-5 * np.hypot(1.0, error), rtol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:the error of the mesh changes")
+def test_a_fit_states_what_its_time_step_does_to_the_numbers():
+    """The data come from steps of 1/32. Ratio and relaxation time are wrong by more than their standard errors, as
+    stated, and a third remains after correction."""
     names = ["viscosity.ratios", "viscosity.relaxation_times"]
     with pytest.warns(UserWarning, match="the error of the time step changes "):
-        found = scene_numbers.fit_numbers(scene_numbers.Problem((coarse,), (data,)), names)
+        found = scene_numbers.fit_numbers(with_fine_data(1e-6), names)
     off = found.values - [0.5, 0.3]
     assert np.all(np.abs(off) > 3 * found.standard_errors)
     assert np.all(np.abs(off - found.time_step_bias) < 0.5 * np.abs(off)), (off, found.time_step_bias)

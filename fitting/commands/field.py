@@ -114,34 +114,45 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     file = options.out / "progress.h5"
     bar, told = cost_bar("iterations")
     how = field.MapOptions(max_iterations=options.iterations, file=file, resume=options.resume, progress=told)
-    problem, beside = scene_numbers.with_mesh_as_noise(problem)
-    if max(beside) > _TOLD:
-        linear = any(scene.mesh.order == 1 for scene in problem.scenes)
-        remedy = "a finer mesh, or order = 2," if linear else "a finer mesh"
-        finer = f"; {remedy} would give more information" if max(beside) > 1 else ""
-        print(
-            f"note: the error of the mesh is {max(beside):.2g} times the noise, and is treated as noise{finer}",
-            file=sys.stderr,
-        )
+    problem, beside = scene_numbers.with_discretisation_as_noise(problem)
+    _tell_sizes(problem, beside)
     with bar:
         found = field.estimate(problem, options.name, length, how)
     good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR
     print(field_report.table_of_field(mesh, found))
-    content = _files(options) | {"map": field_report.of_field(mesh, found) | {"mesh_error_over_noise": beside}}
+    sizes = {f"{kind}_error_over_noise": [each[kind] for each in beside] for kind in beside[0]}
+    content = _files(options) | {"map": field_report.of_field(mesh, found) | sizes}
     _warn(field_report.noise_sentence(found))
     _warn(field.distance_sentence(found))
     _warn(field.level_sentence(found))
-    _warn(field.bias_sentence(found))
+    for sentence in field.map_bias_sentences(found):
+        _warn(sentence)
     if options.sphere:
         sphere = inclusion.estimate(problem, options.name, inclusion.start_from(problem, found))
         print(field_report.table_of_numbers(sphere))
-        with_mesh = max(beside) > _TOLD
+        with_mesh = any(size > _TOLD for each in beside for size in each.values())
         _warn(field_report.misfit_sentence(sphere, with_mesh))
         content["sphere"] = field_report.of_numbers(sphere, with_mesh)
         good = good and sphere.converged
     field_report.write(options.out, mesh, content, found)
     print(f"written: {options.out}/field.json, field.vtu, field.h5, field.png")
     return 0 if good else 1
+
+
+def _tell_sizes(problem: Problem, beside: list[dict[str, float]]) -> None:
+    """Print a note if the errors of the meshes or the time steps are large compared with the noise. `beside`: their
+    sizes in each scene, divided by the noise."""
+    linear = any(scene.mesh.order == 1 for scene in problem.scenes)
+    remedies = {"mesh": "a finer mesh, or order = 2," if linear else "a finer mesh", "time_step": "smaller time steps"}
+    for kind in beside[0]:
+        size = max(each[kind] for each in beside)
+        if size > _TOLD:
+            finer = f"; {remedies[kind]} would give more information" if size > 1 else ""
+            print(
+                f"note: the error of the {kind.replace('_', ' ')} is {size:.2g} times the noise, and is treated as "
+                f"noise{finer}",
+                file=sys.stderr,
+            )
 
 
 def _warn(sentence: str | None) -> None:

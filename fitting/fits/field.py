@@ -14,7 +14,7 @@ uncertainty comes from the same Hessian. Lanczos iterations find the largest eig
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse.linalg
 
-from fitting.fits.scene_numbers import Problem, misfit, missing_or_none, with_solvers
+from fitting.fits.scene_numbers import Problem, discretisation_errors, misfit, with_solvers
 from fitting.methods import prior as smooth
 from fitting.methods.estimate import LARGEST_BIAS
 from liverjax.core import status
@@ -56,6 +56,7 @@ class Field(NamedTuple):
     sd: np.ndarray  # standard deviation (V,) of m at the nodes, from data and prior
     prior_sd: np.ndarray  # standard deviation (V,) of m at the nodes, from the prior alone
     mesh_bias: np.ndarray | None  # error of m (V,) due to the meshes, to be subtracted from m; None: unknown
+    time_step_bias: np.ndarray | None  # the same due to the time steps; None: unknown, or no scene has time steps
     deviation: float  # standard deviation of m in the prior, chosen from `DEVIATIONS`
     length: float  # correlation length of the prior [m]
     chi2: float
@@ -263,7 +264,7 @@ class MapOptions(NamedTuple):
     #: Called after each iteration with the index of the standard deviation in `DEVIATIONS` and with chi^2 per
     #: component.
     progress: Callable[[int, float], None] = lambda weight, chi2: None
-    mesh_error: bool = True  # whether to estimate the error due to the meshes (`mesh_bias`)
+    mesh_error: bool = True  # whether to estimate the errors due to the meshes and the time steps
 
 
 def estimate(
@@ -313,7 +314,7 @@ def estimate(
         given=given,
         sd=deviation * np.sqrt(after),
         prior_sd=deviation * np.sqrt(before),
-        mesh_bias=_bias_of_map(search, here, values, vectors) if options.mesh_error else None,
+        **(_biases_of_map(search, here, values, vectors) if options.mesh_error else _NO_BIASES),
         deviation=deviation,
         length=length,
         chi2=chi2,
@@ -389,14 +390,21 @@ def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: n
     return scipy.sparse.linalg.cg(hessian, g, rtol=1e-2, maxiter=30, M=inverse)[0]
 
 
-def _bias_of_map(search: _Search, here: _LinearRuns, values: np.ndarray, vectors: np.ndarray) -> np.ndarray | None:
-    """Return the change of the field m (V,) due to the error of the meshes: (I + J^T J)^-1 J^T times this error in the
-    residuals. Returns None if this error is unknown."""
-    left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, here.m))
-    if left_out is None or not np.all(np.isfinite(left_out)):
-        return None
-    z = _by_hessian(here, here.pull(left_out), values, vectors)
-    return here.deviation * smooth.field_at_nodes(here.p, z)
+_NO_BIASES: dict[str, np.ndarray | None] = {"mesh_bias": None, "time_step_bias": None}
+
+
+def _biases_of_map(
+    search: _Search, here: _LinearRuns, values: np.ndarray, vectors: np.ndarray
+) -> dict[str, np.ndarray | None]:
+    """Return the changes of the field m (V,) due to the errors of the meshes and of the time steps: (I + J^T J)^-1 J^T
+    times these errors in the residuals. Unknown changes are None."""
+    biases = dict(_NO_BIASES)
+    errors = discretisation_errors(search.problem, values_at(search.problem, search.name, search.base, here.m))
+    for kind, error in errors._asdict().items():
+        if error is not None:
+            z = _by_hessian(here, here.pull(error), values, vectors)
+            biases[f"{kind}_bias"] = here.deviation * smooth.field_at_nodes(here.p, z)
+    return biases
 
 
 def distance_sentence(found: Field) -> str | None:
@@ -426,22 +434,28 @@ def level_sentence(found: Field) -> str | None:
     )
 
 
-def bias_sentence(found: Field) -> str | None:
-    """Return a warning if the mesh error changes the map at some node by more than the standard deviation there.
-    Returns None if the change is smaller everywhere, or if the mesh error is unknown.
-    """
-    if found.mesh_bias is None:
-        return None
-    beyond = np.abs(found.mesh_bias) > found.sd
+def map_bias_sentences(found: Field) -> list[str]:
+    """Return a warning for the mesh and one for the time step if its error changes the map at some node by more than
+    the standard deviation there."""
+    sources = (
+        (found.mesh_bias, "mesh", "mesh_bias", "refine the mesh"),
+        (found.time_step_bias, "time step", "time_step_bias", "use smaller time steps"),
+    )
+    return [said for bias, *words in sources if bias is not None and (said := _bias_sentence(found.sd, bias, words))]
+
+
+def _bias_sentence(sd: np.ndarray, bias: np.ndarray, words: Sequence[str]) -> str | None:
+    what, name, remedy = words
+    beyond = np.abs(bias) > sd
     if not beyond.any():
         return None
-    largest = np.abs(found.mesh_bias)[beyond].max()
+    largest = np.abs(bias)[beyond].max()
     if largest > LARGEST_BIAS:
         return (
-            f"the mesh error changes the map by a third or more ({largest:.0%}), which is too much to correct: refine "
-            "the mesh"
+            f"the {what} error changes the map by a third or more ({largest:.0%}), which is too much to correct: "
+            f"{remedy}"
         )
     return (
-        f"the mesh error changes the map by up to {largest:.0%}, and by more than the standard deviation at "
-        f"{beyond.mean():.0%} of the nodes: subtract mesh_bias from the logarithm of the map, or refine the mesh"
+        f"the {what} error changes the map by up to {largest:.0%}, and by more than the standard deviation at "
+        f"{beyond.mean():.0%} of the nodes: subtract {name} from the logarithm of the map, or {remedy}"
     )

@@ -19,7 +19,7 @@ from fitting.readers.displacements import Displacements, weighted_differences
 from fitting.rigs.time_steps import change_with_small_steps
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Content
+from liverjax.core.struct import Content, replace
 from liverjax.scenes.scene import Scene, numbers_at
 from liverjax.simulation.automatic import with_solver
 
@@ -116,27 +116,13 @@ def _of_discretisation(problem: Problem, values: Content, fitted: tuple[Estimate
     has time steps. `values`: parameters of the scenes. `fitted`: estimate, solution, and function from u to the
     reported parameters."""
     estimate, found, natural_of = fitted
-    left_out = missing_or_none(problem, values)
-    if left_out is not None:
-        size = float(np.sqrt(np.sum(left_out**2) / problem.components))
-        estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, left_out), mesh_over_noise=size)
-    if any(scene.solve.dt is not None for scene in problem.scenes):
-        rows = [
-            np.zeros(np.size(data.measured))
-            if scene.solve.dt is None
-            else change_with_small_steps(lj.with_parameters(scene, values), partial(_all_differences, data, scene))
-            for scene, data in zip(problem.scenes, problem.data, strict=True)
-        ]
-        if np.all(np.isfinite(np.concatenate(rows))):
-            return estimate._replace(time_step_bias=mesh_bias(found, natural_of, np.concatenate(rows)))
-        warnings.warn(
-            "the effect of the time step on the fit is unknown: the run with half the step failed", stacklevel=3
-        )
+    of_mesh, of_steps = discretisation_errors(problem, values)
+    if of_mesh is not None:
+        size = float(np.sqrt(np.sum(of_mesh**2) / problem.components))
+        estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, of_mesh), mesh_over_noise=size)
+    if of_steps is not None:
+        estimate = estimate._replace(time_step_bias=mesh_bias(found, natural_of, of_steps))
     return estimate
-
-
-def _all_differences(data: Displacements, scene: Scene, result: lj.Result) -> jax.Array:
-    return weighted_differences(data, scene, result.positions)
 
 
 def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, estimate: Estimate) -> Estimate:
@@ -196,49 +182,67 @@ def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, 
     return np.concatenate(places)[seen], of.ravel()[seen]
 
 
-def missing(problem: Problem, values: Content) -> np.ndarray:
-    """Return the errors (n,) of the n residuals due to the meshes, for scenes with the parameters `values`."""
-    rows = []
-    for scene, data in zip(problem.scenes, problem.data, strict=True):
-        scene = lj.with_parameters(scene, values)
-        result = lj.simulate(scene, mesh_error=True)
-        assert result.mesh_error is not None
-        both = (
-            weighted_differences(data, scene, x)
-            for x in (result.positions + result.mesh_error.positions, result.positions)
+class Discretisation(NamedTuple):
+    """Errors of the n residuals that the meshes and the time steps cause."""
+
+    mesh: np.ndarray | None  # (n,); None: unknown
+    time_step: np.ndarray | None  # (n,); None: unknown, or no scene has time steps
+
+
+def discretisation_errors(problem: Problem, values: Content) -> Discretisation:
+    """Return the errors of the residuals due to the meshes and the time steps, for scenes with the parameters `values`.
+    The function warns if an error is unknown."""
+    both = [
+        _errors_in(lj.with_parameters(scene, values), data)
+        for scene, data in zip(problem.scenes, problem.data, strict=True)
+    ]
+    of_mesh, of_steps = (np.concatenate(rows) for rows in zip(*both, strict=True))
+    timed = any(scene.solve.dt is not None for scene in problem.scenes)
+    if timed and not np.all(np.isfinite(of_steps)):
+        warnings.warn(
+            "the effect of the time step on the fit is unknown: the run with half the step failed", stacklevel=3
         )
-        more, less = (np.asarray(r) for r in both)
-        rows.append(more - less)
-    return np.concatenate(rows)
+    known = Discretisation(of_mesh, of_steps if timed else None)
+    return Discretisation(*(e if e is not None and np.all(np.isfinite(e)) else None for e in known))
 
 
-def missing_or_none(problem: Problem, values: Content) -> np.ndarray | None:
-    """Return the errors (n,) of the n residuals due to the meshes (`missing`). If the mesh error of a scene cannot be
-    estimated, the function warns and returns None."""
+def _errors_in(scene: Scene, data: Displacements) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of the n residuals of a scene due to the mesh (n,), and due to the time steps (n,). Unknown
+    errors are NaN. If the mesh error is unknown, the function warns."""
+    readings = partial(_all_differences, data, scene)
     try:
-        return missing(problem, values)
+        run = lj.simulate(scene, mesh_error=True)
+        assert run.mesh_error is not None
+        exact = replace(run, positions=run.positions + run.mesh_error.positions)
+        of_mesh, cause = np.asarray(readings(exact)) - np.asarray(readings(run)), "its estimate failed"
     except InputError as e:
-        warnings.warn(f"the effect of the mesh error on the fit is unknown: {e}", stacklevel=3)
-        return None
+        run, of_mesh, cause = None, np.full(np.size(data.measured), np.nan), str(e)
+    if not np.all(np.isfinite(of_mesh)):
+        warnings.warn(f"the effect of the mesh error on the fit is unknown: {cause}", stacklevel=4)
+    steady = scene.solve.dt is None
+    return of_mesh, np.zeros_like(of_mesh) if steady else change_with_small_steps(scene, readings, run)
 
 
-def with_mesh_as_noise(problem: Problem) -> tuple[Problem, list[float]]:
-    """Return the problem with larger noise, which contains the mesh error, and the size of this error in each scene,
-    divided by the stated noise [1].
+def _all_differences(data: Displacements, scene: Scene, result: lj.Result) -> jax.Array:
+    return weighted_differences(data, scene, result.positions)
 
-    The size is a root mean square over the measured components, for the parameters in the scenes. Without the added
-    noise, a map would compensate the mesh error by a false stiffness. If the mesh error cannot be estimated, a warning
-    is given, the problem stays unchanged, and the sizes are NaN.
+
+def with_discretisation_as_noise(problem: Problem) -> tuple[Problem, list[dict[str, float]]]:
+    """Return the problem with larger noise, which contains the errors of the meshes and the time steps. Also return the
+    sizes of the errors that are known in each scene, divided by the stated noise [1], with the keys of
+    `Discretisation`.
+
+    A size is a root mean square over the measured components, for the parameters in the scenes. Without the added
+    noise, a map would compensate these errors by a false stiffness. If an error cannot be estimated, a warning is
+    given, and this error is not added.
     """
-    left_out = missing_or_none(problem, {})
-    if left_out is None or not np.all(np.isfinite(left_out)):
-        return problem, [np.nan] * len(problem.data)
+    errors = {kind: e for kind, e in discretisation_errors(problem, {})._asdict().items() if e is not None}
     data, sizes, begin = [], [], 0
     for one in problem.data:
-        own = left_out[begin : begin + np.size(one.measured)]
-        begin += np.size(one.measured)
-        sizes.append(float(np.sqrt(np.sum(own**2) / one.components)))
-        data.append(one._replace(sd=one.sd * np.hypot(1.0, sizes[-1])))
+        own = slice(begin, begin + np.size(one.measured))
+        begin = own.stop
+        sizes.append({kind: float(np.sqrt(np.sum(e[own] ** 2) / one.components)) for kind, e in errors.items()})
+        data.append(one._replace(sd=one.sd * np.sqrt(1.0 + sum(size**2 for size in sizes[-1].values()))))
     return problem._replace(data=tuple(data)), sizes
 
 

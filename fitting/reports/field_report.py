@@ -126,7 +126,10 @@ def of_field(mesh: TetMesh, found: Field) -> Content:
         "largest_standard_deviation_of_ln": float(np.max(sd)),
         "prior_deviation": found.deviation,
         "correlation_length_m": found.length,
-        "largest_mesh_bias_of_ln": None if found.mesh_bias is None else float(np.abs(found.mesh_bias).max()),
+        **{
+            f"largest_{key}_of_ln": None if bias is None else float(np.abs(bias).max())
+            for key, bias in (("mesh_bias", found.mesh_bias), ("time_step_bias", found.time_step_bias))
+        },
         "chi2_per_component": found.chi2 / found.components,
         "discrepancy_reached": found.reached,
         "distance_to_minimum_in_standard_deviations": found.distance,
@@ -144,8 +147,9 @@ def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> No
     if found is None:
         return
     at_nodes = {"factor": found.log_factor, "sd_of_ln": found.sd, "prior_sd_of_ln": found.prior_sd}
-    if found.mesh_bias is not None:
-        at_nodes["mesh_bias_of_ln"] = found.mesh_bias
+    for key, bias in (("mesh_bias", found.mesh_bias), ("time_step_bias", found.time_step_bias)):
+        if bias is not None:
+            at_nodes[f"{key}_of_ln"] = bias
     at_nodes = {name: np.array(on_middles(mesh, jnp.asarray(values))) for name, values in at_nodes.items()}
     at_nodes["factor"] = np.exp(at_nodes["factor"])
     unknown = np.setdiff1d(np.arange(mesh.number_of_nodes), _mapped(mesh, found))

@@ -20,17 +20,20 @@ def order_of_steps(scene: Scene) -> int:
     return 1 if dynamic_euler or old_recursion or scene.porosity is not None else 2
 
 
-def change_with_small_steps(scene: Scene, readings: Callable[[lj.Result], jax.Array]) -> np.ndarray:
+def change_with_small_steps(
+    scene: Scene, readings: Callable[[lj.Result], jax.Array], run: lj.Result | None = None
+) -> np.ndarray:
     """Estimate how each reading of a run would change with infinitely small time steps.
 
     Args:
         scene: a scene with time steps, with known numbers (not inside jit, grad or vmap).
         readings: function from a run of T steps to its readings, with any shape (T, …).
+        run: the run of the scene, if it is known already.
 
     Returns:
         The change, in the shape of the readings. It is NaN if a run fails.
     """
-    run = lj.simulate(scene)
+    run = lj.simulate(scene) if run is None else run
     coarse = np.asarray(readings(run))
     fine = lj.simulate(replace(scene, solve=replace(scene.solve, dt=scene.solve.dt / 2, steps=2 * scene.solve.steps)))
     if np.any(np.concatenate([run.status, fine.status]) != status.CONVERGED):
