@@ -13,7 +13,7 @@ from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.pressed import PressedObstacle
-from liverjax.simulation.cautions import cautions_of_run, mesh_sentence
+from liverjax.simulation.cautions import cautions_of_mesh, cautions_of_run, mesh_sentence
 from liverjax.simulation.mesh_error import MeshError
 from liverjax.simulation.run import Result
 from liverjax.waves.cautions import cautions_of_waves
@@ -106,6 +106,20 @@ def test_short_bodies_and_nodes_in_one_place():
     assert found.startswith("4 nodes have the same coordinates as another node, so the body is not connected there")
 
 
+@pytest.mark.parametrize("cells", [(2, 2, 2), (1, 2, 2), (3, 3, 3), (1, 1, 1)])
+def test_hanging_nodes_are_told(cells):
+    """One cell beside a box with the same outline and n x n cells on the common face: all new nodes on it hang."""
+    x, tets = np.asarray(BOX.points), np.asarray(BOX.tetrahedra)
+    beside = lj.shapes.box((0.1, 0.1, 0.1), cells)
+    both = np.concatenate([x, np.asarray(beside.points) + np.array([0.1, 0, 0])])
+    points, number = np.unique(np.round(both, 6), axis=0, return_inverse=True)
+    cells_of = number[np.concatenate([tets, np.asarray(beside.tetrahedra) + len(x)])]
+    hanging = (cells[1] + 1) * (cells[2] + 1) - 4
+    for mesh in (lj.tet_mesh(points, cells_of), lj.quadratic(lj.tet_mesh(points, cells_of))):
+        said = [sentence for sentence in cautions_of_mesh(mesh) if "hanging" in sentence]
+        assert [sentence.split(" nodes")[0] for sentence in said] == [str(hanging)] * (hanging > 0)
+
+
 def test_waves_without_a_mass_are_told():
     push = lj.Traction(triangles=lj.boundary.boundary_triangles(BOX)[:1], value=np.array([0.0, 0.0, 5.0]))
     bare = replace(scene(BOX, kind="harmonic", frequencies=np.array([60.0])), traction=(push,))
@@ -163,6 +177,7 @@ def test_they_stand_in_the_report_and_in_the_results(tmp_path, capsys):
         ),
         ([0.0, 0.001], [0.0, 1.0], "bends within steps"),
         ([0.0, 0.1], [0.0, 1.0], None),
+        ([0.5, 0.9], [0.0, 1.0], "begins at 0.5 s, but the run ends at 0.3 s"),
     ],
 )
 def test_a_history_that_changes_within_a_step_is_told(times, history, told):

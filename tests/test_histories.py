@@ -133,10 +133,10 @@ def test_derivative_by_an_entry_of_a_history():
             {"value": [0, 0, 1.0], "history": [[0, 0], [0, 1]]},
             "traction.0 history must have finite numbers at increasing",
         ),
-        ({"value": [0, 0, 1.0], "history": [[0, 0, 1]]}, "traction.0 history is not a table of numbers: write"),
+        ({"value": [0, 0, 1.0], "history": [[0, 0, 1]]}, "traction.0 history has rows of 3 numbers: write"),
         ({"value": [0, 0, 1.0], "history": "none.csv"}, "none.csv cannot be read"),
         ({"pressure": 1.0, "value": [0, 0, 1.0], "history": [[0, 0]]}, "traction.0 needs either value"),
-        ({"pressure": 1.0, "history": [[0, 0, 0, 0]]}, "traction.0 needs either value"),
+        ({"pressure": 1.0, "history": [[0, 0, 0, 0]]}, "traction.0 has a pressure and a history of vectors: write"),
         ({"history": [[0, 1.0]]}, "traction.0 needs either value"),
     ],
 )

@@ -9,7 +9,8 @@ from test_time_tests import SOLID, driven, relaxation, write
 
 from fitting.__main__ import main
 from fitting.fits import time_tests as fits
-from fitting.readers.time_tests import Sample, TimeTest, read_time_test, with_steps
+from fitting.fits.honesty.rise_of_load import with_steps
+from fitting.readers.time_tests import Sample, TimeTest, read_time_test
 from liverjax import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -91,7 +92,7 @@ BAD = {
     "ramp": (
         "time_s,strain,stress_Pa\n0,1,9\n1,1,7\n2,1,6\n3,1,5\n",
         ["--ramp", "1"],
-        "--ramp 1 cannot be right, since the rows begin under load, and only 0 (a step at 0 s) is possible",
+        "--ramp 1 cannot be right, since the rows begin under load at 0 s, and the rise cannot end later",
     ),
     "ramp in rows": (
         "time_s,strain,stress_Pa\n0,0,0\n1,0.5,7\n2,1,6\n3,1,5\n",
@@ -117,6 +118,32 @@ def test_unusable_files_get_one_sentence(name, tmp_path, capsys):
     assert main(["relaxation", str(tmp_path / "t.csv"), *options, "--out", str(tmp_path / "out")]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note")]
     assert len(lines) == 1 and sentence in lines[0], lines
+
+
+@pytest.mark.parametrize(
+    ("ramp", "times", "strains"),
+    [
+        (None, [0.0], [0.0]),
+        (0.0, [0.0], [0.01]),
+        (0.1, [0.0, 0.1], [0.0, 0.01]),
+        (0.3, [0.0], [0.0]),
+        (0.31, None, None),
+    ],
+)
+def test_a_rise_before_the_first_row_may_be_given(tmp_path, ramp, times, strains):
+    """The rows begin at 0.3 s under load. Only a step could be given, and a ramp until the first row was assumed."""
+    t = np.array([0.3, 0.5, 1.0, 3.0, 10.0])
+    path = tmp_path / "t.csv"
+    path.write_text("time_s,strain,stress_Pa\n" + "".join(f"{s},0.01,{5 + 4 / (1 + s)}\n" for s in t))
+    if times is None:
+        with pytest.raises(InputError, match=r"begin under load at 0\.3 s, and the rise cannot end later"):
+            read_time_test(path, "relaxation", ramp=ramp)
+        return
+    test = read_time_test(path, "relaxation", ramp=ramp)
+    np.testing.assert_allclose(test.time, [*times, *t])
+    np.testing.assert_allclose(test.driven, strains + [0.01] * 5)
+    np.testing.assert_array_equal(test.used, np.arange(len(test.time)) >= len(times))
+    assert any("a linear ramp from 0 s on is assumed" in note for note in test.notes) == (ramp is None)
 
 
 def test_missing_files_and_damage_never_leave_a_traceback(tmp_path):

@@ -87,6 +87,14 @@ def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
     assert "a period of 8 steps fits the 9 instants better" in note
 
 
+def test_a_group_of_hdf5_is_no_array(tmp_path):
+    """The message said that the file is damaged."""
+    with h5py.File(tmp_path / "own.h5", "w") as file:
+        file["displacement/real"] = np.zeros((3, 3, 3, 3))
+    with pytest.raises(InputError, match=r"own\.h5: displacement is a group that contains real, not an array"):
+        wave_field.read_waves(tmp_path / "own.h5")
+
+
 def test_an_array_of_hdf5_may_name_its_own_unit_spacing_and_frequencies(tmp_path):
     field = plane_waves((5, 5, 5))
     with h5py.File(tmp_path / "own.h5", "w") as file:

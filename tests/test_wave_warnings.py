@@ -112,6 +112,13 @@ def test_components_that_follow_the_axes_are_never_accused(noise, sign):
     assert components.order_sentence(field._replace(displacement=sign * field.displacement)) is None
 
 
+def test_a_component_that_is_zero_has_no_order():
+    """It was perhaps not measured. Without it, the other components change the volume in every order."""
+    field = plane_waves((9, 9, 9), noise=4e-7)
+    measured = np.array([1.0, 1.0, 0.0]) * field.displacement[..., [0, 2, 1]]
+    assert components.order_sentence(field._replace(displacement=measured)) is None
+
+
 @pytest.mark.parametrize(
     ("moduli", "words"),
     [

@@ -197,7 +197,7 @@ def from_rest(
     Args:
         time, driven, answer: (n,), see `of_columns`.
         ramp: duration [s] of a jump of the load between two rows. The jump ends at the later row; 0 means a step. If
-            the first row is under load, 0 means that this load acted from 0 s on. None means that the load changes
+            the first row is under load, this is the duration of the rise from 0 s on. None means that the load changes
             linearly between rows.
         names: name of the file, and name of `ramp`, for messages.
 
@@ -206,26 +206,30 @@ def from_rest(
     """
     size, rows = np.abs(driven), _rows_of_jumps(driven)
     loaded = size[0] > AT_REST * np.max(size)
-    at_once = ramp == 0 and loaded
-    if ramp is not None and not at_once and not (len(rows) and 0 <= ramp <= time[rows[0]] - time[rows[0] - 1]):
+    early = ramp is not None and loaded and 0 <= ramp <= time[0]  # the rise was complete before the first row
+    if ramp is not None and not early and not (len(rows) and 0 <= ramp <= time[rows[0]] - time[rows[0] - 1]):
         shown = "the rows show how the load rose"
-        if len(rows):
+        if loaded:
+            shown = f"the rows begin under load at {time[0]:.4g} s, and the rise cannot end later"
+        elif len(rows):
             shown = f"the load rose between {time[rows[0] - 1]:.4g} and {time[rows[0]]:.4g} s"
-        elif loaded:
-            shown = "the rows begin under load, and only 0 (a step at 0 s) is possible there"
         raise InputError(f"{names[0]}: {names[1]} {ramp:g} cannot be right, since {shown}; remove this setting")
     if ramp is not None:
-        time, driven, answer = _rows_before_jumps(rows, ramp, time, driven, answer)
+        time, driven, answer = rows_before_jumps(rows, ramp, time, driven, answer)
     if not time[0] > 0:
-        return time, driven, answer, [BEGINS_LOADED] if loaded and not at_once else []
-    first, notes = driven[0] if at_once else 0.0, []
-    if not at_once and loaded:
+        return time, driven, answer, [BEGINS_LOADED] if loaded and not early else []
+    begin, rise, notes = [0.0], [0.0], []
+    if ramp == 0 and loaded:
+        rise = [driven[0]]
+    elif ramp is not None and early and ramp != time[0]:
+        begin, rise = [0.0, ramp], [0.0, driven[0]]
+    elif loaded and not early:
         notes.append(
             f"the rows begin at {time[0]:.3g} s under load: a linear ramp from 0 s on is assumed. If the load was a "
-            "step at 0 s, add a row with this load at 0 s, or give --ramp 0 (relaxation and creep only; in a "
+            "step at 0 s, give --ramp 0, or the duration of a faster rise (relaxation and creep only; in a "
             "description: ramp = 0)"
         )
-    return np.append(0.0, time), np.append(first, driven), np.append(0.0, answer), notes
+    return np.append(begin, time), np.append(rise, driven), np.append(np.zeros(len(begin)), answer), notes
 
 
 def with_known_rise(test: TimeTest, time: np.ndarray, driven: np.ndarray, ramp: float | None) -> TimeTest:
@@ -256,7 +260,7 @@ def _rows_of_jumps(driven: np.ndarray) -> np.ndarray:
     return 1 + np.flatnonzero((own > least) & (np.maximum(before, after) < _COMPLETE * own))
 
 
-def _rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple:
+def rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple:
     """Return the columns with an added row in each jump, `ramp` [s] before the later row of the jump. The added row has
     the values of the earlier row."""
     interval = time[rows] - time[rows - 1]
@@ -267,24 +271,6 @@ def _rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns
         np.insert(values, rows[new], added[new])
         for values, added in ((time, before), *((c, c[rows - 1]) for c in columns))
     )
-
-
-def with_steps(test: TimeTest) -> TimeTest:
-    """Return the test with each jump of the load (`TimeTest.jumps`) replaced by a step at the later row.
-
-    If the rows begin under load, the first step is at 0 s.
-    """
-    driven, jumps = test.driven.copy(), test.jumps
-    if test.rise == BEFORE_ROWS:
-        driven[: jumps[0]] = driven[jumps[0]]
-        jumps = jumps[1:]
-    shown = np.flatnonzero(np.isfinite(test.answer))
-    for row in jumps:
-        last = shown[np.searchsorted(shown, row) - 1]
-        driven[last + 1 : row] = driven[last]
-    time, driven, answer = _rows_before_jumps(jumps, 0.0, test.time, driven, test.answer)
-    used = np.isin(time, test.time[test.used])
-    return test._replace(time=time, driven=driven, answer=answer, used=used)
 
 
 def kind_of(path: str | os.PathLike) -> str:

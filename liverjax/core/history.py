@@ -43,7 +43,8 @@ def read_history(value: object, name: str, forms: tuple[int, ...] = (1, 3)) -> t
         except (TypeError, ValueError, OverflowError):
             data = np.empty(0)
         if data.ndim != 2 or data.shape[1] - 1 not in forms:
-            raise InputError(f"{where} is not a table of numbers: write {wanted}, or name a CSV file")
+            found = f"has rows of {data.shape[1]} numbers" if data.ndim == 2 else "is not a table of numbers"
+            raise InputError(f"{where} {found}: write {wanted}, or name a CSV file")
     if not len(data) or not np.all(np.isfinite(data)) or not np.all(np.diff(data[:, 0]) > 0):
         raise InputError(f"{where} must have finite numbers at increasing times: sort and complete its rows")
     numbers = data[:, 1] if data.shape[1] == 2 else data[:, 1:]

@@ -94,9 +94,11 @@ def tried(scene: Scene) -> Tried:
         off, whole = np.asarray(found.pressure_error), float(np.abs(np.asarray(P)).max())
         said += f", and {off.max():.2g} Pa of pressure" + (f", {off.max() / whole:.2%} of the largest" if whole else "")
         small, beside["reduced_pressure_error"] = small and off.max() <= solve.reduced_tolerance * whole, (off, "Pa")
-    if np.any(np.asarray(first.status)) or not small:
+    failed = int(np.count_nonzero(np.asarray(first.status)))
+    if failed or not small:
         limit = f"{float(np.asarray(solve.reduced_tolerance)):.2%}"
-        return Tried(None, f"{said}. The error is above {limit}, or a step failed, so the full model runs")
+        why = f"{failed} of its steps failed" if failed else f"The error is above {limit}"
+        return Tried(None, f"{said}. {why}, so the full model runs")
     ran = Ran(_as_result(found, x, P), len(found.times), run_time, compile_time, beside)
     return Tried(ran, said)
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.mesh.selection import boundary_triangles
 from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import TetMesh
 
@@ -12,6 +13,8 @@ from liverjax.mesh.tetrahedra import TetMesh
 _INSIDE = 1e-9
 #: Two vertices coincide if their distance is below this fraction of the body's size.
 SAME_PLACE = 1e-9
+#: A vertex lies on a face if its distance is below this fraction of the size of the face. Files may have six digits.
+_ON_FACE = 1e-5
 #: A piece of a line is ignored if it is shorter than this fraction of the line.
 _SHORTEST = 1e-9
 
@@ -30,6 +33,29 @@ def doubled_vertices(mesh: TetMesh) -> int:
     points = np.asarray(mesh.points)
     steps = np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * float(np.ptp(points, axis=0).max())))
     return mesh.number_of_vertices - len(np.unique(steps, axis=0))
+
+
+def hanging_vertices(mesh: TetMesh) -> int:
+    """Return the number of vertices that lie inside a face or an edge of the boundary (hanging nodes). At such
+    vertices, the mesh is not connected, because each of them is a corner only of the elements on one side."""
+    from scipy.spatial import cKDTree  # slow to import
+
+    points, triangles = np.asarray(mesh.points), np.asarray(boundary_triangles(mesh))
+    corners, vertices = points[triangles], np.unique(triangles)
+    middles = corners.mean(axis=1)
+    radii = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
+    near = cKDTree(points[vertices]).query_ball_point(middles, radii)
+    pair = np.repeat(np.arange(len(triangles)), [len(one) for one in near])
+    vertex = vertices[np.concatenate(near).astype(int)]
+    others = np.all(vertex[:, None] != triangles[pair], axis=1)
+    pair, vertex = pair[others], vertex[others]
+    a, b, c = np.moveaxis(corners[pair], 1, 0)
+    normal = np.cross(b - a, c - a)
+    square, p = np.sum(normal**2, axis=1), points[vertex]
+    height = np.abs(np.sum(normal * (p - a), axis=1)) / np.sqrt(square)
+    parts = [np.sum(normal * np.cross(y - x, p - x), axis=1) / square for x, y in ((b, c), (c, a), (a, b))]
+    inside = (np.min(parts, axis=0) >= -_ON_FACE) & (np.max(parts, axis=0) < 1 - _ON_FACE)
+    return len(np.unique(vertex[inside & (height <= _ON_FACE * radii[pair])]))
 
 
 def barycentric(mesh: TetMesh, points: np.ndarray) -> np.ndarray:

@@ -438,6 +438,8 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
     name = f"traction.{k}"
     given = _history(name, table)
     vectors = bool(given) and given["history"].ndim == 2
+    if "pressure" in table and vectors:
+        raise InputError(f"{name} has a pressure and a history of vectors: write its history as [[time, factor], …]")
     if ("value" in table) + ("pressure" in table) + vectors != 1:
         raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
     triangles: Indices = boundary.surface_of(mesh, _nodes(mesh, name, table), table.get("set"))

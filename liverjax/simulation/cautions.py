@@ -10,7 +10,7 @@ from liverjax.core import status
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
-from liverjax.mesh.locate import doubled_vertices
+from liverjax.mesh.locate import doubled_vertices, hanging_vertices
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.membrane import Membrane
@@ -25,6 +25,7 @@ from liverjax.physics.rigid_plate import RigidPlate
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes import regions
 from liverjax.scenes.by_element import by_element
+from liverjax.scenes.checks.histories import cautions_of_histories
 from liverjax.scenes.checks.rigid_motion import loose_piece
 from liverjax.scenes.scene import Scene, histories, named_physics
 from liverjax.simulation.automatic import qualities
@@ -54,7 +55,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
     return [
         *cautions_of_mesh(scene.mesh),
         *of_locking(scene),
-        *_of_histories(scene, result),
+        *cautions_of_histories(scene, np.asarray(result.times)),
         *_of_stress_at_start(scene, result),
         *_of_growing_motion(scene, result),
         *_of_contacts(scene, result),
@@ -110,7 +111,7 @@ def _pressure_errors(result: Result) -> tuple[str, str]:
 
 
 def cautions_of_mesh(mesh: TetMesh) -> list[str]:
-    """Warnings about the size of the body, about nodes with equal coordinates, and about slivers."""
+    """Warnings about the size of the body, nodes with equal coordinates, hanging nodes, and slivers."""
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     size, quality = float(np.ptp(points, axis=0).max()), qualities(points, tets, np.asarray(mesh.volumes))
     said = []
@@ -125,6 +126,12 @@ def cautions_of_mesh(mesh: TetMesh) -> list[str]:
         said.append(
             f"{doubled} nodes have the same coordinates as another node, so the body is not connected there: merge "
             "these nodes if the body should be connected"
+        )
+    hanging = hanging_vertices(mesh)
+    if hanging:
+        said.append(
+            f"{hanging} nodes lie on a face or edge of an element without being its corners (hanging nodes), so the "
+            "body is not connected there: divide these elements, or make a conforming mesh"
         )
     slivers = np.flatnonzero(quality < SLIVER)
     if len(slivers):
@@ -157,10 +164,6 @@ def of_locking(scene: Scene) -> list[str]:
         f"the bulk modulus is {ratio:.3g} times the shear modulus, so these quadratic elements are too stiff: "
         "write volumetric = 'mixed' in [solve]"
     ]
-
-
-#: The program warns if the steps miss more than this fraction of a history's largest value or of its time integral.
-MISSED = 0.05
 
 
 #: After this number of relaxation times, the stress of an initially unrelaxed body is relaxed to within 1 %.
@@ -219,34 +222,6 @@ def _gives_no_energy(physics: Physics) -> bool:
     if isinstance(physics, RigidPlate):
         return not np.any(np.asarray(physics.turn))
     return isinstance(physics, SlidingSupport | ElasticSupport | Membrane)
-
-
-def _of_histories(scene: Scene, result: Result) -> list[str]:
-    """Warn about each history that changes within a step, since the run uses only its values at the ends of steps."""
-    said = []
-    steps = np.concatenate([[0.0], np.asarray(result.times)])
-    for name, part in histories(scene).items():
-        times, values = (np.asarray(getattr(part, column)) for column in ("times", "history"))
-        every = np.union1d(steps, times[(times > 0) & (times < steps[-1])])
-        table, at_steps = (_at_times(at, times, values) for at in (every, steps))
-        seen = _at_times(every, steps, at_steps)
-        apart, whole = np.abs(table - seen), np.abs(table)
-        beyond = np.maximum(table - at_steps.max(axis=0), at_steps.min(axis=0) - table).max(axis=1)
-        peak = int(beyond.argmax())
-        if beyond[peak] > MISSED * whole.max():
-            said.append(
-                f"the history of {name} has a peak at {every[peak]:.4g} s between two steps, and the run misses "
-                f"{100 * beyond[peak] / whole.max():.2g} % of this peak: use a smaller dt, or a dt that divides "
-                f"{every[peak]:.4g} s"
-            )
-            continue
-        lost, everything = (np.trapezoid(a, every, axis=0).max() for a in (apart, whole))
-        if lost > MISSED * everything:
-            said.append(
-                f"the history of {name} bends within steps, but the run uses only the values at the ends of steps, so "
-                f"the error is {100 * lost / everything:.2g} % of the integral over time: use a smaller dt"
-            )
-    return said
 
 
 #: No warning if the depth between contact points is below this fraction of the approach (see `missed_depth`).
@@ -451,12 +426,6 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
         f"{said}: use a dt of {enough:.2g} s or more, or elements of "
         f"{np.sqrt(float(scene.solve.dt) * flow / _FOLLOWS):.2g} m there (the elements are {height:.2g} m thick)"
     ]
-
-
-def _at_times(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (n, k) of a table with k columns at n other times, by linear interpolation."""
-    columns = values.reshape(len(times), -1).T
-    return np.stack([np.interp(at, times, column) for column in columns], axis=1)
 
 
 def _of_volumes(scene: Scene, result: Result) -> list[str]:

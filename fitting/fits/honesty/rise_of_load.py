@@ -6,10 +6,12 @@ the sample is already loaded in the first row, the load may have been a step at 
 relaxation times are as short as the time between the two rows.
 """
 
+import numpy as np
+
 from fitting.fits import time_tests
 from fitting.fits.families import limits
 from fitting.fits.time_tests import TimeFit
-from fitting.readers.time_tests import BEFORE_ROWS, TimeTest, with_steps
+from fitting.readers.time_tests import BEFORE_ROWS, TimeTest, rows_before_jumps
 
 #: Key in `TimeFit.details`: changes, by name, of G0, ratios, times and equilibrium modulus if the load was a step.
 OF_A_STEP = "change_if_the_load_was_a_step"
@@ -45,6 +47,24 @@ def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
     )
     details = fit.details | {OF_A_STEP: changes} if fit.parameters is None else fit.details
     return fit._replace(warnings=(*fit.warnings, told), details=details)
+
+
+def with_steps(test: TimeTest) -> TimeTest:
+    """Return the test with each jump of the load (`TimeTest.jumps`) replaced by a step at the later row.
+
+    If the rows begin under load, the first step is at 0 s.
+    """
+    driven, jumps = test.driven.copy(), test.jumps
+    if test.rise == BEFORE_ROWS:
+        driven[: jumps[0]] = driven[jumps[0]]
+        jumps = jumps[1:]
+    shown = np.flatnonzero(np.isfinite(test.answer))
+    for row in jumps:
+        last = shown[np.searchsorted(shown, row) - 1]
+        driven[last + 1 : row] = driven[last]
+    time, driven, answer = rows_before_jumps(jumps, 0.0, test.time, driven, test.answer)
+    used = np.isin(time, test.time[test.used])
+    return test._replace(time=time, driven=driven, answer=answer, used=used)
 
 
 def _assumed_between_rows(test: TimeTest) -> str:

@@ -22,7 +22,7 @@ def other_order(field: WaveField) -> tuple[tuple[int, ...], tuple[int, ...]] | N
     """Return for each axis the component and the sign with which the divergence is smallest. Return None if the given
     order is nearly as good."""
     slopes = _central_differences(field)
-    if slopes.shape[2] < FEWEST:
+    if slopes.shape[2] < FEWEST or not np.all(np.any(slopes, axis=(0, 2))):  # a component that is 0 has a message
         return None
     # The mean products of all derivatives d_a u_c give the mean square divergence for every order and sign.
     flat = slopes.reshape(9, -1)

@@ -152,6 +152,12 @@ def _hdf5(path: Path) -> Content:
     import h5py
 
     with h5py.File(path) as file:
+        for name in NAMES:
+            if isinstance(file.get(name), h5py.Group):
+                inside = ", ".join(list(file[name])[:5]) or "nothing"
+                raise InputError(
+                    f"{path}: {name} is a group that contains {inside}, not an array: write the arrays at the top level"
+                )
         found: Content = {name: _values(file[name]) for name in NAMES if name in file} | _nearly_known(file)
         # The names may also be attributes of the file or of the array of waves.
         for own in (file, *(file[name] for name in WAVES if name in file)):
