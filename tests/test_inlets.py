@@ -138,7 +138,7 @@ def test_perfusion_swells_a_soft_sponge():
         ({"where": LOW}, "porosity.inlet.0 needs either pressure"),
         ({"where": LOW, "pressure": 1.0, "flux": 1.0}, "porosity.inlet.0 needs either pressure"),
         ({"where": LOW, "presure": 1.0}, "did you mean pressure"),
-        ({"where": LOW, "pressure": 1.0, "history": [[0, 0, 0, 0]]}, "porosity.inlet.0 history is not a table"),
+        ({"where": LOW, "pressure": 1.0, "history": [[0, 0, 0, 0]]}, "porosity.inlet.0 history has rows of 4 numbers"),
     ],
 )
 def test_bad_inlets_are_refused(inlet, words):

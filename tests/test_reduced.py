@@ -371,6 +371,7 @@ def _heavier(scene, density):
 def test_without_the_correction_its_size_is_the_stated_error(trained):
     """If the correction is right, it is the error of the motion without correction."""
     scene, model, *_ = trained
+    scene = lj.with_parameters(scene, {name: np.mean(bounds, axis=0) for name, bounds in model.ranges.items()})
     found, V = lj.simulate_reduced(model, scene), len(scene.mesh.points)
     rng = np.random.default_rng(6)
     q, fields = rng.normal(size=(40, 6, model.number_of_modes)), rng.normal(size=(2, V, 3))

@@ -59,7 +59,7 @@ def test_the_estimate_is_the_change_with_many_small_steps(dt, options, order):
 
 
 def test_a_run_that_fails_gives_no_estimate():
-    scene = block(0.1, 2)
+    scene = block(0.1, 6)
     pulled = replace(scene, traction=tuple(replace(t, value=-1e9 * t.value) for t in scene.traction))
     assert np.all(np.isnan(change_with_small_steps(pulled, tops)))
 
@@ -80,6 +80,7 @@ def with_fine_data(sd: float) -> scene_numbers.Problem:
     return scene_numbers.Problem((coarse,), (data,))
 
 
+@pytest.mark.slow
 def test_a_map_states_what_its_time_step_does_to_it():
     """The truth is uniform, and the data come from the same mesh. Without its bias, the map is closer to the truth."""
     problem = with_fine_data(2e-5)

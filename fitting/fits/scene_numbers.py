@@ -214,7 +214,10 @@ def _errors_in(scene: Scene, data: Displacements) -> tuple[np.ndarray, np.ndarra
         run = lj.simulate(scene, mesh_error=True)
         assert run.mesh_error is not None
         exact = replace(run, positions=run.positions + run.mesh_error.positions)
-        of_mesh, cause = np.asarray(readings(exact)) - np.asarray(readings(run)), "its estimate failed"
+        of_mesh, cause = (
+            np.asarray(readings(exact)) - np.asarray(readings(run)),
+            "the estimate of the mesh error failed",
+        )
     except InputError as e:
         run, of_mesh, cause = None, np.full(np.size(data.measured), np.nan), str(e)
     if not np.all(np.isfinite(of_mesh)):

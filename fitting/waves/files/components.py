@@ -22,7 +22,7 @@ def other_order(field: WaveField) -> tuple[tuple[int, ...], tuple[int, ...]] | N
     """Return for each axis the component and the sign with which the divergence is smallest. Return None if the given
     order is nearly as good."""
     slopes = _central_differences(field)
-    if slopes.shape[2] < FEWEST or not np.all(np.any(slopes, axis=(0, 2))):  # a component that is 0 has a message
+    if slopes.shape[2] < FEWEST:
         return None
     # The mean products of all derivatives d_a u_c give the mean square divergence for every order and sign.
     flat = slopes.reshape(9, -1)
@@ -46,10 +46,12 @@ def order_sentence(field: WaveField) -> str | None:
     order, signs = found
     whole = -1 if sum(signs) < 0 else 1  # a common sign of all components does not matter
     names = ", ".join(("-" if whole * s < 0 else "") + "xyz"[c] for c, s in zip(order, signs, strict=True))
+    empty = [axis for c, axis in enumerate("xyz") if not np.any(np.nan_to_num(field.displacement[..., c]))]
+    instead = f". If component {' and '.join(empty)} was not measured, this is the cause: write NaN instead of zeros"
     return (
         f"the components of the displacement may have a wrong order or sign: with order and signs ({names}), the "
         "displacements change the volume much less, as expected for shear waves. Give the components in the order and "
-        "with the signs of the voxel axes"
+        f"with the signs of the voxel axes{instead if empty else ''}"
     )
 
 
