@@ -7,7 +7,8 @@ import sys
 from liverjax.commands.arguments import with_joined_numbers
 from liverjax.commands.exit_codes import exit_code, show_unknown_letters
 
-#: Names of the other commands. A command line without one of these names is for a frequency sweep.
+#: Names of the commands for tests that are not frequency sweeps. A command line without one of these names is for a
+#: frequency sweep.
 COMMANDS = ("curves", "field", "relaxation", "creep", "indentation", "amplitude", "waves")
 
 
@@ -19,7 +20,7 @@ def main(arguments: list[str] | None = None, prog: str = "python -m fitting") ->
     if arguments[:1] and arguments[0] in COMMANDS:
         name, arguments = arguments[0], arguments[1:]
         prog = f"{prog} {name}"
-    command = importlib.import_module(f"fitting.commands.{name}")  # only this command is loaded, for a quick start
+    command = importlib.import_module(f"fitting.commands.{name}")  # only this command is loaded, to save time
     return exit_code(command.run, command.parser(prog).parse_args(with_joined_numbers(arguments)))
 
 

@@ -1,3 +1,3 @@
-"""The module that users import for fits of several tests: all of `fitting.fits.joint`."""
+"""The module that users import for fits of several tests. It exports all names of `fitting.fits.joint`."""
 
 from fitting.fits.joint import *  # noqa: F403

@@ -24,7 +24,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None, prog: str = "liverjax") -> int:
-    """Run one command. Return its exit code: 0 (done), 1 (failed) or 2 (unusable input)."""
+    """Run one command. Return its exit code: 0 (done), 1 (failed), 2 (unusable input) or 130 (Ctrl-C)."""
     show_unknown_letters()
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["fit"]:

@@ -171,8 +171,8 @@ def test_what_no_law_follows_is_said(tmp_path, tanned):
 @pytest.mark.parametrize(
     "change, words",
     [
-        (("strain_%", "strein"), "has a column strain"),
-        (("strain_%", "strain_mm"), "has a column strain"),
+        (("strain_%", "strein"), "has a strain column"),
+        (("strain_%", "strain_mm"), "has a strain column"),
         (("\n1.0,", "\n2.0,"), None),
         (("storage_modulus_Pa", "storage_modulus_bar"), "bar"),
     ],

@@ -196,7 +196,7 @@ def _spring(**given) -> dict:
         ),
         (
             {"traction": (lj.Traction(triangles=LOST, pressure=1.0),)},
-            "traction.0.triangles has [1, 2, 4], which is not a",
+            "traction.0.triangles contains the triangle [1, 2, 4], which is not a",
         ),
         (
             {"traction": (lj.Traction(triangles=TOP.ravel(), pressure=1.0),)},
@@ -212,9 +212,9 @@ def _spring(**given) -> dict:
         ),
         (
             {"porosity": replace(SOUND.porosity, inlet=(Inlet(triangles=LOST, flux=1.0),))},
-            "porosity.inlet.0.triangles has [1, 2, 4], which is not a face of an element",
+            "porosity.inlet.0.triangles contains the triangle [1, 2, 4], which is not a face of an element",
         ),
-        (_plate(triangles=LOST), "obstacle.0.triangles has [1, 2, 4], which is not a face"),
+        (_plate(triangles=LOST), "obstacle.0.triangles contains the triangle [1, 2, 4], which is not a face"),
         (
             _plate(triangles=jnp.zeros((0, 3), int)),
             "obstacle.0.triangles contains no node: give node numbers from 0 to 7",
@@ -226,7 +226,10 @@ def _spring(**given) -> dict:
             _plate(times=jnp.array([1.0, 0.0]), history=jnp.zeros((2, 3))),
             "obstacle.0 history must have increasing times, but has 0 s after 1 s: sort the times",
         ),
-        (_spring(triangles=LOST, normal=1.0), "support.0.triangles has [1, 2, 4], which is not a face of an element"),
+        (
+            _spring(triangles=LOST, normal=1.0),
+            "support.0.triangles contains the triangle [1, 2, 4], which is not a face of an element",
+        ),
         (_spring(triangles=TOP, normal=jnp.ones(5)), "support.0.normal has shape (5,): give one number or shape (2,)"),
         (
             _spring(nodes=jnp.array([99]), stiffness=1.0),
@@ -240,12 +243,12 @@ def _spring(**given) -> dict:
         ({"physics": (SlidingSupport(nodes=jnp.array([0]), normal=jnp.ones(2)),)}, "support.0.normal has shape (2,)"),
         (
             {"physics": (Membrane(triangles=LOST, thickness=1e-5, law=LAYER),)},
-            "membrane.0.triangles has [1, 2, 4], which is not",
+            "membrane.0.triangles contains the triangle [1, 2, 4], which is not",
         ),
         ({"physics": (Membrane(triangles=TOP, thickness=jnp.ones(3), law=LAYER),)}, "membrane.0.thickness has shape"),
         (
             {"physics": (replace(FIBRE, nodes=jnp.array([7])),)},
-            "ligament.0.nodes has shape (1,): give the nodes of each",
+            "ligament.0.nodes has shape (1,): give an array (n, m) with the nodes",
         ),
         (
             {"physics": (replace(FIBRE, weights=jnp.ones((2, 1))),)},
@@ -299,7 +302,7 @@ MEANINGLESS = (
     ),
     (
         {"viscosity": lj.Prony(ratios=0.5, relaxation_times=0.1)},
-        "viscosity.ratios = 0.5 is one number: give one per mode",
+        "viscosity.ratios = 0.5 is one number: give a list with one number per mode",
     ),
     (
         {"law": lj.laws.typical("saint_venant_kirchhoff"), "viscosity": replace(PULLED.viscosity, part="isochoric")},
@@ -324,7 +327,7 @@ MEANINGLESS = (
     (_moved(by=0.01), "displaced.0 'by' has shape ()"),
     (_moved(by=jnp.zeros((3, 3))), "displaced.0 'by' has shape (3, 3)"),
     (_moved(nodes=jnp.array([4, 700])), "displaced.0.nodes contains node 700, but the mesh has only the nodes 0 to 7"),
-    (_moved(axes="XYZ"), "displaced.0 axes = 'XYZ' is not known: give some of the letters xyz"),
+    (_moved(axes="XYZ"), "displaced.0 axes = 'XYZ' is not known: give one or more of the letters x, y and z"),
     ({"fixed": (lj.Fixed(nodes=jnp.array([0, 1]), axes=""),)}, "fixed.0 axes = '' is not known"),
     ({"fixed": (lj.Fixed(nodes=jnp.array([0.0, 1.0])),)}, "fixed.0.nodes has numbers of type float64"),
     (

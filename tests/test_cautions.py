@@ -173,9 +173,9 @@ def test_they_stand_in_the_report_and_in_the_results(tmp_path, capsys):
         (
             [0.0, 0.19, 0.191],
             [1.0, 1.0, 0.0],
-            "bends within steps, but the run uses only the values at the ends of steps",
+            "is not linear within steps, but the run uses only the values at the ends of steps",
         ),
-        ([0.0, 0.001], [0.0, 1.0], "bends within steps"),
+        ([0.0, 0.001], [0.0, 1.0], "is not linear within steps"),
         ([0.0, 0.1], [0.0, 1.0], None),
         ([0.5, 0.9], [0.0, 1.0], "begins at 0.5 s, but the run ends at 0.3 s"),
     ],

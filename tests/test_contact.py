@@ -243,7 +243,7 @@ SCENE = {
         ({"shape": "sphere", "radius": 0.0, "position": [0, 0, 1]}, "must be above 0"),
         (
             {"shape": "sphere", "radius": 0.1, "position": [0, 0, 0.15]},
-            "the obstacle is 0.0[0-9]* m inside the body; move the obstacle out of the body",
+            "the obstacle overlaps the body by 0.0[0-9]* m; move the obstacle out of the body",
         ),
         (
             {"shape": "sphere", "radius": 0.01, "position": [0.05, 0.05, 0.05]},
@@ -256,7 +256,7 @@ SCENE = {
         ({"shape": "plane", "axis": [0, 0, 1], "position": [True, 0, 1]}, "must be three numbers"),
         ({"shape": "plane", "axis": [0, 0, 1], "position": ["0", 0, 1]}, "must be three numbers"),
         ({"shape": "plane", "axis": [0, 0, 10**400], "position": [0, 0, 1]}, "must be three numbers"),
-        ({"position": [0, 0, 1]}, "has no shape: give plane, sphere"),
+        ({"position": [0, 0, 1]}, "has no shape: use one of plane, sphere"),
         ({"shape": "sphere", "radius": [0.1, 0.2], "position": [0, 0, 1]}, "must be one number"),
         ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "friction": [0.1]}, "must be one number"),
         ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "radius": 0.1}, "which has no radius"),

@@ -156,7 +156,7 @@ def test_a_law_at_its_limit_says_so_without_warnings_of_numpy():
         found = stress_stretch.fit(candidate, [softening])
     assert found.limits == {"chain_length": "infinity"} and np.isfinite(found.standard_errors[0])
     told = " ".join(found.warnings)
-    assert "runs into its limit (chain_length to infinity). The limit fits best" in told
+    assert "the fit is best at a limit of the law (chain_length to infinity)" in told
     assert "leave chain_length free" not in told
     assert "chain_length → infinity" in curves_report.table([found])
 

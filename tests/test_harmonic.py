@@ -325,9 +325,9 @@ def test_an_undamped_resonance_is_told():
         ({"frequencies_Hz": [-1.0]}, "frequencies_Hz = .* above 0"),
         ({"frequencies_Hz": [60.0, 1e200]}, "frequencies_Hz = .* at most 1e"),
         ({"frequencies_Hz": []}, "frequencies_Hz"),
-        ({"factors": np.ones(5)}, "factors has shape"),
-        ({"motion": np.ones(3)}, "motion has shape"),
-        ({"about": np.ones(3)}, "about has shape"),
+        ({"factors": np.ones(5)}, "'factors' has shape"),
+        ({"motion": np.ones(3)}, "'motion' has shape"),
+        ({"about": np.ones(3)}, "'about' has shape"),
         ({"mass": "none"}, "mass = 'none'"),
     ],
 )

@@ -104,7 +104,7 @@ def test_springpots_of_a_scene_file(tmp_path):
     ("old", "new", "words"),
     [
         ("times = [0.0125, 0.002]", "", "needs times"),
-        ("exponents = [0.2, 0.6]", "exponents = [0.2]", "differ in length"),
+        ("exponents = [0.2, 0.6]", "exponents = [0.2]", "must be lists of equal lengths"),
         ("exponents = [0.2, 0.6]", "exponents = [0.2, 1.6]", "springpots.exponents"),
         ('part = "isochoric"', 'part = "none"', "part = 'none'"),
         (

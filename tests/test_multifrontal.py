@@ -15,7 +15,7 @@ import scipy.sparse
 import liverjax as lj
 from liverjax.solvers.factors import dissection, multifrontal
 from liverjax.solvers.factors.memory import free_memory
-from liverjax.waves import sparse
+from liverjax.waves import harmonic, sparse
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -183,6 +183,16 @@ def test_a_factor_that_does_not_fit_in_memory_is_told(monkeypatch):
     assert np.all(np.isnan(lost.residual))
     with pytest.raises(RuntimeError, match="40 Hz"):
         lost.check()
+
+
+def test_element_matrices_that_do_not_fit_in_memory_are_refused(monkeypatch):
+    """Before, the system ended the process without a message. 288 elements need 288 x 12 x 12 x 8 x 4 bytes."""
+    body = scene((4, 4, 3))
+    monkeypatch.setattr(harmonic, "free_memory", lambda: 1.2e6)
+    with pytest.raises(
+        lj.InputError, match=r"of 288 elements of order 1 need about 0\.00133 GB .* 0\.0012 GB are free"
+    ):
+        lj.harmonic(body, [40.0])
 
 
 def test_memory_of_an_elimination_is_foretold(monkeypatch):

@@ -306,7 +306,7 @@ IDLE = {
     ),
     "masses of waves": (
         {"solve": {"kind": "harmonic", "frequencies": [1.0]}, "body": {"density": 1.0, "mass": "lumped"}},
-        r"\[body\] mass = 'lumped' cannot be used with \[solve\] kind = 'harmonic', which has consistent masses",
+        r"\[body\] mass = 'lumped' cannot be used with \[solve\] kind = 'harmonic', which uses consistent masses",
     ),
     "forces of waves": (
         {"solve": {"kind": "harmonic", "frequencies": [1.0]}, "body": {"density": 1.0}, "output": {"reactions": True}},

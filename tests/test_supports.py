@@ -268,7 +268,7 @@ def test_supports_of_a_scene_file():
         ({"where": {"z_max": 0.0}, "normal": "soft"}, "support.0.normal = 'soft' is not a number"),
         ({"where": {"z_max": 0.0}, "normal": 1.0, "stiffness": 1.0}, "support.0 needs either normal and tangential"),
         ({"where": {"z_max": 0.0}, "sliding": False}, "support.0 sliding = False is not true"),
-        ({"where": {"z_max": 0.05}, "sliding": True}, "off one plane"),
+        ({"where": {"z_max": 0.05}, "sliding": True}, "m from one plane"),
         ({"where": {"z_max": 0.0}, "norml": 1.0}, "did you mean normal"),
         ({"where": {"z_max": 0.0}, "sliding": True}, "do not prevent every rigid motion of the body"),
     ],

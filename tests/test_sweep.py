@@ -243,7 +243,7 @@ def test_rows_that_end_crushed_are_told(files, capsys):
     words = command(files, "--out", str(files / "rows.h5"))
     assert main(words) == 0
     told = capsys.readouterr().err
-    assert "times their volume in 1 row (2; worst" in told and "worst: row 2, J = 0" in told
+    assert "times their initial volume in 1 row (2; worst" in told and "worst: row 2, J = 0" in told
     with h5py.File(files / "rows.h5") as found:
         J = found["volume_ratios"][:]
     assert np.allclose(J[:, 0], [0.9, 0.1, 0.8], rtol=0.1) and np.all(J[:, 0] < J[:, 1])
@@ -276,7 +276,7 @@ pre_tension = 0.05
     "column, value, words",
     [
         ("obstacle.0.axis.2", -2.0, "of length 1"),
-        ("obstacle.0.position.2", 0.05, "the obstacle is 0.05 m inside the body"),
+        ("obstacle.0.position.2", 0.05, "the obstacle overlaps the body by 0.05 m"),
         ("vessel.0.wall", 0.005, "thicker than the radius"),
         ("obstacle.0.radius", 0.02, "has no effect on a plane"),
         # A fibre is at least 5 cm long. At 20 N/m times that, its rest length is zero.

@@ -440,7 +440,7 @@ def test_lines_of_words_unknown_units_and_further_tables_are_told(tmp_path):
 
 def test_a_column_without_a_number_is_refused_in_one_sentence(tmp_path):
     (tmp_path / "n.csv").write_text("time_s,relaxation_modulus_Pa\n" + "\n".join(f"{k},nan" for k in range(9)) + "\n")
-    with pytest.raises(InputError, match="every row has an empty cell or one that is not finite"):
+    with pytest.raises(InputError, match="every row has a cell that is empty or not finite"):
         read_time_test(tmp_path / "n.csv", "relaxation")
 
 

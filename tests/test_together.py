@@ -312,7 +312,7 @@ def test_what_no_fit_follows_is_told():
     share = together.Share("sweep", "b.csv", 38, 1.2, 1.0, 0.63, 0.44, 0.3, np.ones(3))
     assert together.disagreements([share]) == []
     assert together.missed([share]) == [
-        "the fit misses the data of b.csv by 63 %: if this is not noise, change --model"
+        "the fit misses the data of b.csv by 63 %: if this is not noise, use another --model"
     ]
     assert together.missed([share._replace(misfit=0.04)]) == []
 

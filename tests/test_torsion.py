@@ -231,7 +231,7 @@ def test_inertia_is_taken_off_and_put_back():
     back = sample_inertia.put_back(own, 1060.0, 0.008)
     np.testing.assert_allclose(back.storage + 1j * back.loss, seen, rtol=1e-9)
     # No modulus of a passive material has such a small loss if inertia dominates.
-    with pytest.raises(lj.InputError, match="the inertia of the sample is larger than the modulus"):
+    with pytest.raises(lj.InputError, match="the inertia of the sample is too large to compute the modulus"):
         sample_inertia.taken_off(Sweep(omega, 0 * omega + 1.0, 0 * omega - 50.0), 1060.0, 0.008)
 
 
@@ -378,6 +378,13 @@ def test_strain_sweep_finds_where_linearity_ends(rig):
     limit = torsion.linearity_limit(strains, m.storage, deviation=0.02)
     assert 0.01 < limit < 0.2
     assert np.isclose(m.storage[0], 770, rtol=1e-6)
+
+
+def test_the_end_of_linearity_needs_finite_moduli():
+    """With a first modulus that is not finite, the largest strain was returned."""
+    strains = np.array([1e-3, 1e-2, 0.1])
+    assert torsion.linearity_limit(strains, [700.0, 700.0, np.nan]) == 1e-2
+    assert np.isnan(torsion.linearity_limit(strains, [np.nan, 700.0, 700.0]))
 
 
 def test_free_plate_rises(law):

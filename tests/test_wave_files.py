@@ -67,7 +67,7 @@ def test_a_table_may_have_the_columns_of_other_formats(tmp_path):
         assert wave_field.read_waves(path).mask.sum() == 75
     last = rows[-1].split(",")
     path.write_text(whole.replace(rows[-1], ",".join([*last[:-2], str(1 - int(last[-2])), last[-1]])))
-    with pytest.raises(InputError, match=f"row ({n + 1}|{2 * n + 1}): mask differs from another frequency"):
+    with pytest.raises(InputError, match=f"row ({n + 1}|{2 * n + 1}): mask differs from its value at another"):
         wave_field.read_waves(path)
 
 

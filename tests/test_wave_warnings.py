@@ -183,7 +183,7 @@ def test_a_field_that_holds_no_number_is_named(tmp_path):
             with pytest.raises(InputError, match=words):
                 wave_field.with_noise(found, None)
         else:
-            assert any("108 of 216 voxels are not measured at every frequency" in n for n in found.notes)
+            assert any("108 of 216 voxels have no displacement at some frequencies" in n for n in found.notes)
 
 
 def test_zeros_at_one_frequency_are_no_measurement(tmp_path):

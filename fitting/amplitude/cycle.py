@@ -2,11 +2,11 @@
 
 The sample is incompressible and isotropic, with a strain energy function W. W gives the instantaneous second
 Piola-Kirchhoff stress S. The relaxation of S does not depend on the strain (book chapter, section 4.2). In simple shear
-with the amount g(t) = a sin(wt), amplitude a and angular frequency w, the shear stress is S12 + g S22, whatever the
-pressure is. S is a sum of harmonics of w. Relaxation multiplies harmonic n by the modulus ratio m(nw) = G*(nw)/G0, with
-the complex modulus G* and the instantaneous modulus G0. In torsion between plates, every ring of the sample is in
-simple shear, with an amount of shear that depends on the radius (a universal deformation: Rivlin 1949). So the torque
-is a sum over rings. A rheometer converts this torque into moduli as if the sample were linear.
+with the amount g(t) = a sin(wt), amplitude a and angular frequency w, the shear stress is S12 + g S22. The pressure
+does not change this stress. S is a sum of harmonics of w. Relaxation multiplies harmonic n by the modulus ratio m(nw) =
+G*(nw)/G0, with the complex modulus G* and the instantaneous modulus G0. In torsion between plates, every ring of the
+sample is in simple shear, with an amount of shear that depends on the radius (a universal deformation: Rivlin 1949). So
+the torque is a sum over rings. A rheometer converts this torque into moduli as if the sample were linear.
 """
 
 from typing import NamedTuple
@@ -33,8 +33,8 @@ class Reading(NamedTuple):
 
     shears: np.ndarray  # (K,) amounts of shear, above 0
     F: jax.Array  # (K, 3, 3) deformation gradients
-    #: (M, 2, A, 2, K) complex. Axes: set of modulus ratios, harmonic (1 or 3), strain amplitude, component (S12/g or
-    #: S22), amount of shear.
+    #: (M, 2, A, 2, K) complex, for M sets of modulus ratios, 2 harmonics (1 and 3), A strain amplitudes, 2 components
+    #: (S12/g and S22) and K amounts of shear.
     harmonics: jax.Array
 
 
@@ -72,12 +72,12 @@ def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
         return np.ones(1), np.ones(1)
     x, w = np.polynomial.legendre.leggauss(RINGS)
     rho = 0.5 * (1 + x)
-    return rho, 0.5 * w * 4 * rho**3  # share of each ring in 2 torque / (pi radius^3) / (strain at the rim)
+    return rho, 0.5 * w * 4 * rho**3  # weight of a ring in 2 torque / (pi radius^3) / (strain at the rim)
 
 
 def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the values (..., K), at the points `at` (...), of the K Lagrange polynomials for K Chebyshev nodes (K,)
-    (barycentric form; Berrut, Trefethen 2004)."""
+    """Return the K Lagrange polynomials of the Chebyshev nodes `nodes` (K,), evaluated at the points `at` (...), as an
+    array (..., K) (barycentric form; Berrut, Trefethen 2004)."""
     k = np.arange(len(nodes))
     w = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / len(nodes))
     off = at[..., None] - nodes

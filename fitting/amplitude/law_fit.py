@@ -125,7 +125,7 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
     compiled = time.perf_counter()
     found = jax.block_until_ready(program(points))
     times = (time.perf_counter() - compiled, compiled - begin)
-    # G' and G'' are not two tests, but belong to one sweep, and their residuals are already relative.
+    # `of_tests` is False, because G' and G'' belong to one sweep, and their residuals are already relative.
     law = assessed(own, _as_curves(sweep), found, scale, times, of_tests=False)
     best = found.u[int(np.nanargmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
     G, third = (np.asarray(v) for v in model(best))
@@ -164,7 +164,7 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
     change, of_law = (own.loss[-1] / own.storage[-1] / (own.loss[0] / own.storage[0]) for own in (sweep, best))
     names = [name for name in best.law.names if name != "loss_tangent"]
     shape = [n for n, unit in zip(best.law.names, best.law.units, strict=True) if unit == "1" and n in names]
-    shape = shape or names[1:]  # of moduli, the ratios to the first modulus
+    shape = shape or names[1:]  # if all parameters are moduli, all except the first
     if "loss_tangent" in best.law.names and shape:
         told.append(
             "without --model, the constant part of the stress is also computed with the modulus at the frequency of "
@@ -179,7 +179,8 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
         )
     if np.sqrt(np.mean(np.abs((best.storage + 1j * best.loss) / (sweep.storage + 1j * sweep.loss) - 1) ** 2)) > 0.05:
         told.append(
-            "the law misses the moduli by more than 5 % on average, so it does not describe this sweep: try another law"
+            "the law does not describe this sweep, because it misses the moduli by more than 5 % on average: try "
+            "another law"
         )
     if sweep.storage[-1] < 0.8 * sweep.storage[0]:
         told.append(

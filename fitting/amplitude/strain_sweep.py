@@ -43,7 +43,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     """
     found = [t for t in tables_of(str(path), text_of(path, "a strain sweep").splitlines()) if "strain" in t.raw]
     if not found:
-        raise InputError(f"{path}: no table has a column strain in % or 1; add this column")
+        raise InputError(f"{path}: no table has a strain column (unit % or 1); add this column")
     place, notes = choose_table(str(path), found, table, "strains", lambda t: len(np.unique(t.raw["strain"])))
     chosen = found[place]
     columns = {c.quantity: (c, j) for j, c in reversed(list(enumerate(chosen.columns)))}
@@ -66,7 +66,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are ignored as requested")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:
         raise InputError(
-            f"{path}: points at {len(np.unique(strain[kept]))} different strains are left; give {FEWEST_POINTS} or more"
+            f"{path}: only {len(np.unique(strain[kept]))} different strains are left; give {FEWEST_POINTS} or more"
         )
     if np.ptp(omega[kept]) > 0.01 * omega[kept].mean():
         low, high = omega[kept].min() / 2 / np.pi, omega[kept].max() / 2 / np.pi

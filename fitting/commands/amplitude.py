@@ -18,7 +18,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         epilog="The errors (±) come from noise alone. An error of the gap is not included: 50 µm in 1 mm changes "
         f"every modulus and strain by 5 %. {EXIT_CODES}",
     )
-    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW for your own law, or all")
+    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW for your own law, or all (every law)")
     command.add_argument(
         "sweep",
         type=Path,

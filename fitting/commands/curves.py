@@ -24,7 +24,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         description="Fit hyperelastic laws to tension, compression, shear, equibiaxial and pure-shear curves together.",
         epilog=EXIT_CODES,
     )
-    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW for your own law, or all")
+    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW for your own law, or all (every law)")
     command.add_argument(
         "files",
         type=Path,
@@ -68,11 +68,12 @@ def run(options: argparse.Namespace) -> int:
     candidates = hyperelastic.candidates(options.law, options.terms)
     found, notes = curves.read_curves(options.files, options.unit or "Pa")
     if options.unit and not any("names no unit" in note for note in notes):
-        notes.append(f"--unit {options.unit} has no effect: the stress columns name their unit")
+        notes.append(f"--unit {options.unit} has no effect, because the headings of the stress columns contain a unit")
     if options.law == "all":
         left = [n for n in laws.LAWS if not hyperelastic.incompressible_form(n)]
         notes.append(
-            f"some laws are not fitted, because their energy is not an isochoric energy plus U(J): {', '.join(left)}"
+            "some laws are not fitted, because their energy is not an isochoric energy plus U(J) (J: volume ratio): "
+            f"{', '.join(left)}"
         )
     for note in [*notes, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)

@@ -19,7 +19,7 @@ from liverjax.scenes.scene import numbers_at
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation import gradients
 
-#: A note is given if the mesh error, divided by the noise, exceeds this value.
+#: A note is given if the error of the mesh or of the time steps, divided by the noise, exceeds this value.
 _TOLD = 0.3
 
 
@@ -39,7 +39,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
         help="scene, and CSV file with the columns x,y,z (or node),ux,uy,uz[,time][,sd]",
     )
     command.add_argument("--name", default="law.mu", metavar="NAME", help="parameter to map (default law.mu)")
-    command.add_argument("--length", type=float, metavar="M", help="correlation length [m] (default: size / 10)")
+    command.add_argument(
+        "--length", type=float, metavar="M", help="correlation length [m] (default: length of the body / 10)"
+    )
     command.add_argument(
         "--sphere", action="store_true", help="also fit a sphere of another stiffness; the map gives the starting point"
     )
@@ -76,7 +78,8 @@ def _problem(options: argparse.Namespace) -> Problem:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find a map, or a few parameters, of scenes. The exit code is 1 if a solve or the fit did not converge."""
+    """Find a stiffness map, or a few parameters, of the scenes. The exit code is 1 if a simulation or the fit did not
+    converge."""
     return (_map if options.parameters is None else _fit_few_numbers)(options, _problem(options))
 
 

@@ -7,8 +7,8 @@ from tqdm import tqdm
 
 
 def cost_bar(unit: str, description: str | None = None) -> tuple[tqdm, Callable[[int, float], None]]:
-    """Return a progress bar on standard error, and the function to call with every cost. The bar is off if standard
-    error is not a terminal."""
+    """Return a progress bar on standard error, and a function that must be called with every new cost. The bar is off
+    if standard error is not a terminal."""
     bar = tqdm(desc=description, unit=f" {unit}", disable=None, leave=False)
 
     def told(_: int, cost: float) -> None:
@@ -20,8 +20,8 @@ def cost_bar(unit: str, description: str | None = None) -> tuple[tqdm, Callable[
 
 @contextmanager
 def named_bar(description: str) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar on standard error. Yields the function to call with the name of each fit. The bar is off if
-    standard error is not a terminal."""
+    """Show a progress bar on standard error. Yields a function that must be called with the name of each fit. The bar
+    is off if standard error is not a terminal."""
     with tqdm(desc=description, unit=" fits", disable=None, leave=False) as bar:
 
         def told(text: str) -> None:

@@ -37,13 +37,13 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--model",
         choices=("prony", "fractional", "spectrum", "auto"),
         default="prony",
-        help="free Prony modes (default), springpots, a smooth spectrum, or the best of all by the criterion",
+        help="free Prony modes (default), springpots, a smooth spectrum, or the best by the information criterion",
     )
     command.add_argument(
         "--ramp",
         type=float,
         metavar="S",
-        help="duration [s] of the rise of the load, if no row shows it (until the first row under load); 0: a step",
+        help="duration [s] of the rise of the load before the first row under load, if no row shows it; 0: a step",
     )
     command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="ignore responses before this time")
     command.add_argument("--radius", type=float, metavar="M", help="radius of the sample [m], for torque and force")
@@ -79,7 +79,9 @@ def _said_of_rows(test: "TimeTest") -> list[str]:
 
     number, every, told = len(thinned(test)), int(test.used.sum()), []
     if number < every:
-        told.append(f"{number} of {every} points are fitted, spread over the logarithm of the time since each load")
+        told.append(
+            f"{number} of {every} points are fitted, spread over the logarithm of the time after each load change"
+        )
     first, last = test.resolved
     if test.answers_at_once:
         return told
@@ -119,7 +121,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))
     found = fits.choose_in_time(test, options.model, options.modes)
-    if options.file.suffix.lower() != ".toml":  # errors of sizes in a TOML file act in another way
+    if options.file.suffix.lower() != ".toml":  # this error is only for tests in a rheometer
         default = Simulation()
         rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
         found.details["geometry_error"] = total_error.of_geometry(rig, None)

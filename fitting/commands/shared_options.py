@@ -54,7 +54,7 @@ def check_samples(count: int | None) -> None:
 
 
 def write_cards(out: Path, model: "Maxwell") -> None:
-    """Write material cards, with a note on the limits of each program."""
+    """Write material cards, and print notes on everything that a program cannot represent."""
     from fitting.reports import material_cards
 
     for sentence in material_cards.write(out / "cards", model):
@@ -63,8 +63,9 @@ def write_cards(out: Path, model: "Maxwell") -> None:
 
 
 def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
-    """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, points are
-    ignored only because of the limits of the band and of the raw columns (`without_inertia`)."""
+    """Read a sweep, and ignore the points at which the instrument dominates. If --max-frequency is given, fewer points
+    are ignored: those outside the band, and those at which the raw torque or the raw phase shows too much inertia of
+    the instrument (`without_inertia`)."""
     from fitting.readers import rheometer
 
     try:

@@ -59,10 +59,10 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--model",
         choices=("prony", "fractional", "spectrum", "auto"),
         default="prony",
-        help="free Prony modes (default), springpots, a smooth spectrum, or the best of all by the criterion",
+        help="free Prony modes (default), springpots, a smooth spectrum, or the best by the information criterion",
     )
     command.add_argument(
-        "--method", choices=("torsion", "closed-form"), help="default torsion; closed-form for several samples"
+        "--method", choices=("torsion", "closed-form"), help="method (default torsion; several samples: closed-form)"
     )
     command.add_argument(
         "--master",
@@ -117,7 +117,7 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
         metavar="E",
         help="compression of the sample before the sweep, divided by its height (default 0); --height is the gap",
     )
-    command.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the simulated sample")
+    command.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the sample (default neo_hookean)")
     command.add_argument("--steps", type=int, default=50, help="time steps per cycle of the simulation (default 50)")
     command.add_argument(
         "--scheme", choices=("exponential", "backward_euler", "chapter"), default="exponential", help="Prony recursion"
@@ -150,7 +150,7 @@ def run(options: argparse.Namespace) -> int:
 
     _check(options)
     if options.master is not None:
-        options.method = options.method or "closed-form"  # no measurement exists at the shifted frequencies
+        options.method = options.method or "closed-form"  # a simulation cannot be compared at shifted frequencies
     elif len(options.sweep) > 1:
         from fitting.commands import samples
 
@@ -260,7 +260,7 @@ def _check(options: argparse.Namespace) -> None:
     if options.density is not None and not 100 <= options.density <= 25000:
         raise InputError(f"--density {options.density} is not possible in kg/m^3: give e.g. --density 1060")
     if options.density is not None and options.method == "closed-form" and not (options.height or options.others):
-        raise InputError(f"--density {options.density:g} needs --height too: the inertia of the sample depends on both")
+        raise InputError(f"--density {options.density:g} needs --height too: give both, as the inertia depends on both")
     _check_precompression(options)
     _check_master(options)
     if len(options.sweep) > 1 and options.master is None:
@@ -441,7 +441,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         fits[1].details.update(heavy)
     for fit in fits:
         fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
-    for fit in fits if options.precompression else ():  # after `geometry_error` is set, because it is used
+    for fit in fits if options.precompression else ():  # `compression_numbers` uses `geometry_error`
         fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
     return fits, corrected
 

@@ -64,9 +64,9 @@ def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "M
     """Read a test from a file: a TOML description of a test rig, shear waves, a further sweep, or a relaxation or creep
     test.
 
-    The points of a further sweep outside the band that the user gives are ignored. As in the first sweep, points at
-    which the instrument dominates are ignored too. If `whole` is true, the test is only predicted, and the limits of
-    the band are not applied.
+    Points of a further sweep are ignored outside the band that the user gives. As in the first sweep, points at which
+    the instrument dominates are ignored too. If `whole` is true (for a test that is only predicted), the limits of the
+    band are not applied.
     """
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion

@@ -24,7 +24,8 @@ FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5", "pro
 #: made coarser. MOST_OF_MAP: maximum number of values of a map in a divided body, because the matrices of such a map
 #: are dense.
 MOST_MEMORY, MOST_OF_MAP = 4.0, 5000
-#: Maximum correlation length of a map, divided by the size of the organ. Above it, the map would be uniform.
+#: Maximum correlation length of a map, divided by the size of the organ. With a larger length, the map would be
+#: uniform.
 LONGEST = 5.0
 
 
@@ -60,7 +61,13 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="M",
         help="standard deviation of one component (default: estimated from the data)",
     )
-    command.add_argument("--density", type=float, default=DENSITY, metavar="KG_M3", help=f"default {DENSITY:g}")
+    command.add_argument(
+        "--density",
+        type=float,
+        default=DENSITY,
+        metavar="KG_M3",
+        help=f"density of the organ [kg/m^3] (default {DENSITY:g})",
+    )
     command.add_argument("--stride", type=int, metavar="N", help="use means of N x N x N voxels (default: as needed)")
     command.add_argument("--no-map", action="store_true", help="fit only the whole organ and the regions")
     command.add_argument(

@@ -1,15 +1,15 @@
 """A stiffness map from measured displacements: a smooth field of one parameter of the law, with its uncertainty.
 
-The parameter of an element is the value in the scene times exp(m). Here m is the mean over the element of a nodal field
-(V,) with the prior of `fitting.methods.prior`. The unknown is the whitened field z, whose entries are independent with
-variance 1 in the prior. A Gauss-Newton method in a trust region (Steihaug 1983) minimises chi^2/2 + |z|^2/2. J is the
-derivative of the residuals with respect to z. The Hessian I + J^T J is never assembled: each product of the Hessian
-with a vector needs one linearised run and one transposed run. No eigenvalue of this Hessian is below 1. The norm of the
-gradient is therefore an upper bound of the distance to the minimum, in standard deviations of the map. The prior's
-standard deviation of m sets the weight of the regularisation. This standard deviation is increased until chi^2 is as
-low as the number of measured components (discrepancy principle; Morozov 1966), or until chi^2 no longer falls. The
-uncertainty comes from the same Hessian. Lanczos iterations find the largest eigenvalues of J^T J (Bui-Thanh et al.
-2013).
+The parameter of an element is the value in the scene times exp(m). Here m is the mean of a nodal field (V,) over the
+element. `fitting.methods.prior` describes the prior of this field. The unknown is the whitened field z, whose entries
+are independent with variance 1 in the prior. A Gauss-Newton method in a trust region (Steihaug 1983) minimises chi^2/2
++ |z|^2/2. J is the derivative of the residuals with respect to z. The Hessian I + J^T J is never assembled: each
+product of the Hessian with a vector needs one linearised run and one transposed run. No eigenvalue of this Hessian is
+below 1. The norm of the gradient is therefore an upper bound of the distance to the minimum, in standard deviations of
+the map. The prior's standard deviation of m sets the weight of the regularisation. This standard deviation is increased
+until chi^2 is as low as the number of measured components (discrepancy principle; Morozov 1966), or until chi^2 no
+longer falls. The uncertainty comes from the same Hessian. Lanczos iterations find the largest eigenvalues of J^T J
+(Bui-Thanh et al. 2013).
 """
 
 import re
@@ -56,7 +56,7 @@ class Field(NamedTuple):
     sd: np.ndarray  # standard deviation (V,) of m at the nodes, from data and prior
     prior_sd: np.ndarray  # standard deviation (V,) of m at the nodes, from the prior alone
     mesh_bias: np.ndarray | None  # error of m (V,) due to the meshes, to be subtracted from m; None: unknown
-    time_step_bias: np.ndarray | None  # the same due to the time steps; None: unknown, or no scene has time steps
+    time_step_bias: np.ndarray | None  # error of m (V,) due to the time steps; None: unknown, or no time steps
     deviation: float  # standard deviation of m in the prior, chosen from `DEVIATIONS`
     length: float  # correlation length of the prior [m]
     chi2: float
@@ -64,7 +64,7 @@ class Field(NamedTuple):
     reached: bool  # whether chi^2 is at most the number of components
     distance: float  # distance to the minimum: length of the next Gauss-Newton step, in standard deviations
     history: list[dict]  # one entry for each prior deviation: chi2, iterations, evaluations, seconds
-    eigenvalues: np.ndarray  # of J^T J; the data determine the directions of z with eigenvalues above 1
+    eigenvalues: np.ndarray  # largest ones of J^T J; the data determine directions of z with values above 1
     codes: tuple[int, ...]
     seconds: float
     given: np.ndarray  # (E,) True where a [[region]] of the scene, not the map, sets the modulus
@@ -212,7 +212,7 @@ class _Search:
         self.evaluations += 1
         here = _LinearRuns(self.p, deviation, z.copy(), m, np.asarray(r), J, z, tuple(int(c) for c in codes))
         here = here._replace(slope=here.pull(here.r))
-        # The next trial step may begin again at the z before this trial step.
+        # If this trial step is rejected, the next trial step begins again at the previous z.
         base = [one for one in self.last if np.array_equal(one.z, self.z)]
         self.last = [here, *(base or self.last)[:1]]
         return here
@@ -299,7 +299,8 @@ def estimate(
     here = search.at(search.z)
     if not here.finite:
         raise InputError(
-            "the simulation fails at the parameters from which the map begins: run simulate on the scene first"
+            "the simulation fails at the parameters from which the map begins: run simulate on the scene to find the "
+            "cause"
         )
     deviation, m = here.deviation, np.asarray(here.m)
     values, vectors = _measured_directions(here, len(m), options.modes)
@@ -366,8 +367,8 @@ def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
 
 
 def _measured_directions(here: _LinearRuns, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the k largest eigenvalues (k,) of J^T J, k = `modes` or fewer, and their eigenvectors (n, k) in whitened z
-    (n,)."""
+    """Return the k largest eigenvalues (k,) of J^T J and their eigenvectors (n, k), for the n entries of z. k is
+    `modes`, or less if there are too few entries or residuals."""
     k = min(modes, n - 2, len(here.r))
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=lambda z: here.pull(here.push(z)), dtype=float)
     # The prior determines the directions with an eigenvalue far below 1, so a low accuracy of these eigenvalues is
@@ -377,8 +378,8 @@ def _measured_directions(here: _LinearRuns, n: int, modes: int) -> tuple[np.ndar
 
 
 def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return (I + J^T J)^-1 g (V,), by conjugate gradients with a relative tolerance of 1 %. This is accurate enough
-    for first-order estimates. The eigenvalues and eigenvectors of J^T J give the preconditioner."""
+    """Return (I + J^T J)^-1 g (V,) for a vector g (V,), by conjugate gradients with a relative tolerance of 1 %. This
+    is accurate enough for first-order estimates. The eigenvalues and eigenvectors of J^T J give the preconditioner."""
     n, shrink = len(g), values / (1 + values)
 
     def solved(z: np.ndarray) -> np.ndarray:

@@ -45,9 +45,9 @@ def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> j
 
 def start_from(problem: Problem, field: Field) -> np.ndarray:
     """Return the starting point u (6,) of the sphere (see `estimate`) from the map. The sphere consists of the elements
-    whose ln(modulus) differs from the background by more than half of the largest difference. Differences are divided
-    by the standard deviation of the map. Otherwise the sphere could begin at large values where the data contain little
-    information, for example at corners.
+    whose ln(modulus) differs from the background by more than half of the largest difference. For this comparison, the
+    differences are divided by the standard deviation of the map. Without this division, the sphere could begin at large
+    differences in regions where the data contain little information, for example at corners.
     """
     mesh = problem.scenes[0].mesh
     middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)

@@ -26,8 +26,8 @@ from fitting.readers.frequency_sweep import Sweep, some
 from fitting.rigs import compression
 from liverjax import laws
 
-#: If the standard error of an instrument error, divided by its prior standard deviation, is at least this, the data do
-#: not determine the instrument error.
+#: If the standard error of an instrument error, divided by its prior standard deviation, is at least this value, the
+#: data do not determine the instrument error.
 UNTOLD = 0.9
 #: ROUNDS: maximum number of rounds; each round is a fit and a correction. HALVINGS: maximum number of halvings of a
 #: correction that would make a modulus 0 or negative.
@@ -38,7 +38,8 @@ SETTLED = 1e-6
 
 
 class Nuisance(NamedTuple):
-    """An error of the instrument, in standard deviations of its prior."""
+    """An error of the inertia or friction that the instrument subtracts. Its size is given in standard deviations of
+    its prior."""
 
     name: str
     moved: np.ndarray  # (n,) change of G* [Pa] at the n frequencies if the error is one standard deviation
@@ -46,7 +47,8 @@ class Nuisance(NamedTuple):
 
     @property
     def reported(self) -> str:
-        """Name of this error in fit.json. The value there is the true quantity minus the subtracted quantity."""
+        """Name of this error in fit.json. The value there is the true quantity minus the subtracted quantity; for the
+        inertia, this difference is divided by the subtracted inertia."""
         return "friction_off_by_N_m_s" if self.name == "friction" else "inertia_off_by"
 
     def told(self, deviations: float) -> str:

@@ -40,8 +40,10 @@ class Test(NamedTuple):
     predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
     measured: np.ndarray  # (n,)
     sd: np.ndarray  # (n,) standard deviation of the noise
-    mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) change on an infinitely fine mesh; None: no mesh
-    time_step_error: Callable[[Law, Prony], np.ndarray] | None = None  # (n,) change with infinitely small time steps
+    #: Change (n,) of the predicted values on an infinitely fine mesh; None: the test has no mesh.
+    mesh_error: Callable[[Law, Prony], jax.Array] | None = None
+    #: Change (n,) of the predicted values with infinitely small time steps; None: the test has no time steps.
+    time_step_error: Callable[[Law, Prony], np.ndarray] | None = None
 
 
 def sweep(data: Sweep) -> Test:
@@ -117,7 +119,7 @@ def fit(
     gives the names of these parameters.
 
     If tests are simulated in rigs, `mesh_bias` and `time_step_bias` are the errors of each parameter due to meshes and
-    time steps. Subtract both to correct the parameter. A warning is given if one is larger than the standard error.
+    time steps. Subtract both to correct the parameter. A warning is given if one of them exceeds the standard error.
 
     Args:
         tests: one or more tests.

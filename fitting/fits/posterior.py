@@ -69,8 +69,8 @@ class Posterior(NamedTuple):
         if self.simulated and not self.simulated["largest_difference"] < DIFFERENT:
             out.append(
                 "the posterior was computed for small strain (linear rig) instead of with the simulation. In "
-                f"{SIMULATED} simulated draws, its log density is wrong by up to "
-                f"{self.simulated['largest_difference']:.2g}, so its intervals are only approximate"
+                f"{SIMULATED} simulated draws, the log density is wrong by up to "
+                f"{self.simulated['largest_difference']:.2g}, so the intervals of the posterior are only approximate"
             )
         if self.r_hat[worst] < AGREED:
             return out
@@ -363,8 +363,8 @@ def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np
     return target(kind, residuals, sweep.resolved, size, sweep.noise_given)
 
 
-#: SIMULATED: number of draws that are simulated. DIFFERENT: the program warns if the log density of one of them differs
-#: by more from its approximation.
+#: SIMULATED: number of draws that are simulated. DIFFERENT: the program warns if the approximate log density of one of
+#: these draws is wrong by more than this value.
 SIMULATED, DIFFERENT = 12, 0.1
 
 
@@ -429,7 +429,8 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
 
 
 def _beside_offset(residuals: Callable, offset: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of u (W, P): the residuals (W, m), made uncorrelated if all errors contain a common offset.
+    """Return a function from u (W, P) to uncorrelated residuals (W, m). The measured values contain a common offset
+    error, so their residuals are correlated, and the function transforms the residuals.
 
     The covariance of m residuals is s^2 (I + d d^T) with the noise s. `offset`: d (m,), the change of all residuals
     by one standard error of the offset, divided by s. The residuals are multiplied by (I + d d^T)^(-1/2).

@@ -73,8 +73,8 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
     lost = np.flatnonzero(~(np.isfinite(G) & (G.real > 0) & (G.imag > 0)))
     if lost.size:
         raise InputError(
-            f"{sweep.source or 'sweep'}: at {hertz[lost[0]]:.3g} Hz the inertia of the sample is larger than the "
-            "modulus; exclude such frequencies with --max-frequency, or check --density and --height"
+            f"{sweep.source or 'sweep'}: at {hertz[lost[0]]:.3g} Hz the inertia of the sample is too large to compute "
+            "the modulus; exclude such frequencies with --max-frequency, or check --density and --height"
         )
     change = np.abs(G / seen - 1)
     k, notes = int(change.argmax()), sweep.notes

@@ -148,8 +148,8 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     return out
 
 
-#: _STRANGE: a sample is reported as an outlier if it is less probable than this value that any of the samples differs
-#: so much by chance. _FEWEST: minimum number of samples for this test.
+#: _STRANGE: a sample is reported as an outlier if the probability that any of the samples differs so much by chance is
+#: below this value. _FEWEST: minimum number of samples for this test.
 _STRANGE, _FEWEST = 0.05, 4
 #: _APART: a sample is reported as an outlier only if its value, divided by the mean of the others, is above this ratio
 #: or below its inverse. _UNSURE: values whose logarithm has a larger standard error are not compared.
@@ -228,7 +228,7 @@ def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[st
     fewer, way = (above, "above") if len(above) < len(below) else (below, "below")
     return [
         f"{', '.join(fewer)}: the {name} is at least a factor of {np.exp(gaps.max()):.2g} {way} that of the other "
-        "samples; check units and sizes. The population's intervals contain this factor"
+        "samples; check units and sizes. This factor widens the population's intervals"
     ]
 
 

@@ -70,7 +70,7 @@ class Simulation(NamedTuple):
 
 
 #: Up to this strain at the rim, the derivatives are computed with the linear rig. The relative error of the derivatives
-#: is below the strain. With inertia, the error of the derivatives also contains the effect of the mesh on the inertial
+#: is then at most 1 %. With inertia, the error of the derivatives also contains the effect of the mesh on the inertial
 #: forces.
 LINEAR_STRAIN = 1e-2
 
@@ -174,8 +174,8 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
 
 @cache
 def _without_mesh(radius: float, gap: float, law: str, strain: float) -> tuple[Glued, Glued]:
-    """Return the result of `glued_compression.glued` for the name of a law. A fit needs this result twice, so it is
-    cached."""
+    """Return the factors and the force of a sample that is compressed between glued plates, and their estimated mesh
+    errors (see `glued_compression.glued`). `law`: name of the law. A fit needs this result twice, so it is cached."""
     return glued(radius, gap, laws.typical(law), strain)
 
 
@@ -413,7 +413,7 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
 def _cause(closed: Fit, simulated: Fit, k: int) -> tuple[str, str]:
     """Return two parts of a warning about the change of parameter k: the cause with a verb ("… changes"), and the
     remedy."""
-    # The closed form has no inertia in this case.
+    # In this case, the simulation contains the inertia of the sample, but the closed form does not.
     if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):
         return (
             "the sample's inertia and the discretisation change",
@@ -426,5 +426,5 @@ def _cause(closed: Fit, simulated: Fit, k: int) -> tuple[str, str]:
         )
     of_mesh, of_steps = simulated.uncertainty.mesh_bias, simulated.uncertainty.time_step_bias
     if of_mesh is not None and of_steps is not None and abs(of_mesh[k]) > abs(of_steps[k]):
-        return "the mesh of the simulation changes", "use the closed form"
-    return "the simulation's discretisation changes", "raise --steps, or use the closed form"
+        return "the mesh of the simulation changes", "use the closed form (--method closed-form)"
+    return "the simulation's discretisation changes", "raise --steps, or use the closed form (--method closed-form)"

@@ -65,7 +65,7 @@ _HIDDEN, _MOVED = 2.0, 0.05
 #: the factor RUNAWAY, and its error is at least FREE times its value. The second condition is needed because typical
 #: sizes hold for large strains. At small strains, coefficients of higher terms may be far larger and still determined.
 RUNAWAY, FREE = 1e6, 30.0
-#: Lower bound of the relative noise for the limit FREE, because no test is more accurate.
+#: The comparison with FREE assumes at least this relative noise, because no test is more accurate.
 _LEAST_NOISE = 1e-3
 #: Uneven noise differs in size between points. If the standard error for uneven noise exceeds the error for equal noise
 #: by this factor, the correlation for uneven noise is used.
@@ -93,8 +93,8 @@ def initial_modulus(curves: list[Curve]) -> float:
 
 def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawFit:
     """Minimise the sum of squares of the relative misfit: the difference of the nominal stress P of the law and the
-    measured one, divided by the root mean square of the curve's stress. The best minimum from many starting points is
-    returned."""
+    measured one, divided by the root mean square of the curve's stress. A stress that falls while the sample is
+    deformed further also adds to this sum (`STIFFNESS`). The best minimum from many starting points is returned."""
     scale = initial_modulus(curves)
     F, at = jnp.asarray(np.concatenate([c.F for c in curves])), np.cumsum([0] + [len(c.stress) for c in curves])
     i, j = (jnp.asarray(np.repeat([c.component[k] for c in curves], np.diff(at))) for k in (0, 1))
@@ -195,7 +195,7 @@ def _of_other_minima(
 
 
 #: First words of the warning about factors that multiply the stress of each test.
-OWN_FACTORS = "the stress of each test seems to have an individual factor"
+OWN_FACTORS = "the stress of each test seems to be multiplied by an individual factor"
 
 
 def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: int) -> list[str]:
@@ -210,8 +210,9 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
         )
     if factors is not None and factors.shown:
         told.append(
-            f"{OWN_FACTORS}, which scatters by {100 * factors.deviation:.2g} %, for example due to another sample or "
-            f"a wrong size of the sample. The standard errors contain such factors, estimated from {tests} tests"
+            f"{OWN_FACTORS}. These factors scatter by {100 * factors.deviation:.2g} %, for example due to different "
+            f"samples or wrong sizes of the samples. The standard errors contain this scatter (estimated from {tests} "
+            "tests)"
         )
     return told
 
@@ -290,8 +291,8 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
     if fit.limits:
         ran = ", ".join(f"{name} to {end}" for name, end in fit.limits.items())
         told.append(
-            f"the law runs into its limit ({ran}). The limit fits best; the given misfit and G0 hold for this limit. "
-            "The value of this parameter has no meaning: use a law without this parameter"
+            f"the fit is best at a limit of the law ({ran}). The given misfit and G0 hold for this limit. The value of "
+            "such a parameter has no meaning: use a law without this parameter"
         )
     for name, value, error in zip(fit.names, fit.values, fit.standard_errors, strict=True):
         if name not in fit.limits and not error * quantile < abs(value):
@@ -371,7 +372,7 @@ def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
     return told
 
 
-#: Two laws describe the data equally well if their AICc differs by less than this.
+#: Two laws describe the data equally well if their AICc differs by less than this value.
 TIE = 4.0
 
 

@@ -48,7 +48,7 @@ class TimeFit(NamedTuple):
     solution: Solution
     uncertainty: Estimate
     converged: bool
-    time: np.ndarray  # times (m,) [s] of the fitted values
+    time: np.ndarray  # times (m,) [s] of the measured values
     measured: np.ndarray  # (m,) stress [Pa], or strain [1] in creep
     fitted: np.ndarray
     scales: np.ndarray  # (m,) scales that divide the residuals
@@ -84,7 +84,7 @@ def relative_sizes(measured: np.ndarray, fitted: np.ndarray, scales: np.ndarray)
 
 @lru_cache(maxsize=8)
 def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
-    """Return a function from (u, time, driven, rows, answer, scales) to the residuals (m,) of m fitted values, for
+    """Return a function from (u, time, driven, rows, answer, scales) to the residuals (m,) of m measured values, for
     relaxation or creep."""
     natural = generalised_maxwell.natural_fluid if name == FLUID.name else generalised_maxwell.natural
 
@@ -206,14 +206,14 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
 
 
 def refitted(fit: TimeFit, test: TimeTest) -> TimeFit:
-    """Return a fit of Prony modes, of the same kind and number as in `fit`, to `test`. `test` is a changed form of the
-    test to which `fit` belongs."""
+    """Fit Prony modes to `test`, with the same kind and number of modes as in `fit`. `test` is a changed form of the
+    test that `fit` describes."""
     return _one_model(test, thinned(test), fit.modes, fit.kind)
 
 
 def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
-    """Return a function and its data. The function computes the residuals (m,) of m fitted values from the variables u
-    of the fit and these data.
+    """Return a function and its data. The function computes the residuals (m,) of m measured values from the variables
+    u of the fit and these data.
 
     Args:
         test: data.
@@ -223,8 +223,8 @@ def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Arr
 
 
 def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
-    """Return n times (n,), the driven quantity (n,) at these times, the indices (m,) of the m fitted values among these
-    times, the fitted values (m,) themselves, and their scales (m,)."""
+    """Return n times (n,), the driven quantity (n,) at these times, the indices (m,) of the m measured values among
+    these times, the measured values (m,) themselves, and their scales (m,)."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
     kept[rows] = True
@@ -257,7 +257,7 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
         kind: "sweep", "dispersion", "relaxation" or "creep".
         model: Prony modes.
         at: angular frequencies (n,) [rad/s], or times (n,) [s].
-        drive: for relaxation and creep, the driven quantity (n,) and the indices (m,) of the fitted values among the
+        drive: for relaxation and creep, the driven quantity (n,) and the indices (m,) of the measured values among the
             times. For dispersion, the density and the indices (m,) of the measured values among velocities [m/s]
             followed by attenuations [1/m].
     """
@@ -275,8 +275,8 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
 
 
 def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stress divided by the strain (m,) [Pa] at the m fitted values, which is roughly the relaxation modulus
-    G(t). Also return the times (m,) [s] of these values since the loading began."""
+    """Return the stress divided by the strain (m,) [Pa] at the m measured values, which is roughly the relaxation
+    modulus G(t). Also return the times (m,) [s] of these values since the loading began."""
     rows = thinned(test)
     driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
     ratio = answer / np.maximum(driven, 1e-6 * driven.max())
@@ -314,7 +314,7 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
         for f in tried
     ]
     elastic = _without_relaxation(test, chosen)
-    advice = "try fewer modes" if chosen.modes > 1 else "look at the data"
+    advice = "try fewer modes" if chosen.modes > 1 else "check the data file"
     out = [_told_of_elastic(elastic)] if elastic else []
     out += (
         []
@@ -323,7 +323,7 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     )
     mean = float(chosen.relative_errors.mean())
     if mean > 0.05:
-        out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try more modes, or look at the data")
+        out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try more modes, or check the data")
     closer = min(tried, key=criterion)
     if lowest < criterion(chosen) - 10 and closer.modes != chosen.modes:
         errors = [float(f.relative_errors.mean()) for f in (closer, chosen)]

@@ -25,9 +25,9 @@ from fitting.waves.dispersion import Dispersion
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: ROUNDS: maximum number of rounds; each round is a fit, and then new weights of the tests. SETTLED: the rounds end if
-#: no noise changes by more than this fraction. QUIETEST: minimum relative noise of a test. FIRST: the same in round 1.
-#: STARTS: number of starting points. LEAST_FREEDOM: least degrees of freedom with which a test determines its noise.
+#: ROUNDS: maximum number of rounds, each with a fit and then new weights of the tests. SETTLED: the rounds end if the
+#: noise of no test changes by more than this fraction. QUIETEST: minimum relative noise of a test. FIRST: relative
+#: noise in round 1. STARTS: number of starting points. LEAST_FREEDOM: degrees of freedom needed for a noise.
 ROUNDS, QUIETEST, STARTS, FIRST, SETTLED, LEAST_FREEDOM = 12, 1e-5, 6, 0.03, 0.01, 3.0
 #: The tests contradict each other if the noise of a test in the common fit, divided by its noise in a fit to this test
 #: alone, exceeds this ratio.
@@ -98,8 +98,8 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """Return the divisors for relative errors of the measured values: mostly the measured values. In relaxation and
-    creep, they have a lower bound. If errors of the phase angle cause the scatter of G'', its divisor is |G*|."""
+    """Return the divisors for relative errors: the measured values, with a lower bound in relaxation and creep. If
+    errors of the phase angle cause the scatter of G'', its divisor is |G*|."""
     _, measured, scales = reported_numbers(test)
     if isinstance(test, Sweep) and test.sd_estimated:
         return np.concatenate([test.storage, np.hypot(test.storage, test.loss)])
@@ -119,7 +119,7 @@ def least_noise(test: Measured) -> float:
 
 
 def first_noise(test: Measured) -> float:
-    """Return the noise of a test in round 1, divided by its scales. The relative noise is the same for all tests."""
+    """Return the noise of a test in round 1, divided by its scales. All tests begin with the relative noise `FIRST`."""
     return max(least_noise(test), FIRST * float(np.median(np.abs(sizes_of(test)) / reported_numbers(test)[2])))
 
 
@@ -277,8 +277,8 @@ def noises(
     tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, taken: np.ndarray | float
 ) -> np.ndarray:
     """Return the noise of each test, relative to its scales: the root of its squared residuals per degree of freedom.
-    With less than `LEAST_FREEDOM`, this noise is at least `first_noise`. `used`: noise in the fit. `taken`: Jacobian of
-    the residuals, or effective number of parameters."""
+    With fewer than `LEAST_FREEDOM` degrees, it is at least `first_noise`. `used`: noise in the fit. `taken`: Jacobian
+    of the residuals, or effective number of parameters."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals[: counts.sum()], np.cumsum(counts)[:-1])
     freedoms = degrees_of_freedom(np.asarray(taken), counts) if np.ndim(taken) else counts * (1 - taken / counts.sum())
@@ -358,7 +358,7 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     )
 
 
-#: The program warns about a rise of the load that no row shows if it lasts longer than this fraction of a relaxation
+#: The program warns if a rise of the load between two rows lasts longer than this fraction of the shortest relaxation
 #: time.
 _SHORT = 0.2
 
@@ -393,7 +393,8 @@ def disagreements(shares: list[Share]) -> list[str]:
 def missed(shares: list[Share]) -> list[str]:
     """Return a warning for each test with a large misfit both in the common fit and in a fit to this test alone."""
     return [
-        f"{viscoelastic.MISSES} of {s.source or s.name} by {100 * s.misfit:.2g} %: if this is not noise, change --model"
+        f"{viscoelastic.MISSES} of {s.source or s.name} by {100 * s.misfit:.2g} %: if this is not noise, use another "
+        "--model"
         for s in shares
         if s.misfit > MISSED and s.noise <= APART * s.alone
     ]
@@ -413,7 +414,7 @@ def structured(fit: Together) -> list[str]:
                 out.append(
                     f"structured misfit of {test.source or name_of(test)}{what}: the residuals change sign only "
                     f"{runs - 1} times in {len(part)} values (probability by chance {chance:.1g}). The model is "
-                    "inadequate, or the tests do not agree there"
+                    "inadequate, or the tests do not agree"
                 )
     return out
 

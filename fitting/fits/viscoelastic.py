@@ -53,7 +53,7 @@ class Fit(NamedTuple):
     details: Content
     kind: Kind = Kind()
     parameters: Estimate | None = None  # parameters of another model; None: the modes are the parameters
-    rivals: tuple["Fit", ...] = ()  # the other models that could be chosen
+    rivals: tuple["Fit", ...] = ()  # fits of the other models that could have been chosen
 
     @property
     def modes(self) -> int:
@@ -217,7 +217,7 @@ def _of_noise_shown(
 def _of_repeats(J: np.ndarray, r: np.ndarray, slope: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
     """Return the square root of the covariance of the parameters for noise that is correlated between repeated values
     of G', or of G'', at one frequency. Returns None if the residuals show no such noise."""
-    of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G' and G'' have separate factors
+    of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G' and G'' form separate groups
     _, group, counts = np.unique(of_row, return_inverse=True, return_counts=True)
     if np.median(counts) < 2:
         return None
@@ -242,7 +242,7 @@ def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> 
     where = f"{'storage' if worst < n else 'loss'}_modulus at {sweep.angular_frequency[worst % n] / (2 * np.pi):.3g} Hz"
     return (
         f"{MISSES} by {100 * e.mean():.2g} % on average and by {100 * e.max():.3g} % in {where}: "
-        f"try {'another --model' if kind.values else 'more modes or another --model'}, or look at the data",
+        f"try {'another --model' if kind.values else 'more modes or another --model'}, or check the data",
     )
 
 
@@ -356,7 +356,7 @@ def closer_but_not_chosen(modes: int, errors: list[float], converged: bool) -> s
     a, b = (100 * e for e in errors)
     return (
         f"{modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but {reason}: "
-        f"--modes {modes} uses them anyway"
+        f"to use them anyway, give --modes {modes}"
     )
 
 

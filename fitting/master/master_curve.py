@@ -14,14 +14,15 @@ from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: The program warns if the distance of a sweep from the common curve exceeds both FAR_OFF and SCATTERS times the
-#: scatter of the points. It also warns if the standard error of a shift factor exceeds LOOSE [decades].
+#: The program warns if the relative distance of a sweep from the common curve is larger than FAR_OFF, and also larger
+#: than SCATTERS times the scatter of the points. It also warns if the standard error of a shift factor is larger than
+#: LOOSE [decades].
 FAR_OFF, SCATTERS, LOOSE = 0.05, 2.0, 0.3
-#: Relative distances from the curve below this value may come from the spline alone. Then no factors of the moduli are
-#: reported.
+#: If the relative distance of the points from the curve is below this value, the spline alone may cause this distance.
+#: Then no factors that multiply the moduli are reported.
 SMOOTH = 1e-3
-#: Factors that multiply the moduli (vertical shifts) are reported if the probability of the same improvement by chance
-#: is below this.
+#: Factors that multiply the moduli (vertical shifts) are reported only if the probability of the same improvement by
+#: chance is below this value.
 CHANCE = 1e-3
 #: Factors that multiply the moduli are reported only if they reduce the distance of the sweeps from one curve to less
 #: than this fraction of the distance without such factors.
@@ -43,8 +44,8 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
 
     Args:
         data: sweeps at two or more temperatures.
-        reference: reference temperature [K]; the nearest measured temperature is used. None: the middle temperature, or
-            the temperature whose given shift factor is nearest to 1.
+        reference: reference temperature [K]; the nearest measured temperature is used. None: the middle temperature or,
+            if the file gives shift factors, the temperature with the factor nearest to 1.
         vertical: whether factors that multiply the moduli are fitted too. Such factors cannot be fitted if the file
             gives the shift factors.
     """
@@ -58,7 +59,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
     untold: list[str] = []
     if data.shift_factors is not None:
         log_a = np.log10(data.shift_factors)
-        if reference is None:  # the temperature to which the given factors refer
+        if reference is None:  # the given factors refer to the temperature with the factor 1
             place = int(np.argmin(np.abs(log_a)))
         found = shifts.known_shifts(data.sweeps, T, place, log_a - log_a[place])
     else:
@@ -84,8 +85,8 @@ def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
 
 
 def _scatter_of_points(sweeps: list[Sweep]) -> float:
-    """Return the relative scatter of the points about a smooth curve, as the median over all sweeps. It is 0 if there
-    are too few points."""
+    """Return the relative scatter of the points about a smooth curve, as the median over all sweeps. The result is 0 if
+    there are too few points."""
     each = [scatter(*merged(s.angular_frequency, G)) for s in sweeps for G in (s.storage, s.loss)]
     known = [own for own in each if np.isfinite(own)]
     return float(np.median(known)) if known else 0.0
@@ -123,7 +124,7 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     (F-test)."""
     try:
         other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
-        # For the F-test, both fits use the same distance between knots, the smaller one of the two fits.
+        # For the F-test, both fits use the same distance between knots: the smaller of the two chosen distances.
         knots = min(found.knots, other.knots)
         alone, both = (
             shifts.found(sweeps, found.temperatures, found.reference, vertical, (knots,)) for vertical in (False, True)

@@ -23,7 +23,7 @@ from liverjax.core.errors import InputError
 KNOTS, SMOOTH = (0.4, 0.6, 0.9, 1.35, 2.0, 3.0), 1e-3
 #: LONGEST: maximum step of a factor in one iteration [decades]. The iteration ends if all steps are below CONVERGED.
 LONGEST, CONVERGED = 0.3, 1e-6
-#: Two settings of the first estimate of a shift. OVERLAP: minimum fraction of a sweep that overlaps with the
+#: Settings for the first estimate of a shift. OVERLAP: minimum fraction of a sweep that must overlap with the
 #: neighbouring sweep. REACH: shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
 #: Two sweeps match within the noise if their mean square distance, divided by the variance of their noise, is at most
@@ -67,7 +67,7 @@ def found(
         temperatures: (K,) [K], ascending.
         reference: index of the sweep that is not shifted.
         vertical: whether factors b_T that multiply the moduli are fitted too.
-        tried: distances between two knots of the curve [decades] to try.
+        tried: distances between two knots of the curve [decades] that are tried.
 
     Raises:
         InputError: two sweeps at neighbouring temperatures do not match at any shift, or do not overlap after the best
@@ -96,8 +96,9 @@ def sum_of_squares(sweeps: Sequence[Sweep], shifts: Shifts) -> float:
 
 
 def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
-    """Return the result with the lowest corrected information criterion. If there are too few data for each of the
-    curves, return the result with the largest distance between knots. `factors`: number of fitted factors.
+    """Return the result with the lowest corrected information criterion. If the data are too few to compute this
+    criterion for any result, return the result with the largest distance between knots. `factors`: number of fitted
+    factors.
     """
     data = 2 * sum(len(s.storage) for s in sweeps)
 
@@ -239,7 +240,7 @@ def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: 
         right.append(y - B @ c)
     smooth = np.kron(np.eye(2), _smoothness(size))
     A = np.vstack([*rows, np.hstack([np.zeros((len(smooth), 2 * K)), smooth])])
-    # The coefficients already minimise the cost, so the rows of the penalty have the right-hand side 0.
+    # The rows of the penalty have the right-hand side 0, so they keep the change of the coefficients smooth.
     return A, np.concatenate([*right, np.zeros(len(smooth))])
 
 
@@ -286,10 +287,10 @@ def _over(fixed: tuple, moving: tuple) -> float | None:
         score = max(float(np.mean(np.square(apart))), noise), -int(inside.sum())
         if score < best:
             best, where = score, float(s)
-    return where if best[0] < 0.25 else None  # sweeps do not match at a root mean square distance of half a decade
+    return where if best[0] < 0.25 else None  # no match if the distance is half a decade or more
 
 
 def _variance(columns: tuple) -> float:
-    """Return the mean noise variance of log10 G' and log10 G''. It is 0 if there are too few points."""
+    """Return the mean noise variance of log10 G' and log10 G''. The result is 0 if there are too few points."""
     each = [scatter(*merged(10.0 ** columns[0], 10.0 ** columns[j])) / np.log(10) for j in (1, 2)]
     return float(np.mean(np.square(each))) if np.all(np.isfinite(each)) else 0.0

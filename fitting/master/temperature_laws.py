@@ -13,8 +13,8 @@ import scipy.optimize
 
 from fitting.master.shifts import Shifts
 
-#: GAS: molar gas constant [J / (mol K)]. LEAST: standard error that is added to given shift factors [decades]; a tenth
-#: of it is added to fitted ones.
+#: GAS: molar gas constant [J / (mol K)]. LEAST: standard error [decades] that is added to the errors of given shift
+#: factors. A tenth of this value is added to the errors of fitted shift factors.
 GAS, LEAST = 8.314462618, 0.01
 
 
@@ -73,8 +73,8 @@ def _arrhenius(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw:
 
 
 def _wlf(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw | None:
-    """Fit the WLF law. Return None if the curvature of log a_T over temperature has the opposite sign, because then the
-    law has no finite parameters."""
+    """Fit the WLF law. Return None if the fitted C1 is not between 0 and 1000, or if C2 is not below 10,000 K. This
+    happens if the curvature of log a_T over temperature has the opposite sign to that of the law."""
     W = _whitening(shifts)
 
     # C2 must stay above T0 minus the lowest temperature, because the law has a pole at T0 - C2.

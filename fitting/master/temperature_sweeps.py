@@ -22,7 +22,7 @@ class AtTemperatures(NamedTuple):
 
     sweeps: list[Sweep]
     temperatures: np.ndarray  # (K,) [K], ascending
-    shift_factors: np.ndarray | None  # (K,) shift factors a_T; None: the files give none
+    shift_factors: np.ndarray | None  # (K,) shift factors a_T; None if the files give no shift factors
 
 
 def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
@@ -87,14 +87,16 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
             )
         T = np.full(len(sweep.storage), float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C"))
     if np.any(T <= 0):
-        raise InputError(f"{path}: a temperature of {celsius(T.min()):.4g} °C is below absolute zero; check its unit")
+        raise InputError(f"{path}: a temperature of {celsius(T.min()):.4g} °C is below absolute zero; check the unit")
     order = np.argsort(T, kind="stable")
     group = np.empty(len(T), int)
     group[order] = np.concatenate([[0], np.cumsum(np.diff(T[order]) >= SAME)])
     factors = raw.get("shift_factor", np.full(len(T), np.nan))
     if np.any(factors <= 0):
-        raise InputError(f"{path}: shift_factor = {factors.min():g} is not above 0; give positive factors of frequency")
-    # Every temperature has the same frequencies. So a note that frequencies repeat would be wrong.
+        raise InputError(
+            f"{path}: shift_factor = {factors.min():g} is not above 0; give positive factors of the frequency"
+        )
+    # If a table has several temperatures, the same frequencies occur at each of them. A note on this would be wrong.
     if group.max() > 0:
         sweep = sweep._replace(notes=tuple(note for note in sweep.notes if REPEATED not in note and note != SORTED))
     out = []

@@ -17,7 +17,7 @@ from fitting.methods.noise.alike_noise import Alike, along_rows
 from fitting.methods.noise.uneven_noise import uneven_root
 
 _GRID = 200
-#: If the noise, divided by the fitted force, is below this value, the residuals are roundoff.
+#: If the noise, divided by the largest fitted force, is below this value, the residuals are roundoff.
 _NOISELESS = 1e-7
 
 
@@ -95,7 +95,7 @@ def fit_contact(
     noise = float(np.sqrt(residuals @ residuals / (len(force) - J.shape[1])))
     sizes, correlation, alike = _errors_of_any_noise(J, residuals, noise)
     independent = None if alike is None else alike.independent
-    # Offset and tilt, then their errors. Each is 0 if the chosen base line does not have this term.
+    # The two pairs are (offset, tilt) and their errors. A term that the chosen base line does not have is 0.
     (offset, tilt), (offset_error, tilt_error) = (
         np.append(v, np.zeros(2))[:2] for v in (numbers[1:], sizes[2:] * np.abs(force).max())
     )
@@ -121,8 +121,8 @@ def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> 
     return np.max(errors, axis=0), float(correlations[largest][0, 1]), alike
 
 
-#: _FREE: this first fraction of the approach is before contact, even if the base line has a tilt. _FEWEST: minimum
-#: number of points in this part.
+#: _FREE: only this fraction of the depths before the fitted contact point certainly lies before contact, because a tilt
+#: of the base line moves the fitted contact point. _FEWEST: minimum number of points in this part.
 _FREE, _FEWEST = 0.7, 8
 #: A tilt is used only if |tilt| / standard error exceeds _SEEN in a fit of the approach alone and _CLEAR in the fit of
 #: the whole curve.
@@ -138,8 +138,8 @@ def fit_with_offset(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[
     plain, free = (fit_contact(depth, force, unit_force, base) for base in BASES[:2])
     if free.before < _FEWEST or not free.modulus > 0:
         return plain
-    # If the offset is large, the plain fit explains it as a contact force and has no points before contact. In this
-    # case, the offset is used only if the fit becomes clearly better and the force does not rise before contact.
+    # If the offset is large, the fit without an offset explains it as a contact force and has no points before contact.
+    # In this case, the offset is used only if the fit becomes clearly better and the force before contact is constant.
     better = np.sum(plain.residuals**2) - np.sum(free.residuals**2) > _CLEAR**2 * free.noise**2
     slope, error = _slope_and_error(depth[depth <= free.contact_point], force[depth <= free.contact_point])
     flat = abs(slope) < _SEEN * error
@@ -157,8 +157,8 @@ def _slope_and_error(depth: np.ndarray, force: np.ndarray) -> tuple[float, float
 def fit_without_tilt(
     depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], plain: ContactFit
 ) -> ContactFit | None:
-    """Fit with a straight base line if the force rises or falls during the approach and the fit of the whole curve
-    confirms this. Otherwise return None.
+    """Fit the curve with a tilted base line if the force rises or falls before contact and the fit of the whole curve
+    confirms this tilt. Otherwise return None.
 
     Args:
         depth, force, unit_force: see `fit_contact`.

@@ -55,15 +55,15 @@ def estimated(
     deviations_given: bool = True,
     effective: float | None = None,
 ) -> Estimate:
-    """Return the estimate at a minimum. The delta method converts the covariance of the unknowns u to the reported
-    parameters.
+    """Return the estimate for a minimum that a search has found. The delta method converts the covariance of the
+    unknowns u to the reported parameters.
 
     Args:
         names: names of the parameters to report.
         natural_of: function that computes these parameters (P,) from the unknowns u.
         found: result of the search over u. If `found` contains NumPy arrays, `natural_of` must work in
             `host.with_jacobian`.
-        components: number of residuals that come from measured values. Without a prior, all other residuals are 0.
+        components: number of residuals that come from measured values. If u has no prior, all other residuals are 0.
         deviations_given: whether the standard deviations of the data are given, see `noise_factor`.
         effective: effective number of parameters that the data determine, if u has a prior. The residuals of the prior
             then follow the `components` residuals of the data.
@@ -108,7 +108,7 @@ def noise_factor(residuals: np.ndarray, freedom: float, deviations_given: bool) 
 
     If no standard deviations are given, the noise is estimated from the residuals. Given standard deviations are used
     unchanged, unless the residuals are larger. In that case, the errors are enlarged in the ratio of the residuals to
-    the deviations. They are never reduced (the rule of the Particle Data Group).
+    the deviations. The errors are never reduced (the rule of the Particle Data Group).
     """
     estimate = float(np.sqrt(np.sum(residuals**2) / max(1, freedom)))
     return max(1.0, estimate) if deviations_given else estimate
@@ -156,7 +156,7 @@ def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
 
 def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
     """Return the estimate with the systematic errors (`shared`) of `other` added. The ratio of each error to the value
-    of its parameter stays the same."""
+    of its parameter is the same as in `other`."""
     if other.shared is None:
         return estimate
     known = other.values != 0
@@ -175,7 +175,7 @@ UNKNOWN = 100.0
 
 def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], missing: np.ndarray) -> np.ndarray:
     """Return the change (P,) of the parameters due to the errors of the meshes, to first order. `missing` (n,): errors
-    of the meshes in the simulated data, divided by the noise. The same function is used for errors of time steps.
+    of the n simulated data due to the meshes, divided by the noise. The same function is used for errors of time steps.
 
     The change of the unknowns u is J^+ `missing`, with the Jacobian J of the residuals. This estimate is accurate if
     the errors are below 25 % and the parameters are not nearly dependent. Subtract the result once to correct the
@@ -196,12 +196,12 @@ def bias_sentences(estimate: Estimate) -> list[str]:
 
 
 def _sentences_of(estimate: Estimate, bias: np.ndarray | None, source: tuple[str, str, str]) -> list[str]:
-    """Return warnings about one kind of bias. `source`: its source, its name and a remedy."""
+    """Return warnings about one kind of bias. `source`: cause of the bias, name of the bias, and a remedy."""
     if bias is None:
         return []
     values, errors, (what, name, remedy) = np.asarray(estimate.values), estimate.standard_errors, source
     unknown = np.flatnonzero(np.isfinite(errors) & (errors > UNKNOWN * np.abs(values)))
-    if len(unknown):  # their bias is only amplified roundoff
+    if len(unknown):  # the bias of these parameters is only amplified roundoff
         names = ", ".join(estimate.names[k] for k in unknown)
         return [
             f"the data do not determine {names}: the standard errors are more than {UNKNOWN:g} times the values, and "

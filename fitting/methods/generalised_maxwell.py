@@ -72,8 +72,8 @@ def _softmax_shares(logits: Array) -> Array:
     return share / xp.sum(share, axis=-1, keepdims=True)
 
 
-#: Upper bound of the log of the difference between two log times. For larger differences the shorter time is 0 in any
-#: case; the bound prevents an overflow of the exponential.
+#: Upper bound of the log of the difference between two log times. For larger differences the shorter time is
+#: practically 0 anyway. The bound prevents an overflow of the exponential.
 _FARTHEST = 30.0
 
 
@@ -98,7 +98,8 @@ def unconstrained(model: Maxwell) -> Array:
 
 
 def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array) -> Array:
-    """Return the residuals (2n,): (model - data) / scale, first of G', then of G''. `scales` (2n,) [Pa]."""
+    """Return the residuals (2n,) at n frequencies: (model - data) / scale, first of G', then of G''. `scales` (2n,)
+    [Pa]."""
     xp = arrays_of(u)
     return (xp.concatenate(moduli(natural(u), omega), axis=-1) - xp.concatenate([storage, loss])) / scales
 
@@ -243,7 +244,8 @@ def start_at_times(times: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarra
 
 def times_over(resolved: tuple[float, float], modes: int, count: int) -> list[np.ndarray]:
     """Return relaxation times (N,) [s], descending, for `count` starting points. The times of the first point are
-    evenly spread on the log axis. The times of the other points are random."""
+    evenly spread on the log axis. The times of the other points are random. `resolved`: shortest and longest relaxation
+    time [s] that the data resolve."""
     low, high = np.log(resolved)
     rng = np.random.default_rng(0)
     grids = [np.linspace(low, high, modes + 2)[1:-1]]

@@ -25,8 +25,8 @@ def exponential(u: Array) -> Array:
 
 
 def with_jacobian(function: Callable[..., Any], u: np.ndarray, *data: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (…, m) and derivatives (…, m, P) of a function of u (…, P), in NumPy. The derivatives are exact to
-    roundoff.
+    """Return the m values (…, m) of a function of P unknowns u (…, P), and their derivatives (…, m, P), in NumPy. The
+    derivatives are exact to roundoff.
 
     The derivative is Im f(u + i h) / h with a tiny step h (Squire and Trapp 1998, SIAM Review 40, 110). So the function
     must consist of +, -, *, /, exp, log, sums and similar operations. It must accept complex u with additional leading

@@ -21,14 +21,14 @@ import scipy.special
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.readers.frequency_sweep import FEWEST, Sweep, merged, scatter, some
 
-#: A violation of the bounds counts if it exceeds both SIGNIFICANT standard deviations of the scatter and NEGLIGIBLE
-#: times the modulus.
+#: A violation of the bounds counts if it is larger than SIGNIFICANT standard deviations of the scatter, and also larger
+#: than NEGLIGIBLE times the modulus.
 SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
-#: A warning is given if the relative distance of the best spectrum from the data exceeds both FAR and FAR_RATIO times
-#: the scatter.
+#: A warning is given if the relative distance of the best spectrum from the data is larger than FAR, and also larger
+#: than FAR_RATIO times the scatter.
 FAR, FAR_RATIO = 0.01, 5.0
-#: If random noise gives such signs of the residuals with a probability below this value, the misfit is called
-#: structured.
+#: If random noise gives as few changes of sign of the residuals with a probability below this value, the misfit is
+#: called structured.
 CHANCE = 0.005
 
 
@@ -38,7 +38,7 @@ class Consistency(NamedTuple):
     misfit: float  # relative root mean square distance of the best non-negative spectrum from the data
     scatter: float  # relative scatter of neighbouring points about a smooth curve
     breaches: tuple[tuple[float, float, str], ...]  # intervals [rad/s] and the violated bound
-    onset: float | None  # last frequency [rad/s] before the instrument's mark, in the last half decade
+    onset: float | None  # last frequency [rad/s] before the instrument's inertia shows; None: it does not show
 
     @property
     def far(self) -> bool:
@@ -61,8 +61,8 @@ def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
 
 
 def without_instrument(sweep: Sweep) -> Sweep:
-    """Return the sweep without the points after the instrument's mark. These points are moved to `grey`, and a note
-    names them.
+    """Return the sweep without the points at high frequencies that show the inertia of the instrument (the mark of the
+    instrument). These points are moved to `grey`, and a note reports them.
 
     The search is repeated with the remaining points until no mark is found. Only the last half decade of the sweep is
     searched.
@@ -91,8 +91,8 @@ def without_instrument(sweep: Sweep) -> Sweep:
 
 
 def onset_of(sweep: Sweep) -> tuple[float, str] | None:
-    """Find the instrument's mark in the last half decade. Returns the last frequency [rad/s] before the mark and the
-    violated bound, or None if there is no mark."""
+    """Find the effect of the instrument's inertia (the mark of the instrument) in the last half decade of the sweep.
+    Returns the last frequency [rad/s] before the mark and the violated bound, or None if there is no mark."""
     omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
     noise, each = scatter(omega, storage), _noise_of_loss(sweep, scatter(omega, loss))
     for k in range(len(omega) - 1):
@@ -167,8 +167,8 @@ def _rounded_up(hertz: float) -> float:
     return math.ceil(hertz / unit) * unit
 
 
-#: _ONE_SIDED: nearly all residuals have one sign if random signs would agree as often with a probability below this
-#: value.
+#: _ONE_SIDED: nearly all residuals count as having one sign if the probability that so many random signs are equal is
+#: below this value.
 #: _OUTLIERS: residuals of the rarer sign are outliers if their mean size exceeds this many times the mean size of the
 #: others.
 _ONE_SIDED, _OUTLIERS = 1e-4, 3.0
@@ -213,7 +213,7 @@ NOT_CONTAINED = "the standard errors do not contain it"
 def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple[dict, list[str]]:
     """Test the signs of the residuals of G' and of G'', ordered by frequency, with a runs test. Returns the results of
     the tests, and one warning if the misfit is structured. The noise of repeated measurements at one frequency may be
-    correlated, so they count as one measurement."""
+    correlated, so these measurements count as one."""
     numbers, told = {}, []
     omega, storage, loss = merged(omega, storage, loss)
     for name, residuals in (("storage_modulus", storage), ("loss_modulus", loss)):

@@ -16,7 +16,7 @@ from liverjax.solvers.blas import one_blas_thread
 
 
 class Solution(NamedTuple):
-    """A minimum of cost = |r|^2 / 2, or the unknowns u with the smallest cost found."""
+    """Result of a search: a minimum of the cost |r|^2 / 2 of residuals r, or the unknowns u with the smallest cost."""
 
     u: Array
     residuals: Array
@@ -100,8 +100,8 @@ def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
     J = xp.where(better[..., None, None], J, s.J)
     cost = xp.minimum(cost, xp.where(better, cost_new, cost))
     step, predicted, left = _damped_steps(J, r, damping)
-    # `exhausted`: even a very short step does not lower the cost. If the remaining decrease is at roundoff, the fit has
-    # converged as far as the arithmetic allows.
+    # `exhausted`: even a very short step does not lower the cost. If the decrease that is still possible is as small as
+    # roundoff, the fit has converged as far as the arithmetic allows.
     exhausted = damping > MAX_DAMPING
     at_roundoff = xp.isfinite(cost_new) & ((left <= 1e-4 * cost) | (cost <= 1e-14 * r.shape[-1]))
     converged = (left <= gain * cost) | (cost <= ZERO * r.shape[-1]) | (exhausted & at_roundoff)
@@ -130,10 +130,12 @@ def solution(s: State) -> Solution:
 def degrees_of_freedom(jacobian: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return the degrees of freedom (K,) of K groups of residuals: their numbers minus the sums of their leverages.
 
-    A group that the parameters fit exactly has none (Cook and Weisberg 1982, Residuals and Influence in Regression).
+    A group that the parameters fit exactly has 0 degrees of freedom (Cook and Weisberg 1982, Residuals and Influence in
+    Regression).
 
     Args:
-        jacobian: Jacobian (n, P) of all residuals. Rows of a prior may follow the rows of the groups.
+        jacobian: Jacobian (n, P) of all n residuals with respect to P parameters. Rows of a prior may follow the rows
+            of the groups.
         counts: numbers (K,) of residuals of the groups.
     """
     if not np.all(np.isfinite(jacobian)):
@@ -144,8 +146,8 @@ def degrees_of_freedom(jacobian: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def with_jacobian(residuals: Callable[..., jax.Array]) -> Callable[..., tuple[jax.Array, jax.Array]]:
-    """Convert a residual function of (u, …) to a function that returns (r, dr/du), in one pass of forward-mode
-    differentiation."""
+    """Convert a residual function of (u, …) to a function that returns the residuals r and the Jacobian dr/du, in one
+    pass of forward-mode differentiation."""
 
     def evaluate(u: jax.Array, *data: Any) -> tuple[jax.Array, jax.Array]:
         def twice(u):

@@ -5,13 +5,13 @@ s the standard deviation between samples (the spread) and e_i the error of y_i. 
 maximum likelihood. The interval of mu follows Hartung and Knapp (2001), Statistics in Medicine 20. The interval of a
 new sample uses Student's t with n - 1 degrees of freedom. This is exact if the errors are small (Higgins, Thompson and
 Spiegelhalter (2009), J. R. Stat. Soc. A 172, use n - 2). If the errors e_i are so large that s is uncertain, a second
-interval is averaged over all s. The wider interval is used.
+interval is averaged over all possible s. The wider interval is used.
 
 Few samples determine s poorly. The values of the samples are moved towards the mean (shrinkage). The moved values are
-averages over all s. Their weights are the restricted likelihood and a half-Cauchy prior of scale 1 (Gelman 2006,
-Bayesian Analysis 1, 515). The standard deviations of the moved values contain the errors of s and mu. The interval of
-Hartung and Knapp is too narrow if a few samples have most of the weight. Then the interval averaged over all s is used
-if it is wider.
+averages over all possible s. Their weights are the restricted likelihood and a half-Cauchy prior of scale 1 (Gelman
+2006, Bayesian Analysis 1, 515). The standard deviations of the moved values contain the errors of s and mu. The
+interval of Hartung and Knapp is too narrow if a few samples have most of the weight. Then the interval averaged over
+all possible s is used if it is wider.
 """
 
 from typing import NamedTuple
@@ -28,8 +28,8 @@ EVEN = 0.8
 #: If the mean variance of the errors, divided by the variance between samples, exceeds this value, the estimated
 #: variance between samples is not reliable.
 UNSURE = 0.25
-#: If a sample does not determine its value, and the value is below this fraction of the mean, the sample is not part of
-#: the population.
+#: If the data of a sample do not determine its value, and this value is below this fraction of the mean, the sample is
+#: not part of the population.
 BELOW = 1e-3
 
 
@@ -70,8 +70,8 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     elif np.mean(v) > UNSURE * variance:
         intervals = intervals[0], _hull(intervals[1], over.interval(1.0))
     pooled, pooled_errors = np.full((2, len(values)), np.nan)
-    # Samples that do not determine their value are treated like a new sample. A value far below the others belongs to
-    # another material.
+    # A sample whose data do not determine its value is treated like a new sample. But if this value is far below the
+    # mean, the sample is of another material and is excluded.
     silent = ~known & (values > BELOW * np.exp(mean))
     pooled[silent], pooled_errors[silent] = over.moved(np.zeros(silent.sum()), np.full(silent.sum(), 1e12))
     pooled[known], pooled_errors[known] = over.moved(y, v)
@@ -152,7 +152,7 @@ def _variance_between(y: np.ndarray, v: np.ndarray) -> float:
 
 def _weighted_mean(y: np.ndarray, v: np.ndarray, variance: float) -> tuple[float, float]:
     """Return the weighted mean and its standard error. The standard error comes from the scatter of the values. It is
-    at least the standard error that follows from their errors."""
+    at least as large as the standard error that follows from the variances `v` and `variance`."""
     w = 1 / (v + variance)
     mean = float(np.sum(w * y) / np.sum(w))
     q = float(np.sum(w * (y - mean) ** 2) / (len(y) - 1))

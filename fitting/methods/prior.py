@@ -18,7 +18,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 
 class Prior(NamedTuple):
-    """The prior as a factorised sparse matrix in SciPy, for the functions below."""
+    """The prior, stored as a factorised sparse matrix (SciPy). The functions below use this matrix."""
 
     solver: Any  # LU factorisation of kappa^2 M + L
     root_mass: np.ndarray  # (V,) square root of the lumped mass
@@ -40,13 +40,15 @@ def prior(mesh: TetMesh, length: float) -> Prior:
 
 
 def field_at_nodes(p: Prior, z: np.ndarray) -> np.ndarray:
-    """Return the field m at the nodes, (V,) or (V, k), from independent standard normal z of the same shape."""
+    """Return one field m (V,) or k fields (V, k) at the nodes, from independent standard normal numbers z of the same
+    shape."""
     root = p.root_mass if z.ndim == 1 else p.root_mass[:, None]
     return p.scale * p.solver.solve(root * z)
 
 
 def to_whitened(p: Prior, g: np.ndarray) -> np.ndarray:
-    """Convert derivatives with respect to m to derivatives with respect to z (the transpose of `field_at_nodes`)."""
+    """Convert derivatives g with respect to the field m to derivatives with respect to the numbers z. This function is
+    the transpose of `field_at_nodes`, which computes m from z."""
     root = p.root_mass if g.ndim == 1 else p.root_mass[:, None]
     return p.scale * root * p.solver.solve(g)
 
@@ -56,7 +58,7 @@ def variances(p: Prior, modes: np.ndarray, kept: np.ndarray, chunk: int = 512) -
     the variance to the fraction `kept`.
 
     Args:
-        modes: orthonormal directions of z (V, k).
+        modes: k orthonormal directions (V, k) of the normal numbers z (see `field_at_nodes`).
         kept: fraction (k,) of the variance that remains in each direction.
     """
     n = len(p.root_mass)

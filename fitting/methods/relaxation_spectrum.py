@@ -93,7 +93,8 @@ def second_differences(count: int, smoothing: float) -> np.ndarray:
 
 
 def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) -> GridSpectrum:
-    """Return the spectrum at a minimum, with its effective number of parameters.
+    """Return the spectrum for the strengths x that minimise the misfit plus the penalty, with the effective number of
+    parameters.
 
     Args:
         x: equilibrium modulus and strengths (1 + K,) in `grid.unit`.

@@ -24,7 +24,8 @@ from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, from_starts
 from fitting.readers.rheometer import Sweep
 
-#: Number of entries of u: log E, logit(gamma / alpha), log V, logit(alpha), log W, logit(beta / alpha).
+#: Number of entries of the vector u of unknowns: log E, logit(gamma / alpha), log V, logit(alpha), log W, logit(beta /
+#: alpha).
 SIZE = 6
 
 
@@ -65,7 +66,7 @@ def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> t
     xp = arrays_of(u, x)
     alpha, beta, gamma = (exponent[..., None] for exponent in _orders(u))
     gamma, beta = switches[1] * gamma, switches[3] * beta
-    # Logarithms of the absolute moduli, and a common unit of both springpots that prevents overflow.
+    # E, V and W are logarithms of absolute moduli. Both springpots are divided by the softer one to prevent overflow.
     E, V, W = (u[..., k, None] + n * xp.log(x) for k, n in ((0, gamma), (2, alpha), (4, beta)))
     least = xp.where(switches[2] > 0, xp.minimum(V.real, W.real), V.real)
     own, in_row = xp.exp(least - V), switches[2] * xp.exp(least - W)
@@ -75,13 +76,13 @@ def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> t
     return beside * xp.cos(angle * gamma) + row * real, beside * xp.sin(angle * gamma) + row * imaginary
 
 
-#: DENSE: relaxation times per decade in `as_modes`. BEYOND: decades of relaxation times below the shortest and above
-#: the longest time of a response.
+#: DENSE: number of relaxation times per decade in `as_modes`. BEYOND: number of decades by which these times extend
+#: below the shortest and above the longest time of a response.
 DENSE, BEYOND = 6, (3.0, 3.0)
 
 
 def times_of_modes(low: float, high: float) -> np.ndarray:
-    """Relaxation times (K,) [s], descending, for responses at times from `low` to `high` [s]."""
+    """Return K relaxation times (K,) [s], descending, for responses at times from `low` to `high` [s]."""
     decades = np.log10(high / low) + sum(BEYOND)
     return np.logspace(np.log10(high) + BEYOND[1], np.log10(low) - BEYOND[0], int(np.ceil(decades * DENSE)) + 1)
 
@@ -89,14 +90,15 @@ def times_of_modes(low: float, high: float) -> np.ndarray:
 def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwell:
     """Return many Prony modes that represent the relaxation spectrum of the model, for responses in the time domain.
 
-    The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converges
-    exponentially. An equilibrium modulus and one fast mode replace the slower and the faster times. Both are chosen so
-    that G* is exact at one small and one large real s.
+    The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converts the
+    spectrum to modes, and converges exponentially. An equilibrium modulus replaces the modes that are slower than
+    `times`. One fast mode replaces the modes that are faster. Both are chosen so that G* is exact at one small and one
+    large real s.
 
     Args:
         u, switches: see `moduli`.
         times: (K,) [s], descending, with a constant ratio, see `times_of_modes`.
-        reference: the frequency [rad/s] that is the unit of frequencies in u.
+        reference: reference frequency [rad/s]. u describes the model for frequencies divided by this value.
     """
     xp = arrays_of(u, times)
     step = xp.log(times[0] / times[1])
@@ -119,7 +121,8 @@ def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwe
 def springpot_residuals(
     u: Array, switches: Array, x: Array, storage: np.ndarray, loss: np.ndarray, scales: np.ndarray
 ) -> Array:
-    """Return the residuals (2n,): (model - data) / scale, first of G', then of G''. `scales` (2n,) [Pa]."""
+    """Return the residuals (2n,) at n frequencies: (model - data) / scale, first of G', then of G''. `scales` (2n,)
+    [Pa]."""
     found = arrays_of(u).concatenate(moduli(u, switches, x), axis=-1)
     return (found - np.concatenate([storage, loss])) / scales
 
@@ -199,7 +202,7 @@ FRACTIONAL = (
 
 
 def full(model: Fractional, u: Array) -> Array:
-    """Return all six entries (…, 6) of u from the free entries (…, P). Entries that the model does not have are 0."""
+    """Return all six entries (…, 6) of u from the P free entries (…, P). Entries that the model does not have are 0."""
     xp = arrays_of(u)
     nothing = xp.zeros_like(u[..., 0])
     return xp.stack([u[..., model.free.index(k)] if k in model.free else nothing for k in range(SIZE)], axis=-1)
@@ -212,7 +215,7 @@ def best_minimum(model: Fractional, sweep: Sweep, starts: np.ndarray, scales: np
         model: the fractional model.
         sweep: data.
         starts: starting points (S, P).
-        scales: scales of the residuals (2n,) [Pa]; by default the standard deviations of the sweep.
+        scales: scales of the residuals (2n,) [Pa] at n frequencies; by default the standard deviations of the sweep.
     """
     x = sweep.angular_frequency / reference_frequency(sweep)
     scales = np.concatenate(sweep.deviations) if scales is None else scales
@@ -229,8 +232,8 @@ def reference_frequency(sweep: Sweep) -> float:
 
 
 def starting_points(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
-    """Return starting points u (count, SIZE). In the first ones, two springpots have equal moduli at a frequency inside
-    or near the band. The others are random."""
+    """Return starting points u (count, SIZE). In the first points, two springpots have equal moduli at a frequency
+    inside or near the band. The other points are random."""
     rng = np.random.default_rng(seed)
     size = np.log(np.hypot(sweep.storage, sweep.loss))
     half = 0.5 * np.log(sweep.angular_frequency[-1] / sweep.angular_frequency[0])
@@ -244,8 +247,8 @@ def starting_points(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
     return np.concatenate([np.array(ordered), spread])[:count]
 
 
-#: Frequencies at which both springpots have equal moduli: distance from the middle of the band, divided by its half
-#: width.
+#: Frequencies at which both springpots have equal moduli. Each number is the logarithmic distance from the middle of
+#: the band, divided by half of the width of the band.
 _CROSSINGS = (-1.5, -0.75, 0.0, 0.75, 1.5)
 
 

@@ -33,7 +33,8 @@ def _phi(x: Array) -> tuple[Array, Array]:
     """Return phi_1 = (1 - e^-x) / x and phi_2 = (x - 1 + e^-x) / x^2, with their limits at x = 0."""
     xp = arrays_of(x)
     small = x < 1e-3
-    near, safe = xp.where(small, x, 0.0), xp.where(small, 1.0, xp.where(x > 1e100, 1e100, x))  # for finite powers
+    # x is limited to 1e100, so that its powers stay finite.
+    near, safe = xp.where(small, x, 0.0), xp.where(small, 1.0, xp.where(x > 1e100, 1e100, x))
     one = xp.where(small, 1 - near / 2 + near**2 / 6 - near**3 / 24, -xp.expm1(-safe) / safe)
     two = xp.where(small, 0.5 - near / 6 + near**2 / 24 - near**3 / 120, (safe + xp.expm1(-safe)) / safe**2)
     return one, two
@@ -159,8 +160,8 @@ def _driven_strain(at: Slopes, time: np.ndarray, stress: np.ndarray, rows: np.nd
 def _memory_of_modes(
     rates: np.ndarray, dt: np.ndarray, start: float, step: np.ndarray, ramp: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the history variable h (n, …, N) of each mode and its derivative dh/drate. The recursion is h_(j+1) = e^-x
-    h_j + phi_1(x) step_j + phi_2(x) ramp_j, with x = rate dt_j."""
+    """Return the history variable h (n, …, N) of N modes at n times, and its derivative dh/drate. The recursion is
+    h_(j+1) = e^-x h_j + phi_1(x) step_j + phi_2(x) ramp_j, with x = rate dt_j and phi_1, phi_2 of `_phi`."""
     intervals = (-1, *(1,) * rates.ndim)
     dt, step, ramp = (a.reshape(intervals) for a in (dt, step, ramp))
     x = dt * rates
@@ -183,7 +184,8 @@ def _slopes_of_phi(x: np.ndarray, one: np.ndarray, two: np.ndarray) -> tuple[np.
     return np.where(small, near[0], of_one), np.where(small, near[1], of_two)
 
 
-#: Coefficients of the Taylor series of these derivatives. For x below 1e-2, the first omitted term is below 1e-16.
+#: Coefficients of the Taylor series of the derivatives of phi_1 and phi_2. For x below 1e-2, the first omitted term is
+#: below 1e-16.
 _SLOPES = (
     [-1 / 2, 1 / 3, -1 / 8, 1 / 30, -1 / 144, 1 / 840, -1 / 5760],
     [-1 / 6, 1 / 12, -1 / 40, 1 / 180, -1 / 1008, 1 / 6720, -1 / 51840],
@@ -202,7 +204,7 @@ def _retardation(at: Slopes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     eigenvalues, Q = np.linalg.eigh(np.where(known, S, 0.0))
     Q = np.where(known, Q, np.nan)
     c = np.einsum("...ik,...i->...k", Q, b)
-    # Derivatives with respect to every u_p of b, of its components along the eigenvectors, and of the diagonal -1/tau.
+    # Derivatives with respect to every unknown u_p: of b, of the components of b along the eigenvectors, and of -1/tau.
     of_b = b[..., None] * (of_g / (2 * g[..., None]) - of_tau / (2 * tau[..., None]))
     along, of_diagonal = np.swapaxes(Q, -1, -2) @ of_b, np.swapaxes(of_tau / tau[..., None] ** 2, -1, -2)
     # M: q_l . (dS/du_p) q_k, with the axes (…, p, l, k).

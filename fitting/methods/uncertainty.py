@@ -51,7 +51,7 @@ def estimate(
     modes = jax.eval_shape(maxwell, found.u).ratios.shape[0]
     vector = partial(parameter_vector, maxwell=maxwell)
     own = estimated(parameter_names(modes), vector, found, count, deviations_given, effective)
-    if modes == 1 and maxwell is generalised_maxwell.natural_fluid:  # the only mode of a fluid has exactly ratio 1
+    if modes == 1 and maxwell is generalised_maxwell.natural_fluid:  # the ratio is exactly 1
         own = own._replace(standard_errors=np.where(np.arange(len(own.values)) == 1, 0.0, own.standard_errors))
     return own
 
@@ -136,8 +136,8 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
             intervals[name] = [None, None]
             continue
         grid = center + error * np.linspace(-4, 4, points) * uncertainty.quantile / 2
-        # The penalty keeps the parameter only near its grid value. The result is the constrained optimum for the value
-        # that the parameter has in this result.
+        # The penalty keeps the parameter only near its grid value. So each result is the constrained optimum for the
+        # value `reached`, not for the grid value.
         reached, chi2 = (
             np.asarray(v) for v in along(j, jnp.maximum(grid, 1e-3 * center), 1e3 * uncertainty.noise / error)
         )
@@ -189,8 +189,7 @@ def supported_modes(data: Band) -> int:
 
 
 def superfluous(data: Band, u: Estimate) -> list[str]:
-    """Return warnings that advise against some of the modes. The list is empty if this number of modes may be
-    chosen."""
+    """Return warnings that advise against some of the modes. The list is empty if the data support all modes of `u`."""
     modes = (len(u.values) - 1) // 2
     kind, measured = ("sweep", "measured frequencies") if isinstance(data, Sweep) else ("test", "measured times")
     fewer = f"use fewer modes or a wider {kind}" if modes > 1 else f"use a wider {kind}"
@@ -200,10 +199,10 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
     out = []
     for k in range(modes):
         if not low / 100 <= tau[k] <= 100 * high:
-            product = f"G0 ratios[{k}] relaxation_times[{k}]" if tau[k] < low else f"G0 (1 - ratios[{k}])"
+            product = f"G0 * ratios[{k}] {'*' if tau[k] < low else '/'} relaxation_times[{k}]"
             out.append(
                 f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the "
-                f"{measured} resolve. Only the product {product} is determined: "
+                f"{measured} resolve. Only {product} is determined: "
                 f"{'use fewer modes or another band' if modes > 1 else 'use another band'}"
             )
         if not g_err[k] < 0.5 * g[k]:

@@ -32,22 +32,22 @@ class Curve(NamedTuple):
     label: str
     test: str  # uniaxial, equibiaxial, pure_shear, simple_shear or general
     F: np.ndarray  # (n, 3, 3) deformation gradient, det F = 1; face 3 is free of stress
-    component: tuple[int, int]  # which component of the nominal stress was measured
+    component: tuple[int, int]  # indices of the measured component of the nominal stress, from 0
     stress: np.ndarray  # (n,) [Pa]
-    returns: int = 0  # how often the rows reverse and repeat a range of deformations
-    sample: str = ""  # the same string for all components of one test; if empty, `label` is used
+    returns: int = 0  # how often the deformation reverses and repeats earlier deformations
+    sample: str = ""  # name of the sample, the same for all components of one test; if empty, `label`
 
     @property
     def driven(self) -> np.ndarray:
-        """Component (n,) of F on which the measured stress does work, if this component varies. Otherwise the shear F12
-        if F12 varies, and else the stretch F11."""
+        """Component (n,) of F on which the measured stress does work. If this component is constant, the shear F12. If
+        F12 is constant too, the stretch F11."""
         own, shear = self.F[:, *self.component], self.F[:, 0, 1]
         return own if np.ptp(own) > 0 else shear if np.ptp(shear) > 0 else self.F[:, 0, 0]
 
     @property
     def rises(self) -> bool:
-        """Whether the stress of a stable material must rise with `driven`. False in a general test, and if the
-        component of F that belongs to the measured stress is constant."""
+        """Whether the stress of a stable material must rise with `driven`. It is False in a general test. It is also
+        False if the component of F that belongs to the measured stress is constant."""
         return self.test != "general" and np.ptp(self.F[:, *self.component]) > 0
 
     @property
@@ -106,7 +106,7 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
 
 
 def _rows_of_curves(file: Path) -> tuple[list[dict[str, str]], list[tuple[int, str]]]:
-    """Return the rows of a file, and the numbers and labels of rows such as "Mean", which are not among them."""
+    """Return the measured rows of a file. Also return numbers and labels of excluded rows such as "Mean"."""
     text = text_of(file, "curves")
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     cells = [[c.strip('" ') for c in split_cells(line, _delimiter_of_curves(line))] for line in lines]
@@ -116,7 +116,7 @@ def _rows_of_curves(file: Path) -> tuple[list[dict[str, str]], list[tuple[int, s
         raise InputError(f"{file} contains no rows: give a CSV file of curves")
     names, between = _documented(cells[first]), _delimiter_of_curves(lines[first])
     every = cells[first + 1 : end]
-    tests = [k for k, name in enumerate(names) if name == "test"]  # these cells are never numbers
+    tests = [k for k, name in enumerate(names) if name == "test"]  # cells of this column are never numbers
     labelled = [[cell for k, cell in enumerate(own) if k not in tests or is_summary(cell)] for own in every]
     summaries = summary_rows(labelled)
     rows = [_row_under(names, own, file) for k, own in enumerate(every) if k not in summaries]
@@ -135,8 +135,8 @@ def _rows_of_curves(file: Path) -> tuple[list[dict[str, str]], list[tuple[int, s
 
 
 def _measured_rows(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
-    """Return the rows with a measured nominal stress, and the number of other rows. If no row has a nominal stress,
-    return all rows and 0."""
+    """Return the rows with a measured nominal stress, and the number of rows without it. If no row has a nominal
+    stress, return all rows and 0."""
     name = next((key for key in rows[0] if key.startswith("nominal_stress")), None)
     kept = rows if name is None else [row for row in rows if row[name].lower() not in EMPTY]
     return (kept, len(rows) - len(kept)) if kept else (rows, 0)
@@ -320,7 +320,8 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
     return curves, column[2]
 
 
-#: Stretches of a sheared sample that differ by less than this count as one stretch, measured again in each row.
+#: Stretches of a sheared sample that differ by less than this count as one stretch. They differ because the stretch was
+#: measured again in each row.
 SAME_STRETCH = 0.01
 
 

@@ -35,7 +35,7 @@ class Displacements(NamedTuple):
 
     @property
     def components(self) -> int:
-        """Number of measured components."""
+        """Number of measured components of the displacements, at all points together."""
         return int(np.isfinite(self.sd).sum())
 
 
@@ -108,8 +108,8 @@ def _deviations_of_noise(path: Path, own: np.ndarray | None, noise: float | None
     return sd
 
 
-#: If _SOME points or more all lie within _TOGETHER times the size of the body, their positions are assumed to be in
-#: another unit.
+#: If the file has _SOME points or more, and all of them lie within _TOGETHER times the size of the body, the positions
+#: are assumed to be in another unit.
 _SOME, _TOGETHER = 8, 0.01
 
 
@@ -123,8 +123,8 @@ def _refuse_other_places(path: Path, places: np.ndarray, size: float, unit: str)
 
 
 def _no_copies(path: Path, table: dict[str, np.ndarray]) -> None:
-    """Raise an error if the file has the same table twice, because each row counts as a measurement. A few rows may be
-    equal because of rounding."""
+    """Raise an error if half of the rows or more are copies of other rows, because each row counts as a measurement. A
+    few rows may be equal because of rounding."""
     rows = np.nan_to_num(np.column_stack(list(table.values())), nan=np.inf)
     _, first, of = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     again = np.flatnonzero(first[of.ravel()] != np.arange(len(rows)))
@@ -145,7 +145,7 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
     names = [name.lower() for name in names]
     if not lines[0].lstrip().startswith("#") or set(names) & set(_COLUMNS):
         lines = lines[1:]
-    else:  # comments before the header
+    else:  # the first lines are comments, and the header follows them
         lines = [line for line in lines if not line.lstrip().startswith("#")]
         between, names = split_line(lines[0]) if lines else (between, names)
         names, lines = [name.lower() for name in names], lines[1:]
@@ -218,7 +218,7 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.
     candidates = min(candidates, len(tets))
     _, near = cKDTree(X[tets].mean(axis=1)).query(points, k=candidates)
     near = near.reshape(len(points), candidates)
-    D = np.moveaxis(np.asarray(mesh.shape_vectors), -1, 0)  # (E, 3, 3) gradients of N_1 .. N_3
+    D = np.moveaxis(np.asarray(mesh.shape_vectors), -1, 0)  # (E, 3, 3) gradients of shape functions 1 to 3
     inner = np.einsum("nkac,nkc->nka", D[near], points[:, None] - X[tets[near, 0]])
     bary = np.concatenate([1 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)
     best = np.argmax(bary.min(axis=-1), axis=1)
@@ -250,7 +250,8 @@ def _steps(path: Path, scene: Scene, time: np.ndarray | None, n: int) -> np.ndar
 
 
 def predicted(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
-    """Return the simulated displacements (n, 3) [m] of the points, from the node positions (T, V, 3) [m] of a run."""
+    """Return the simulated displacements (n, 3) [m] of the points, from the node positions (T, V, 3) [m] of a run with
+    T steps."""
     corner = positions[data.step[:, None], data.nodes] - scene.mesh.points[data.nodes]
     return jnp.sum(data.weights[..., None] * corner, axis=1)
 

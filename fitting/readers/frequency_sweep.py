@@ -10,7 +10,7 @@ from fitting.readers import raw_torque
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Minimum number of frequencies that must remain if points are ignored. A fit of one mode needs at least this number.
+#: Minimum number of frequencies that must remain if points are ignored.
 FEWEST = 3
 #: Given standard deviations are the spread between samples, not noise, if they exceed LARGE times the moduli and also
 #: SHARED times the scatter of the points. If these deviations were noise, the points would scatter just as much.
@@ -26,7 +26,7 @@ class Sweep(NamedTuple):
     storage_sd: np.ndarray | None = None  # (n,) standard deviations [Pa]
     loss_sd: np.ndarray | None = None
     source: str = ""
-    notes: tuple[str, ...] = ()  # notes on changes and choices of the reader
+    notes: tuple[str, ...] = ()  # notes for the user: what the reader has changed, ignored or assumed
     raw: dict[str, np.ndarray] | None = None  # (n,) raw torque [N m], angle [rad], phase [rad], if in the file
     inertia: np.ndarray | None = (
         None  # (n,) [Pa] contribution of the instrument's inertia, already subtracted; None if unknown
@@ -35,7 +35,7 @@ class Sweep(NamedTuple):
     friction_error: float = 0.0  # standard deviation of the bearing's friction [N m s]
     grey: np.ndarray | None = None  # (k, 3) frequency [rad/s], G', G'' [Pa] of k ignored points (mostly inertia)
     sd_estimated: bool = False  # True: the sd come from the scatter of the points and are only weights
-    sd_before: bool = False  # True: the sd are those before a correction of the moduli, and are only weights
+    sd_before: bool = False  # True: the sd belong to the moduli before a correction, and are only weights
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
@@ -50,7 +50,7 @@ class Sweep(NamedTuple):
 
     @property
     def noise_given(self) -> bool:
-        """Whether standard deviations are given, and describe the noise of each point and not the spread between
+        """Whether standard deviations are given that describe the noise of each point, not the spread between
         samples."""
         if self.storage_sd is None or self.sd_estimated or self.sd_before:
             return False
@@ -132,8 +132,8 @@ def distance_from_smooth(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarray:
-    """Return the distances of y (n,) from polynomials of degree m - 2 through m neighbours. They are scaled so that
-    their variance is that of the noise."""
+    """Return the distances of y (n,) from polynomials of degree m - 2 that are fitted to m neighbouring points. The
+    distances are scaled so that their variance is that of the noise."""
     left = []
     for k in range(len(x) - m + 1):
         own = x[k : k + m] - x[k]
@@ -142,21 +142,21 @@ def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarr
     return np.array(left)
 
 
-#: Points nearer than _NEAR in the logarithm of x are merged into one point of the smooth curve. The curve needs at
-#: least _PLACES such points, and has at most about _MOST.
+#: Points whose logarithms of x differ by less than _NEAR are merged into one point of the smooth curve. The curve needs
+#: at least _PLACES such points, and has at most about _MOST.
 _NEAR, _PLACES, _MOST = 0.01, 5, 400
-#: A point is far from the curve if the distance of its logarithm exceeds both _FAR and _DEVIATIONS robust standard
-#: deviations.
+#: A point is far from the curve if the distance of its logarithm from the curve is larger than _FAR, and also larger
+#: than _DEVIATIONS robust standard deviations.
 _FAR, _DEVIATIONS = 0.4, 5.0
 
 
 def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return a smooth curve through positive values y (n,) over positive x (n,), for example moduli over frequencies.
 
-    The curve is a spline of the logarithms, smoothed by cross-validation. The curve is the scale of relative errors. If
-    the measured values were the scale, a point that is low by chance would have more weight than a point that is high.
-    The fit would then be too low by twice the square of the relative noise. A value far above the curve is returned as
-    it is, so that this wrong point does not dominate the fit.
+    The curve is a spline of the logarithms, smoothed by cross-validation. Residuals are divided by the curve, so they
+    are relative. If the residuals were divided by the measured values, a point that is low by chance would have more
+    weight than a point that is high. The fit would then be too low by twice the square of the relative noise. A value
+    far above the curve is returned as it is, so that this wrong point does not dominate the fit.
     """
     return _curve_of_bytes(np.asarray(x, float).tobytes(), np.asarray(y, float).tobytes())
 
@@ -286,8 +286,8 @@ def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> S
 
 
 def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
-    """Return the sweep with only the points whose modulus exceeds the uncertainty of the contribution of the
-    instrument's inertia. The other points become `grey`.
+    """Return the sweep without the points at which the instrument's inertia dominates: there, the uncertainty of the
+    inertia's contribution [Pa] exceeds the modulus. These points become `grey`.
 
     The inertia is found from raw torque and raw angle, with the torque of the sample or its `radius` and `height` [m].
     If these columns do not show the inertia, it is found from the raw phase.
@@ -322,12 +322,12 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     empty = int(np.sum(~raw_torque.with_raw_columns(raw)))
     if empty:
         shows += (
-            f" ({empty} of {len(G)} points have an empty cell in the raw columns: for them, the inertia of the other "
-            "points is used)"
+            f" ({empty} of {len(G)} points have an empty cell in the raw columns: for these points, the inertia of "
+            "the other points is used)"
         )
     note = (
-        f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz, the inertia needs {times:.3g} times the torque of the "
-        "sample"
+        f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz, the torque for the inertia is {times:.3g} times the "
+        "torque of the sample"
     )
     if not lost.any():
         return sweep._replace(notes=(*sweep.notes, note))
@@ -336,7 +336,7 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
             f"{sweep.source}: {note}: the instrument dominates at nearly all points; measure at lower frequencies"
         )
     lowest = sweep.angular_frequency[lost].min() / (2 * np.pi)
-    share = f"the uncertainty of the torque of the inertia ({100 * raw_torque.UNCERTAINTY:g} % of that torque)"
+    share = f"the uncertainty of the torque for the inertia ({100 * raw_torque.UNCERTAINTY:g} % of this torque)"
     left = (
         f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are ignored, because the torque of the sample is "
         f"below {share}"

@@ -24,13 +24,13 @@ _WORDS = {
     "depth": ("indentation", "eindringtiefe", "enfoncement", "depth", "tiefe", "profondeur", "displacement", "weg"),
     "force": ("force", "kraft", "load", "normal force"),
 }
-#: A heading with one of these words means something else, for example a speed or an error.
+#: A heading with one of these words names another quantity, for example a speed or an error.
 _NOT = {"rate", "velocity", "speed", "sd", "std", "error", "modulus"}
 #: A value above this, in SI units, cannot be a measurement.
 _LARGEST = 1e30
 _FEWEST = 6
 #: A loading ends when the indenter moves back by more than _BACK times the depth range. A hold at the end of the
-#: loading is ignored if it contains more than the fraction _HELD of all points.
+#: loading is ignored if it contains more than the fraction _HELD of the points of the loading.
 _BACK, _HELD = 0.1, 0.15
 #: An offset of the force is subtracted only if the noise is too small to hide a rise by this fraction of the largest
 #: force.
@@ -122,8 +122,8 @@ def _offset(force: np.ndarray) -> float:
 def _points_of_hold(values: np.ndarray) -> int:
     """Return the number of points at the end at which depth or force stays at its largest value; 0 if it still rises.
 
-    Because of noise, a rising quantity comes near its largest value long before the end. So these points are a hold
-    only if the rise within them is below half of the rise before them, by more than expected from noise.
+    Because of noise, a rising quantity comes near its largest value long before the end. So these points count as a
+    hold only if the rise within them is below half of the rise before them by more than twice the noise.
     """
     reached = int(np.argmax(values >= np.max(values) - _margin(values))) + 1
     held = len(values) - reached
@@ -143,8 +143,8 @@ def _both_sides(values: np.ndarray, reached: int, half: int) -> tuple[np.ndarray
 
 
 def _margin(values: np.ndarray) -> float:
-    """Return the distance from its largest value within which a quantity counts as constant: twice its noise, plus 0.5
-    % of its range."""
+    """Return a distance. If a quantity is nearer than this to its largest value, it counts as constant. The distance is
+    twice the noise, plus 0.5 % of the range of the values."""
     return 2 * noise_of_series(values) + 0.005 * float(np.ptp(values))
 
 

@@ -1,9 +1,9 @@
-"""Noise, typical sizes and single wrong values of a series of values, estimated from these values."""
+"""Estimate the noise and the typical sizes of a measured series of values, and find single wrong values in it."""
 
 import numpy as np
 
-#: A single value is far from its neighbours if the distance is above these multiples of the changes beside it and of
-#: the noise, and above this fraction of the largest value.
+#: A single value is far from its neighbours if its distance from them exceeds three limits: _FAR times the changes
+#: beside it, _NOISES times the noise, and _OF_LARGEST times the largest value.
 _FAR, _NOISES, _OF_LARGEST = 10.0, 20.0, 0.02
 _LOW = 0.5
 
@@ -32,8 +32,8 @@ def sizes_of_series(values: np.ndarray) -> np.ndarray:
 
 
 def far_values(values: np.ndarray) -> np.ndarray:
-    """Return the indices of single values that lie far from both neighbours, on the same side. The change between these
-    neighbours, and between them and the next values, must be much smaller."""
+    """Return the indices of single values that lie far from both neighbours, on the same side. The changes between the
+    two neighbours, and between each neighbour and the next value, must be much smaller."""
     if len(values) < 5:
         return np.zeros(0, int)
     own, steps = values[2:-2], np.abs(np.diff(values))
@@ -45,12 +45,12 @@ def far_values(values: np.ndarray) -> np.ndarray:
 
 
 def told_of_far_values(time: np.ndarray, load: np.ndarray, values: np.ndarray) -> list[str]:
-    """Return a note for each of the `far_values` of the response (n,) to a `load` (n,), at the times `time` (n,) [s]. A
-    value beside a change of the load may be a true peak."""
+    """Return a note for each of the `far_values` of the response (n,) to a `load` (n,), at the times `time` (n,) [s].
+    No note is given beside a change of the load, because there the value may be a true peak."""
     still = np.abs(np.diff(load)) <= _OF_LARGEST * np.max(np.abs(load))
     return [
         f"the response {values[k]:.4g} at {time[k]:.4g} s is far from its neighbours {values[k - 1]:.4g} and "
-        f"{values[k + 1]:.4g}: if it is a fault of the measurement, remove this row"
+        f"{values[k + 1]:.4g}: if this value is a fault of the measurement, remove this row"
         for k in far_values(values)
         if still[k - 1] and still[k]
     ]

@@ -157,7 +157,8 @@ def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray])
 
 
 def _agreed(omega: np.ndarray, values: np.ndarray) -> float:
-    """Return the median inertia at the highest frequencies, or NaN if the values there differ by a tenth or more.
+    """Return the median inertia at the highest frequencies, or NaN if the inertias at these frequencies differ by a
+    tenth or more.
 
     At these frequencies the contribution of the inertia is largest, so the inertia is known best. At other frequencies
     the inertia is a small difference of large numbers.

@@ -178,8 +178,8 @@ def _what_differs(sweep: Sweep) -> list[str]:
     if len(np.unique(sweep.angular_frequency)) == len(sweep.angular_frequency):
         if heat.size and np.ptp(heat) > WARMER:
             out.append(
-                f"the temperature changes by {np.ptp(heat):.2g} K in the sweep, and the fit treats its effect on the "
-                "moduli as an effect of the frequency"
+                f"the temperature changes by {np.ptp(heat):.2g} K in the sweep, and the fit treats the effect of "
+                "the temperature on the moduli as an effect of the frequency"
             )
         if strain.size and strain.min() > 0 and strain.max() > STRAINED * strain.min():
             out.append(
@@ -201,7 +201,7 @@ def _what_differs(sweep: Sweep) -> list[str]:
 
 
 #: A note is given if the median relative difference between a column and the values computed from G' and G'' exceeds
-#: this [1].
+#: this value [1].
 CONTRADICTS = 0.03
 
 

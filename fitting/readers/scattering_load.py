@@ -12,8 +12,8 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
     """Return the imposed strain or stress without scatter, and notes. A constant load is replaced by its mean, and a
     linear ramp by a fitted straight line. `word`: "strain" or "stress", for the notes.
 
-    The model treats the change between two readings as a real step. So it would treat the scatter of a sensor as
-    motion.
+    The model treats every change between two readings as a real change of the load. So it would also treat the scatter
+    of a sensor as a change of the load.
     """
     size, noise = float(np.max(np.abs(driven))), noise_of_series(driven)
     if not noise > QUIET * size:
@@ -24,7 +24,7 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
     share = np.mean(near[first:])
     if share < 0.5:  # the load is cyclic: its third differences look like noise
         return driven, []
-    # Because of the scatter, a single row of the ramp may be near the level before the ramp ends.
+    # Because of the scatter, a single row of the ramp may be near the constant level before the ramp ends.
     first = next((int(k) for k in np.flatnonzero(near) if np.mean(near[k:]) >= 0.99), len(near))
     if np.sum(near[first:]) < 0.9 * np.sum(near):
         return driven, [

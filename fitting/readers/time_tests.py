@@ -53,7 +53,7 @@ class TimeTest(NamedTuple):
     @property
     def cyclic(self) -> bool:
         """Whether the imposed load falls by more than half of its largest value and rises again. The response of such a
-        test passes 0."""
+        test passes through 0."""
         driven = np.abs(self.driven)
         half = 0.5 * driven.max()
         fallen = np.maximum.accumulate(driven) - driven > half
@@ -67,7 +67,7 @@ class TimeTest(NamedTuple):
         """Time [s] of the last row at rest. Instruments often record for a while before the load."""
         driven = np.abs(self.driven)
         first = int(np.argmax(driven > AT_REST * driven.max()))
-        while first > 0 and driven[first] - driven[first - 1] > 1e-6 * driven.max():  # back to the start of the rise
+        while first > 0 and driven[first] - driven[first - 1] > 1e-6 * driven.max():  # go back to the start of the rise
             first -= 1
         return float(self.time[first])
 
@@ -77,7 +77,7 @@ class TimeTest(NamedTuple):
         jumps."""
         if self.rise == GIVEN:
             return np.zeros(0, int)
-        shown = np.flatnonzero(np.isfinite(self.answer))  # rows without a response may have been added
+        shown = np.flatnonzero(np.isfinite(self.answer))  # added rows may have no response
         return shown[_rows_of_jumps(self.driven[shown])]
 
     @property
@@ -112,7 +112,7 @@ def read_time_test(
         kind: "relaxation" or "creep".
         sample: radius and height of a cylinder, for torque and force.
         ramp: duration [s] of the ramp of strain or stress, 0 for a step. For a column of modulus or compliance, None
-            means a step. For two columns, a duration is given only if no row shows the rise (see `from_rest`).
+            means a step. For two columns, give a duration only if no row shows the rise (see `from_rest`).
         start: responses before this time [s] are not fitted.
 
     Raises:
@@ -127,8 +127,8 @@ def read_time_test(
     form = next((f for f in FORMS if set(f) <= set(columns)), None)
     if form is None or (form[0] in ("modulus", "compliance") and form[0] != _own_table(kind)):
         raise InputError(
-            f"{path}: a {kind} test needs the time and {_own_table(kind)}, strain and stress, angle and torque, or "
-            f"displacement and force; the file has {', '.join(columns)}"
+            f"{path}: a {kind} test needs the time and one of these: {_own_table(kind)}; strain and stress; angle and "
+            f"torque; displacement and force. The file has {', '.join(columns)}"
         )
     if form[0] in ("modulus", "compliance"):
         notes += _another_course(str(path), kind, time, columns[form[0]], (ramp or 0.0, start))
@@ -289,7 +289,8 @@ def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: 
     """Return a note if the imposed quantity of this kind of test changes in the second half, while the other quantity
     is constant.
 
-    No note is given for a constant rate of change, because samples are also strained until their stress is steady.
+    No note is given if the rate of change is constant, because some samples are strained at a constant rate until their
+    stress is steady.
     """
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
     late = len(driven) // 2
@@ -309,7 +310,7 @@ def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: 
 #: A quantity counts as constant if its relative standard deviation in the second half of the test is below this [1].
 HELD = 0.01
 #: A quantity changes at a constant rate if its standard deviation from a straight line is below this fraction of its
-#: standard deviation.
+#: standard deviation from the mean.
 STEADY = 0.05
 
 
@@ -322,7 +323,9 @@ def _as_a_step(path, time, modulus, ramp):
     if not (np.isfinite(ramp) and ramp >= 0):
         raise InputError(f"{path}: --ramp {ramp:g} cannot be the duration of a ramp in seconds; give 0 or more")
     if ramp > time[-1]:
-        raise InputError(f"{path}: --ramp {ramp:g} ends after the last row at {time[-1]:g} s; give seconds")
+        raise InputError(
+            f"{path}: --ramp {ramp:g} ends after the last row at {time[-1]:g} s; give a duration in seconds"
+        )
     kept = time > 0
     times = np.unique(np.concatenate([[0.0], time[kept], [ramp] if ramp else []]))
     answer = np.full(len(times), np.nan)
@@ -330,8 +333,8 @@ def _as_a_step(path, time, modulus, ramp):
     return times, np.minimum(times / ramp, 1.0) if ramp else np.ones(len(times)), answer
 
 
-#: A modulus may rise, and a compliance may fall, by _WRONG_WAY times its largest value, or by _IN_NOISE standard
-#: deviations of its noise.
+#: The limit for the rise of a modulus and for the fall of a compliance is _WRONG_WAY times its largest value, or
+#: _IN_NOISE standard deviations of its noise, whichever is larger.
 _WRONG_WAY, _IN_NOISE = 0.25, 6.0
 
 
@@ -429,8 +432,8 @@ RESTING, OFFSET = 3, 0.003
 
 
 def _without_offset(test: TimeTest) -> tuple[np.ndarray, float, list[str]]:
-    """Return the responses, the standard error of the subtracted offset, and a note. The mean before the load is
-    subtracted from all responses if it clearly exceeds its error."""
+    """Return the responses, the standard error of the subtracted offset, and a note. The mean response before the load
+    is subtracted from all responses if this mean is clearly larger than its standard error."""
     rest = np.isfinite(test.answer) & (test.time < test.begun) & ~((test.time == 0) & (test.answer == 0))
     count, size = int(rest.sum()), float(np.nanmax(np.abs(test.answer)))
     if count < RESTING:
@@ -457,9 +460,9 @@ def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
         return []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
     return [
-        f"the {what} is {here:.3g}{unit} at {test.time[k]:.3g} s, before the load, which is "
+        f"the {what} is {here:.3g}{unit} at {test.time[k]:.3g} s, before the load. This is "
         f"{100 * abs(here) / size:.2g} % of the largest {what} (absolute value). If this is an offset of the sensor, "
-        f"it changes all moduli: subtract this {what} from all rows, or give {RESTING} or more rows before the load"
+        f"all moduli are wrong: subtract this {what} from all rows, or give {RESTING} or more rows before the load"
     ]
 
 

@@ -7,7 +7,7 @@ The layout is the TRIOSJSONExportSchema of TA Instruments. The table is in `Resu
 
 import json
 
-#: Key of a row for the id of the test step to which the row belongs.
+#: Key in a row. Its value is the id of the test step of this row.
 STEP = "Results Step Id"
 
 

@@ -35,7 +35,7 @@ def text(path: Path, data: bytes, wanted: str) -> str:
     try:
         book = python_calamine.CalamineWorkbook.from_filelike(io.BytesIO(data))
         sheets = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
-    except Exception as error:  # the library has one exception per format, and raises others for damaged files
+    except Exception as error:  # the type of the exception depends on the file format
         raise InputError(
             f"{path} is a spreadsheet workbook that cannot be read ({_line(error)}): save the file again, or export "
             f"{wanted} as CSV"

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 
 def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequence[str] = ()) -> Content:
-    """Write fit.json and fit.png into the existing folder `out`. The best fit comes first. `warnings` are written
-    before the warnings of the fits.
+    """Write fit.json and fit.png into the existing folder `out`, and return the content of fit.json. `fits` begins with
+    the best fit. `warnings` are written before the warnings of the fits.
     """
     content = {
         "error_is": "root mean square of the relative misfit of G' and G''",
@@ -48,7 +48,8 @@ def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequen
 
 
 def table(sweep: StrainSweep, fits: list[StrainFit]) -> str:
-    """Return the table of the laws, best law first, and the third harmonic of the best law at the largest strain."""
+    """Return the table of the laws (best law first), and a line with the third harmonic of the best law at the largest
+    strain."""
     most, third = 100 * sweep.strain[-1], round(100 * fits[0].third[-1], 9)
     said = f"{fits[0].law.label}: at a strain of {most:.3g} % the third harmonic is {third:.2g} % of the first"
     return "\n".join([curves_report.table([f.law for f in fits]), said])

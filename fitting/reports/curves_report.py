@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Number of points of a drawn line.
+#: Number of points at which the fitted stress of a curve is drawn.
 FINE = 200
-#: The array shapes are the same for all figures, so the function is compiled once per law.
+#: Function for the stresses of a law on all curves of a figure. The function is compiled once for each kind of law,
+#: because all laws of a figure are evaluated at the same points.
 _stress = jax.jit(partial(homogeneous.nominal_stress, constant=True))
 
 
@@ -62,7 +63,7 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit], structured: Sequen
     ordered = best_first(fits)
     content = {
         "best": ordered[0].label,
-        "error_is": "root mean square of (P - P_measured), relative to that of the curve's stress",
+        "error_is": "root mean square of (P - P_measured), divided by the root mean square of P_measured of the curve",
         "curves": [
             {"label": c.label, "test": c.test, "points": len(c.stress), "rms_stress_Pa": c.scale} for c in curves
         ],
@@ -77,7 +78,8 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit], structured: Sequen
 
 
 def figure(curves: list[Curve], ordered: list[LawFit]) -> "Figure":
-    """Plot each curve with the best laws; below, the error and the number of parameters of each law."""
+    """Plot each measured curve with the stresses of the best laws. A bar chart below shows the error and the number of
+    parameters of each law."""
     shown = ordered[: len(COLOURS)]
     columns = min(4, len(curves))
     rows = -(-len(curves) // columns)
@@ -136,7 +138,8 @@ def _curve(axis: Any, curve: Curve, dense: Curve, stresses: list[np.ndarray]) ->
 
 
 def table(fits: list[LawFit]) -> str:
-    """Return one line per law, best law first: error, times, criterion, G0, parameters ± standard error."""
+    """Return a table with one line per law, best law first: error, times of running and compiling, Akaike's criterion,
+    G0, and parameters ± standard error."""
     lines = [f"{'law':18s} {'error':>7s} {'run':>8s} {'compile':>8s} {'AICc':>8s}  G0 [Pa]    parameters"]
     for f in best_first(fits):
         parameters = ", ".join(

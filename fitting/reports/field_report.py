@@ -142,7 +142,7 @@ def of_field(mesh: TetMesh, found: Field) -> Content:
 
 
 def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> None:
-    """Write all files into the folder `out`."""
+    """Write field.json into the folder `out`. For a map, also write field.vtu, field.h5 and field.png."""
     (out / "field.json").write_text(json.dumps(numbers(content | {"versions": versions()}), indent=1) + "\n")
     if found is None:
         return
@@ -219,7 +219,7 @@ def table_of_numbers(found: Estimate) -> str:
 
 
 def table_of_field(mesh: TetMesh, found: Field) -> str:
-    """Return a table of the fits for each prior, and the result, for the terminal."""
+    """Return a table for the terminal: one line for each prior that was tried, and a line with the result."""
     rows = ["prior sd  chi2/component  iterations  evaluations  seconds"]
     for h in found.history:
         rows.append(

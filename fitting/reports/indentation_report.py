@@ -28,8 +28,11 @@ _WIDE, _DEEP = 0.4, 0.2
 def write(
     out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit, level: ContactFit | None = None
 ) -> Content:
-    """Write both files and return the JSON. `level`: a second fit with a sloping base line (force before contact),
-    which removes a drift of the sensor. It is None if the data show no drift."""
+    """Write fit.json and fit.png into the folder `out`. Return the content of fit.json.
+
+    `level`: a second fit with a sloping base line (force before contact), which removes a drift of the sensor. It is
+    None if the data show no drift.
+    """
     out.mkdir(parents=True, exist_ok=True)
     G, errors = fit.modulus / (2 * (1 + rig.poisson)), fit.standard_errors
     alone = half_space(rig, curve.depth - fit.contact_point)
@@ -78,7 +81,7 @@ def _of_level(level: ContactFit) -> Content:
 def indentation_warnings(
     curve: IndentationCurve, rig: Indenter, fit: ContactFit, level: ContactFit | None = None
 ) -> list[str]:
-    """Return warnings about the modulus for the user."""
+    """Return warnings for the user about the fitted modulus and contact point."""
     told, deepest = [], float(curve.depth.max() - fit.contact_point)
     if fit.before < 3:
         told.append(f"{fit.before} points are before contact: measure the approach too, to find the contact point")
@@ -95,10 +98,12 @@ def indentation_warnings(
             if width > _WIDE
             else f"the indentation depth is {deepest:.3g} m, which is {deepest / rig.thickness:.0%} of the thickness"
         )
-        told.append(f"{far}, but the theory is for small strains: also fit only a part of the curve, and compare")
+        told.append(
+            f"{far}, but the theory is for small strains: also fit only the less deep part of the curve, and compare"
+        )
     if fit.modulus <= 0:
-        told.append("the modulus is not positive, because the force does not rise with the depth: check the signs")
-    # The points before contact contain only noise. With these points, a misfit in contact would look like noise.
+        told.append("the modulus is not positive, because the force does not rise with the depth: check their signs")
+    # The points before contact contain only noise. If they were included, a misfit in contact would look like noise.
     touching = fit.residuals[curve.depth > fit.contact_point]
     runs, chance = runs_probability(touching)
     if chance < 1e-3:

@@ -1,7 +1,8 @@
 """Write Prony modes as material cards for liverjax, FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
 
-All cards are neo-Hookean with G0, the instantaneous shear modulus. The whole stress relaxes, as in the simulations here
-(part = "all"). A shear test does not determine the bulk modulus. It is computed from Poisson's ratio `POISSON`.
+All cards contain a neo-Hookean law. Its shear modulus is the instantaneous modulus G0; only the card for SOFA, which
+has no Prony series, contains the equilibrium modulus. The whole stress relaxes, as in the simulations here (part =
+"all"). A shear test does not determine the bulk modulus. The bulk modulus is computed from Poisson's ratio `POISSON`.
 """
 
 from pathlib import Path
@@ -19,7 +20,7 @@ LARGEST_SUM = 1 - 1e-6
 
 
 def write(folder: Path, model: Maxwell) -> list[str]:
-    """Write the files. Return notes on everything that a program cannot represent."""
+    """Write all cards into `folder`. Return notes on everything that a program cannot represent."""
     folder.mkdir(parents=True, exist_ok=True)
     told = []
     if len(model.ratios) > FEBIO_TERMS:
@@ -85,7 +86,8 @@ def scene_tables(model: Maxwell) -> str:
 
 
 def febio(model: Maxwell) -> str:
-    """Return a viscoelastic material. g0 is the equilibrium fraction, so the elastic law is the instantaneous law."""
+    """Return a viscoelastic material for FEBio. In FEBio, g0 is the fraction of the stress that does not relax, so the
+    elastic law is the instantaneous law."""
     G0, ratios, times = model
     young = _written_number(2 * (1 + POISSON) * float(G0))
     terms = [f"      <t{k}>{_written_number(t)}</t{k}>" for k, t in enumerate(times, 1)]
@@ -112,8 +114,8 @@ def febio(model: Maxwell) -> str:
 
 
 def abaqus(model: Maxwell) -> str:
-    """Return a hyperelastic material with instantaneous moduli, C10 = G0 / 2 and D1 = 2 / K (K: bulk modulus). Each
-    mode has a line with shear ratio g, bulk ratio k and relaxation time tau."""
+    """Return a hyperelastic material for Abaqus with instantaneous moduli, C10 = G0 / 2 and D1 = 2 / K (K: bulk
+    modulus). Each mode has a line with shear ratio g, bulk ratio k and relaxation time tau."""
     G0, ratios, times = model
     kept = zip(_below_one(ratios), times, strict=True)
     rows = [f"{_written_number(g)}, {_written_number(g)}, {_written_number(t)}" for g, t in kept]
@@ -132,8 +134,8 @@ def abaqus(model: Maxwell) -> str:
 
 
 def ansys(model: Maxwell) -> str:
-    """Return commands of Mechanical APDL: a neo-Hookean law with mu = G0 and d = 2 / K (K: bulk modulus). Shear and
-    bulk have the same Prony pairs, with six values per line."""
+    """Return commands of Ansys Mechanical APDL: a neo-Hookean law with mu = G0 and d = 2 / K (K: bulk modulus). Shear
+    and bulk have the same pairs of ratio and relaxation time, with six values per line."""
     G0, ratios, times = model
     pairs = [_written_number(v) for pair in zip(ratios, times, strict=True) for v in pair]
     data = [f"TBDATA,{k + 1},{','.join(pairs[k : k + 6])}" for k in range(0, len(pairs), 6)]
@@ -145,8 +147,8 @@ def ansys(model: Maxwell) -> str:
 
 
 def sofa(model: Maxwell) -> str:
-    """Return a hyperelastic force field with the equilibrium modulus. SOFA has no Prony series, so the series is in a
-    comment.
+    """Return a hyperelastic force field for SOFA with the equilibrium modulus, or with G0 if the model is a fluid. SOFA
+    has no Prony series, so the series is in a comment.
 
     The energy of SOFA's law is mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2. So the second parameter is Lame's lambda,
     not the bulk modulus.

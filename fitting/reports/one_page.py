@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 #: Width and height of A4 [inch], fraction of the height for the text, and margin (as a fraction of width or height).
 WIDTH, HEIGHT, TEXT, MARGIN = 8.27, 11.69, 0.56, 0.06
-#: Characters per line, and the font size [pt] at which a line fits. A text with more lines gets a smaller font.
+#: CHARACTERS: maximum number of characters per line. SIZE: font size [pt] at which such a line fits on the page. If
+#: there are too many lines, a smaller font is used.
 CHARACTERS, SIZE = 104, 8.0
 
 

@@ -44,7 +44,7 @@ def write_draws(path: Path, p: Posterior) -> None:
 
 
 def table(p: Posterior) -> str:
-    """Return lines with medians and 95 % intervals."""
+    """Return lines to print: medians and 95 % intervals of all parameters."""
     flat = p.draws.reshape(-1, p.draws.shape[-1])
     low, middle, high = np.quantile(flat, QUANTILES, axis=0)
     chains, count, _ = p.draws.shape
@@ -55,5 +55,5 @@ def table(p: Posterior) -> str:
     ]
     if p.simulated:
         count, apart = p.simulated["draws"], p.simulated["largest_difference"]
-        rows.append(f"{count:.0f} draws simulated: log density differs by {apart:.2g} at most")
+        rows.append(f"{count:.0f} draws were also simulated: their log density differs by {apart:.2g} at most")
     return "\n".join(rows)

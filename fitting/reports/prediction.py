@@ -23,8 +23,8 @@ class Prediction(NamedTuple):
     source: str
     predicted: np.ndarray  # (m,)
     measured: np.ndarray  # (m,)
-    standard_errors: np.ndarray  # (m,) of the prediction; infinite if the fit does not determine it
-    scales: np.ndarray  # (m,) weights: standard deviations if the test has them
+    standard_errors: np.ndarray  # (m,) of the predicted values; infinite if the fit does not determine a value
+    scales: np.ndarray  # (m,) residuals are weighted by 1 / scales: standard deviations if the test has them
     sizes: np.ndarray  # (m,) relative error = |predicted - measured| / sizes
     inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep
 
@@ -42,8 +42,8 @@ class Prediction(NamedTuple):
 
     @property
     def covered(self) -> float:
-        """Fraction of the measured values in the band that lie within the 95 % interval of the prediction. This
-        interval contains the scatter of the measured values."""
+        """Fraction of the measured values in the band that lie within the 95 % interval of the prediction. The width of
+        this interval includes the scatter of the measured values."""
         off = (self.predicted - self.measured)[self.inside]
         own = self.scales[self.inside] * noise_of_series(off / self.scales[self.inside])
         return float(
@@ -92,6 +92,6 @@ def sentence(found: Prediction) -> str:
         f"{name}: predicted within {off:.2g} % on average; {100 * found.covered:.0f} % of {inside} numbers lie in the "
         f"95 % interval of the prediction"
     )
-    if abs(found.factor - 1) > 0.005 * off:  # a common factor explains half of the error or more
+    if abs(found.factor - 1) > 0.005 * off:  # at least half of the error is one common factor
         told += f"; {found.factor:.3g} times the prediction would fit the test best"
     return told + (f"; {share - inside} numbers outside the band are not counted" if inside < share else "")

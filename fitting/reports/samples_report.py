@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def write(out: Path, found: Samples) -> Content:
-    """Write all three files and return the JSON."""
+    """Write fit.json, fit.png and fit.h5 into the folder `out`. Return the content of fit.json."""
     out.mkdir(parents=True, exist_ok=True)
     content = numbers(_json_content(found))
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
@@ -32,7 +32,7 @@ def write(out: Path, found: Samples) -> Content:
 
 
 def _json_content(found: Samples) -> Content:
-    """Return the content of fit.json: first a typical sample, then the population and all samples."""
+    """Return the content of fit.json: first the model of a typical sample, then the population and all samples."""
     typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
     own = (
         {}
@@ -64,7 +64,7 @@ def _json_content(found: Samples) -> Content:
 
 
 def _times_of_strengths(found: Samples) -> Content:
-    """Return the relaxation time [s] of each strength of a spectrum, by the name of the strength."""
+    """Return the relaxation time [s] of each strength of a spectrum (key: name of the strength)."""
     out: Content = {}
     for fit in found.fits:
         names = (n for n in fit.kind.names if n.startswith("strengths["))
@@ -73,7 +73,7 @@ def _times_of_strengths(found: Samples) -> Content:
 
 
 def _labels(found: Samples) -> dict[str, str]:
-    """Return the names of the parameters for the user. A strength is named by its relaxation time."""
+    """Return for each parameter the name that is printed. A strength of a spectrum is named by its relaxation time."""
     times = _times_of_strengths(found)["relaxation_times"] if found.kind.effective is not None else {}
     return {n: f"strength at {times[n]:.3g} s" if n in times else n for n in found.populations}
 
@@ -110,7 +110,7 @@ def _sample_entry(found: Samples, k: int) -> Content:
 
 #: Words in the warnings of single samples, and the sentence of the summary that counts these warnings.
 COUNTED = (
-    ("mark of the instrument", "the last points show the instrument"),
+    ("mark of the instrument", "the instrument dominates the last points"),
     ("Kramers-Kronig", "G' and G'' are not consistent with each other"),
     ("structured misfit", "the misfit has structure"),
     ("half decade", "some parameters depend on the ends of the band"),
@@ -134,17 +134,18 @@ def warnings(found: Samples) -> list[str]:
                 f"{name}: the value is {np.round(own[0]):g} in all samples, so the springpot is a spring or dashpot"
             )
         elif p is None:
-            out.append(f"{name}: fewer than two samples determine this parameter, so it has no population")
+            out.append(f"{name}: fewer than two samples determine this parameter, so its mean and spread are unknown")
         else:
             if p.spread == 0:
                 out.append(
-                    f"{name}: the errors of the fits explain all differences; no spread between samples is found"
+                    f"{name}: the differences between the samples are not larger than the errors of the fits, so no "
+                    "spread between the samples is found"
                 )
             without = [Path(s.source).name for s, x in zip(found.sweeps, p.pooled, strict=True) if np.isnan(x)]
             if without:
                 out.append(
                     f"{name}: the fit of {', '.join(without)} does not determine this parameter (perhaps a fluid, or "
-                    "another band), so the population contains only the other samples"
+                    "another frequency band), so mean and spread are computed from the other samples"
                 )
     out += _limits_of_typical(found)
     out += outliers(found)
@@ -227,7 +228,8 @@ def table(found: Samples) -> str:
 
 
 def figure(found: Samples) -> "Figure":
-    """Plot the moduli of all samples (left), and every parameter of every sample with its population (right)."""
+    """Plot the moduli of all samples (left). On the right, plot for each parameter the values of all samples, with the
+    95 % intervals of the population mean and of a new sample."""
     fig = pyplot().figure(figsize=(10, max(5.0, 0.7 * len(found.populations) + 1.5)), layout="constrained")
     left, right = fig.subplots(1, 2, width_ratios=(5.6, 4.4))
     for fit, sweep in _pairs(found):

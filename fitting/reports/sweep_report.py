@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 #: Closed form and simulation count as equal if they differ by less than this fraction of a standard error.
 AGREED = 0.1
 STEMS = ("ratios", "relaxation_times")
-MARK = "* changes by more than expected from independent noise if the first or the last half decade is left out"
+MARK = "* changes by more than independent noise explains if the first or the last half decade is left out"
 
 
 def numbers(values: Any) -> Any:
@@ -47,7 +47,7 @@ def numbers(values: Any) -> Any:
 
 
 def summary(fit: Fit, sweep: Sweep) -> Content:
-    """Return the content of fit.json for one method."""
+    """Return the content of fit.json for one fit (closed form or simulation)."""
     u, n = fit.uncertainty, fit.modes
     errors = fit.relative_errors(sweep)
     e = u.standard_errors
@@ -94,7 +94,8 @@ def ends_of_interval(details: Content) -> list[float] | None:
 
 
 def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
-    """Return the moduli of a closed-form fit with standard errors, which contain the uncertainty about the model."""
+    """Return the entry `moduli` of fit.json: G' and G'' of a closed-form fit, and their standard errors. The errors
+    contain the uncertainty about the choice of the model."""
     found = moduli_errors.fitted_moduli(fit, sweep.angular_frequency, sweep.noise_given)
     storage, loss = np.split(found.values, 2)
     errors = np.split(found.standard_errors, 2)
@@ -109,8 +110,8 @@ def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
 
 
 def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | None:
-    """Return the bias of each parameter, under the same names as the standard errors. `moved`: the biases, or None.
-    Returns None if the biases are unknown."""
+    """Return the biases `moved` of the parameters of `n` modes, under the same names as the standard errors. Returns
+    None if the biases are unknown."""
     if moved is None:
         return None
     return {
@@ -149,7 +150,7 @@ def own_numbers(p: Estimate | None, kind: Kind) -> Content:
 
 
 def spectrum_rows(details: Content) -> list[str]:
-    """Return lines about a spectrum for the user. Other models have no lines."""
+    """Return lines to print about the relaxation spectrum of a fit. There are no lines if the model is no spectrum."""
     found = details.get("spectrum")
     if not found:
         return []
@@ -178,10 +179,8 @@ def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = 
 def write(
     out: Path, sweep: Sweep, fits: list[Fit], profile: Content | None, posterior: Posterior | None = None
 ) -> Content:
-    """Write fit.json, fit.png and fit.h5 of the last fit in `fits`, with the other fits added. Return the JSON.
-
-    If there is a posterior, its summary is in the JSON and its draws are in posterior.csv.
-    """
+    """Write fit.json, fit.png and fit.h5, with the last fit as the main result. Return the content of fit.json. If
+    there is a posterior, fit.json contains its summary, and posterior.csv contains its draws."""
     out.mkdir(parents=True, exist_ok=True)
     main = fits[-1]
     content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
@@ -262,8 +261,8 @@ def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
 
 
 def _nearest_of_all(fits: list[Fit]) -> str:
-    """Return a second line for the title: the smallest misfit that a linear material of any spectrum can have. The
-    string is empty if this misfit is unknown."""
+    """Return a second line for the title of the figure. It states the smallest misfit that a linear material with any
+    relaxation spectrum can have. The string is empty if this misfit is unknown."""
     misfit = fits[0].details.get("consistency", {}).get("kramers_kronig_misfit")
     if misfit is None:
         return ""
@@ -365,12 +364,12 @@ def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int =
         ends = [np.array([np.minimum(w, 0.95 * v), w]) for w, v in zip(wide, (g, tau), strict=True)]
         axes.errorbar(tau, g, xerr=ends[1], yerr=ends[0], fmt="none", color=GREY, lw=0.8, label="with the ends, 95 %")
     axes.set(xscale="log", xlabel="relaxation time [s]", ylabel="ratio of G0 [1]")
-    axes.set_ylim(0, 1.05 * axes.get_ylim()[1])  # room above the largest bar
+    axes.set_ylim(0, 1.05 * axes.get_ylim()[1])  # leaves room above the largest error bar
     _legend_above(axes, columns)
 
 
 def _parameter_rows(fit: Fit) -> list[str]:
-    """Return lines with the moduli and one line per mode, or with the parameters of another model."""
+    """Return lines with the moduli and one line per mode. For other models, return lines with the parameters."""
     u, n = fit.uncertainty, fit.modes
     if fit.parameters is not None:
         return own_rows(fit.parameters, fit.kind, fit.details, edges.moved(fit))
@@ -469,7 +468,7 @@ def _totals(fit: Fit) -> list[str]:
 
 
 def _compression(fits: list[Fit]) -> list[str]:
-    """Return lines with the assumed compression of the sample, and with the axial force as a check."""
+    """Return lines with the compression of the sample and the predicted axial force (none if it is not compressed)."""
     found = [fit.details["precompression"] for fit in fits if "precompression" in fit.details]
     if not found:
         return []
@@ -495,5 +494,5 @@ def _agreement(fits: list[Fit]) -> list[str]:
         return [f"the simulation changes a parameter by {shift:.2g} standard errors, in {seconds:.2g} s"]
     return [
         f"closed form and simulation agree within {100 * max(shift, 1e-3):.1g} % of the standard errors: the "
-        f"simulation ({seconds:.2g} s) adds nothing here, and --method closed-form gives the same result"
+        f"simulation ({seconds:.2g} s) is not needed here, and --method closed-form gives the same result"
     ]

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None = None) -> Content:
-    """Write both files, and the draws of the posterior if there is one. Return the JSON, which has the same names as
-    for a sweep."""
+    """Write fit.json and fit.png into the folder `out`, and the draws of the posterior if there is one. Return the
+    content of fit.json, which has the same keys as for a sweep."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = fit.uncertainty, fit.modes
     e, errors = u.standard_errors, fit.relative_errors
@@ -75,8 +75,8 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
 
 
 def _total_errors_in_time(fit: TimeFit) -> Content:
-    """Return total errors and the contribution of each source (noise, size of the sample, short and long times). Empty
-    for a test that a TOML file describes."""
+    """Return total errors and the contribution of each source (noise, size of the sample, short and long times). The
+    result is empty for a test that a TOML file describes."""
     if "geometry_error" not in fit.details:
         return {}
     shares = total_error.error_shares(fit)
@@ -87,7 +87,7 @@ def _total_errors_in_time(fit: TimeFit) -> Content:
 
 
 def table(test: TimeTest, fit: TimeFit) -> str:
-    """Return a table of parameters ± standard error, and the criterion of each number of modes."""
+    """Return a table of parameters ± standard error, and the criterion of each model and number of modes tried."""
     rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
     if time_tests.ELASTIC in fit.details:
         elastic = fit.details[time_tests.ELASTIC]

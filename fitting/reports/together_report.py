@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Names of the curves of a test over frequency; and the axis label of each panel.
+#: CURVES: names of the two curves of a test over frequency. QUANTITIES: axis label for each kind of test.
 CURVES = {"sweep": ("G'", "G''"), "dispersion": ("phase velocity [m/s]", "attenuation [1/m]")}
 QUANTITIES = {
     "sweep": "modulus [Pa]",
@@ -36,7 +36,8 @@ QUANTITIES = {
 
 
 def write(out: Path, found: Together, relative: float) -> Content:
-    """Write both files. Return the JSON, which has the same names as for a sweep, and also `tests`.
+    """Write fit.json and fit.png. Return the content of fit.json, which has the same keys as for a sweep, and the key
+    `tests`.
 
     Args:
         out: folder.
@@ -154,7 +155,7 @@ def table(found: Together, relative: float) -> str:
     if found.kind.name == "prony":
         rows.append(f"G_inf {limits.equilibrium_of(found.model):11.5g} ± {_error(equilibrium_error(u))} Pa")
     if found.kind.effective is not None:
-        rows.append(f"G0 {float(found.model.shear_modulus):.5g} Pa, of the {n} Prony modes that represent it")
+        rows.append(f"G0 {float(found.model.shear_modulus):.5g} Pa, of the {n} Prony modes that represent the spectrum")
     rows += spectrum_rows(found.details or {})
     rows += _with_sizes(found, relative)
     for k, s in enumerate(found.shares, 1):
@@ -174,7 +175,8 @@ def _with_sizes(found: Together, relative: float) -> list[str]:
     if not names or not np.isfinite(whole[names[0]]):
         return []
     told = (
-        f"{names[0]} with the sizes of the samples ({100 * relative:.2g} % of a test's moduli): ± {whole[names[0]]:.2g}"
+        f"{names[0]} with the errors of the sample sizes ({100 * relative:.2g} % of a test's moduli): ± "
+        f"{whole[names[0]]:.2g}"
     )
     known = [n for n in names[1:] if 0 < shares["noise"][n] < np.inf]
     worst = max(known, key=lambda n: shares["geometry"][n] / shares["noise"][n], default=None)

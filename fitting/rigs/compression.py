@@ -12,7 +12,8 @@ power of the radius. So the instrument reports
 
     G*(omega) = a^4 s [a^2 / (l^2 - a^2) (1 - sum_k g_k / (1 + i omega tau_k)) + (1 - sum_k g_k)]
 
-where s is the axial stress before relaxation. So the relaxing part and the equilibrium modulus have different factors.
+where s is the axial stress before relaxation, and g_k and tau_k are the ratio and the relaxation time of mode k. So the
+relaxing part and the equilibrium modulus have different factors.
 """
 
 from typing import NamedTuple

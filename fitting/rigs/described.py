@@ -42,7 +42,7 @@ TESTS: dict[str, tuple[str, ...]] = {
 _OTHER = ("test", "data", "drive", "poisson", "min_time", "ramp")
 #: Kind of the test for each imposed quantity.
 _KINDS = {"displacement": "relaxation", "force": "creep"}
-#: Default Poisson's ratios: K/mu = 1000 for glued samples, and incompressible layers.
+#: Default Poisson's ratios: _GLUED for glued samples (K/mu = 1000), and _LAYER for layers (incompressible).
 _GLUED, _LAYER = 0.4995, 0.5
 #: Displacements, divided by the largest displacement, at which glued samples are simulated. Above the strain _LARGE,
 #: the finer grid is used.
@@ -53,7 +53,7 @@ _RIMS = (0.04, 0.1, 0.2)
 #: An indenter counts as going back if its depth falls by more than both _BACK times the largest depth and _SCATTERS
 #: times the scatter of the depth.
 _BACK, _SCATTERS = 0.02, 4.0
-#: Minimum number of rows of a growing contact, including the row at rest.
+#: Minimum number of rows in which the contact grows, including the row at rest.
 _FEWEST = 6
 #: Maximum number of rows of an indenter's test, including the rows that are added between the measured rows.
 _MOST_ROWS = 2000
@@ -134,9 +134,9 @@ def read_described(path: str | Path) -> TimeTest:
 
 
 def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list[str]]:
-    """Return the number of rows before the indenter goes back, and a note if the indenter goes back. While the contact
-    shrinks, the force follows another formula (Ting 1966, J. Appl. Mech. 33:845)."""
-    depth = scipy.ndimage.median_filter(np.maximum(depth, 0.0), 5, mode="nearest")  # ignores single low values
+    """Return the number of rows before the indenter goes back, and a note if it goes back. While the contact shrinks,
+    another formula is valid for the force (Ting 1966, J. Appl. Mech. 33:845)."""
+    depth = scipy.ndimage.median_filter(np.maximum(depth, 0.0), 5, mode="nearest")  # removes single low values
     scatter = 1.4826 * float(np.median(np.abs(np.diff(depth, 2)))) / np.sqrt(6) if len(depth) > 2 else 0.0
     fall = np.maximum.accumulate(depth) - depth
     back = fall > max(_BACK * float(depth.max()), _SCATTERS * scatter)
@@ -150,8 +150,8 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
 
 
 def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the rows, with additional rows between them that have no force (NaN). The additional rows are needed
-    because d is linear in time between two measured rows, but f(d) is not."""
+    """Return time, displacement d and force with additional rows between the measured rows. The additional rows have no
+    force (NaN). They are needed because d is linear in time between two measured rows, but f(d) is not."""
     parts = int(np.clip(_MOST_ROWS // len(time), 1, 8))
     place = np.arange((len(time) - 1) * parts + 1) / parts
     rows = np.arange(len(time))
@@ -287,7 +287,7 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
     notes = [f"{w.message}" for w in said if issubclass(w.category, UserWarning)]
     notes.append(
         f"the stiffness of the sample, divided by the shear modulus, is {secant[0]:.4g} m; "
-        f"{100 * left_out[0] / found[0]:.2g} % of this value correct the error of the mesh"
+        f"{100 * left_out[0] / found[0]:.2g} % of this value is a correction for the error of the mesh"
     )
     if abs(secant[-1] / secant[0] - 1) > _CURVED:
         notes.append(

@@ -3,8 +3,9 @@
 Each test is a rig: a scene without a law, and a reading (the force or displacement that is taken from the run). Law and
 viscosity are added for each run. The simulated sample is glued to its plates, so no shape factor is needed.
 
-By default, the mesh is a narrow sector of the cylinder between two planes of symmetry. It is fine at the rims of the
-plates and at the edge of the punch, where stresses are infinite. experiments/TABLES.md lists the error of this mesh.
+By default, the mesh is a narrow sector of the cylinder between two planes of symmetry. Its cells are small at the rims
+of the plates and at the edge of the punch, where stresses are infinite. experiments/TABLES.md lists the error of this
+mesh.
 """
 
 import warnings
@@ -30,8 +31,8 @@ from liverjax.simulation import automatic
 #: Minimum radius of the punch, and minimum width of the ring around the punch, divided by the radius of the sample.
 NARROWEST = 0.01
 #: The error of a default mesh is known to be below 1 % if height / radius lies within SHAPES and K/mu is at most
-#: STIFFEST. STIFFEST depends on how the elements treat volume changes. "mixed" needs a law that separates bulk from
-#: shear, and a viscosity with `part = "isochoric"` or no viscosity.
+#: STIFFEST. STIFFEST depends on how the elements treat volume changes (`volumetric` of `lj.Solve`). "mixed" needs a law
+#: that separates bulk from shear, and a viscosity with `part = "isochoric"` or no viscosity.
 SHAPES, STIFFEST = (0.2, 5.0), {"mixed": 1e4, "element": 20.0}
 
 
@@ -39,14 +40,14 @@ class Cells(NamedTuple):
     """Sizes and kind of the elements of a rig's mesh. Results of the default mesh are within 1 % of converged results
     (experiments/TABLES.md)."""
 
-    size: float | None = None  # [m] length of all cells of a whole cylinder; None: a graded sector
+    size: float | None = None  # [m] cell length in a mesh of the whole cylinder; None: a graded sector
     # In a sector: cell size at the rim of a plate, divided by the shortest dimension of the sample at this rim (radius,
     # half the height, …).
     rim: float = 0.04
     edge: float = 0.02  # in a sector: cell size at the edge of a punch, divided by the shortest dimension at this edge
     largest: float = 0.34  # in a sector: longest cells, divided by the radius; along the axis, twice this length
-    growth: float = cylinders.GROWTH  # increase of the cell length per distance from rims and edge
-    corners: int = 24  # corners of the polygon that replaces the circle; a sector has one of its edges
+    growth: float = cylinders.GROWTH  # in a sector: increase of the cell length per distance from rims and edge
+    corners: int = 24  # number of corners of the polygon that replaces the circle; a sector has one of its sides
     order: int = 2  # order of the elements
     volumetric: str = "auto"  # how the elements treat volume changes, see `lj.Solve`
 
@@ -57,7 +58,7 @@ class Rig:
 
     scene: lj.Scene = param("1", "scene; `read` replaces its law")
     nodes: Indices = param("1", "indices (n,) of the nodes that are read")
-    weights: Array = param("1", "weights (n,) of these nodes in the reading")
+    weights: Array = param("1", "weights (n,): the reading is the sum of the weighted values of these nodes")
     reading: str = static(default="force", about="force [N], or mean displacement [m], of the whole cylinder's nodes")
     whole: bool = static(default=False, about="the scene is the whole cylinder, not a sector of it")
 
@@ -155,7 +156,7 @@ def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size
             graded sector.
 
     Raises:
-        InputError: a length or a time is not positive, or a strain is not finite or flattens the sample.
+        InputError: a length or a time is not positive, or a strain is not finite or is at most -0.9.
     """
     strains = _finite_history("strains", strains)
     if strains.min() <= -0.9:
@@ -253,8 +254,8 @@ def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | N
 
 
 def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None) -> _Sample:
-    """Return a sector of the cylinder, or the whole cylinder if `cells.size` is given. `rings` and `layers`: cell
-    length [m] at given radii and heights [m]."""
+    """Return the sample: a sector of the cylinder, or the whole cylinder if `cells.size` is given. `rings` and
+    `layers`: cell length [m] at given radii and heights [m]."""
     radius, height = max(rings), max(layers)
     if cells.size is not None:
         rings, layers = (dict.fromkeys(places, cells.size) for places in (rings, layers))
@@ -301,7 +302,7 @@ def _driven(sample: _Sample, dt: float, lift: np.ndarray) -> Rig:
     times = dt * np.arange(len(lift) + 1)
     nodes = jnp.asarray(sample.under)
     # The motion is prescribed along z only. The planes of symmetry already fix other directions of some of these nodes,
-    # and no direction may be prescribed twice.
+    # and a fixed direction must not be prescribed too.
     moved = lj.Displaced(nodes=nodes, times=jnp.asarray(times), history=jnp.asarray(history), axes="z")
     sample = sample._replace(fixed=(*sample.fixed, lj.Fixed(nodes=nodes, axes="xy")))
     scene = _scene(sample, dt, len(lift), displaced=(moved,))

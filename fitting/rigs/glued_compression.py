@@ -6,9 +6,9 @@ elements of the torsion rig are 20 % too stiff; in pure torsion they are only a 
 and S (see below) and the force of the compression are computed with quadratic elements on the mesh of a quarter
 cylinder that is fine at the rims. This is done once for each law and strain.
 
-At each frequency, the stress of the sample relaxes by the factor m = G*/G0; after a long time it relaxes by m_inf. Then
-the measured modulus is G0 (R m + S m_inf). The factors R and S come from two harmonic solutions about the compressed
-state. Other harmonic solutions agree with this formula within 1e-4.
+At each frequency, the stress of the sample is m = G*/G0 times the elastic stress. After a long time, it is m_inf times
+the elastic stress. Then the measured modulus is G0 (R m + S m_inf). The factors R and S come from two harmonic
+solutions about the compressed state. Other harmonic solutions agree with this formula within 1e-4.
 """
 
 from typing import NamedTuple
@@ -24,8 +24,8 @@ from liverjax.mesh import cylinders
 from liverjax.mesh.promotion import quadratic
 from liverjax.mesh.tetrahedra import with_points
 
-#: Size of the cells at the rim of a plate, divided by the shorter of radius and half height. The coarser cells are used
-#: if a large strain inverts the finer elements at the rim.
+#: Sizes of the cells at the rim of a plate, divided by the shorter of radius and half height. The larger cells are used
+#: if a large strain inverts the smaller elements at the rim.
 RIMS = (0.1, 0.25)
 #: Size of the cells at the rim of a second mesh, divided by their size in the first mesh. Both meshes have the same
 #: number of cells.
@@ -42,8 +42,8 @@ class Glued(NamedTuple):
     """Factors [1] that convert the moduli at rest to the measured moduli of a compressed sample, and the force [N] of
     this sample before relaxation."""
 
-    relaxing: float  # R
-    standing: float  # S
+    relaxing: float  # factor R (see the top of this file)
+    standing: float  # factor S
     force: float
 
 
@@ -66,7 +66,7 @@ def glued(radius: float, gap: float, law: Law, strain: float) -> tuple[Glued, Gl
     for rim in RIMS:
         mesh, wider = (_quarter(radius, gap / (1 - strain), rim, coarser) for coarser in (1.0, COARSER))
         fine = _on_mesh(mesh, radius, law, strain)
-        # The mesh has the same connectivity, so the same compiled program is used.
+        # The second mesh has the same connectivity, so the same compiled program is used.
         coarse = None if fine is None else _on_mesh(with_points(mesh, wider.points), radius, law, strain)
         if fine is not None and coarse is not None:
             change = [(a - b) / (COARSER**ORDER - 1) for a, b in zip(fine, coarse, strict=True)]

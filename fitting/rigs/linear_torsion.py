@@ -54,8 +54,8 @@ class Response(NamedTuple):
 
 
 def _response(column: jax.Array) -> Response:
-    """Return the response to a motion of the last coordinate. `column`: the coordinates (n,) under a unit force on the
-    last coordinate."""
+    """Return the response to a unit displacement of the last coordinate. `column`: the coordinates (n,) under a unit
+    force on the last coordinate."""
     return Response(column / column[-1], 1 / column[-1])
 
 
@@ -90,7 +90,7 @@ class Vibrations(NamedTuple):
 class Linearised(NamedTuple):
     """Matrices of the linearised rig with n coordinates. They are the same for all frequencies."""
 
-    inverse: jax.Array  # inverse of the stiffness (n, n) for motions too fast for relaxation
+    inverse: jax.Array  # (n, n) inverse of the stiffness before relaxation, for very fast motions
     relaxing: jax.Array | None  # (n, n) [N/m] relaxing part of the stiffness; None: the whole stress relaxes
     standing: jax.Array | None  # (n, n) [N/m] part that does not relax; None: the whole stress relaxes
     held: "Held | None" = None  # the compressed sample; None: not compressed
@@ -209,8 +209,8 @@ class Held(NamedTuple):
     meshless: jax.Array | None  # R and S (2,) without mesh error; None: unknown
 
     def bias_at(self, modulus: Number, stands: Number) -> jax.Array:
-        """Return the bias of the mesh. `modulus`: complex factor by which the stress relaxes. `stands`: fraction of
-        the stress that never relaxes."""
+        """Return the bias of the mesh. `modulus`: complex ratio of the relaxing stress to the elastic stress. `stands`:
+        fraction of the stress that never relaxes."""
         if self.meshless is None:
             return self.bias + 0j
         own, true = (R * modulus + S * stands for R, S in (self.factors, self.meshless))

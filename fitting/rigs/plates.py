@@ -1,7 +1,7 @@
 """The sample between the plates of a rheometer (together called the rig): its mesh, and the coordinates of its motion.
 
-The coordinates are the displacements u of the free nodes, the lift (axial displacement) of the top plate, and arc. The
-arc length of the plate's rotation is arc = radius * angle.
+The coordinates are the displacements u of the free nodes, the lift (axial displacement) of the top plate, and the arc
+length of the plate's rotation, arc = radius * angle.
 """
 
 import math
@@ -28,14 +28,16 @@ class Rig:
     mesh: TetMesh = param("m", "the sample")
     radius: Number = param("m", "plate radius")
     height: Number = param("m", "gap")
-    density: Number | None = param("kg/m^3", "None: no inertia, and no velocity in the state", default=None)
+    density: Number | None = param("kg/m^3", "None: the run has no inertia, and no velocities are stored", default=None)
     bottom: int = static(about="number of nodes on the fixed plate")
     top: int = static(about="number of nodes on the turning plate")
     held: jax.Array | None = param(
         "m", "positions (V, 3) of the compressed sample; None: not compressed (`compression`)", default=None
     )
     meshless: jax.Array | None = param(
-        "1", "factors R and S (2,) without mesh error (`glued_compression`); None: unknown", default=None
+        "1",
+        "factors R and S (2,) of `glued_compression`, corrected for the error of the mesh; None: unknown",
+        default=None,
     )
     free_height: bool = static(default=False, about="the top plate also moves along the axis, without axial force")
 
@@ -50,8 +52,8 @@ def linear_cell_for(radius: float, height: float) -> float:
     """Return a cell size [m] that gives about 100 nodes. This is enough for small strain without inertia, because the
     bias (`geometry_factor`) is then the whole error of the mesh.
 
-    The remaining error is of the order of the strain. At a strain of 1e-3, the moduli differ by 1e-5 from the moduli
-    with `cell_size_for` (experiments/benchmarks/torsion_speed.py).
+    The remaining relative error is of the order of the strain. At a strain of 1e-3, the moduli differ by 1e-5 from the
+    moduli with `cell_size_for` (experiments/benchmarks/torsion_speed.py).
     """
     return max((math.pi * radius**2 * height / 30) ** (1 / 3), radius / 4, height / 8)
 

@@ -19,9 +19,10 @@ from liverjax.core.errors import InputError
 
 #: Largest contact radius in a table, divided by the thickness.
 WIDEST = 8.0
-#: Above this eta, 1 - K(eta) is below 1e-13 (it falls as eta^2 exp(-2 eta)).
+#: Upper end of the integrals over eta = xi h. Above it, 1 - K(eta) is below 1e-13 (it falls as eta^2 exp(-2 eta)).
 _LAST_WAVE = 20.0
-#: Numbers of Gauss points over eta and over the contact radius, and of rows of the table.
+#: _WAVES: number of Gauss points over eta. _POINTS: number of Gauss points over the contact radius. _ROWS: number of
+#: contact radii in the table.
 _WAVES, _POINTS, _ROWS = 160, 48, 48
 
 
@@ -49,7 +50,8 @@ def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
     """Return depth and force if the contact radius is `width` times the thickness. Both are divided by the values of a
     half-space with the same contact radius."""
     tau, w = np.polynomial.legendre.leggauss(_POINTS)
-    tau, w = np.append((tau + 1) / 2, 1.0), np.append(w / 2, 0.0)  # the edge of the contact has no weight
+    # The last point is the edge of the contact. Its weight is 0.
+    tau, w = np.append((tau + 1) / 2, 1.0), np.append(w / 2, 0.0)
     eta, v = np.polynomial.legendre.leggauss(_WAVES)
     eta, v = _LAST_WAVE * (eta + 1) / 2, _LAST_WAVE * v / 2
     waves = np.cos(width * np.outer(tau, eta))
@@ -58,7 +60,7 @@ def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
     level, dented = np.linalg.solve(np.eye(len(tau)) - kernel * w, np.stack([np.ones_like(tau), profile], axis=1)).T
     if shape == "punch":
         return 1.0, float(w @ level)
-    depth = dented[-1] / level[-1]  # at this depth, the pressure at the edge is 0
+    depth = dented[-1] / level[-1]  # at this depth, the pressure at the edge of the contact is 0
     alone = w @ (profile[-1] - profile)
     return float(depth / profile[-1]), float(w @ (depth * level - dented) / alone)
 
@@ -150,8 +152,8 @@ class Layer:
 
 
 def series(chi: np.ndarray, poisson: float) -> np.ndarray:
-    """Return the factor (force divided by the force on a half-space) of a sphere for small chi = sqrt(R d)/h, to third
-    order in chi. The series is derived from the same integral equation."""
+    """Return the force of a sphere, divided by its force on a half-space, for small chi = sqrt(R d)/h (radius R, depth
+    d, thickness h). The series has terms up to chi^3. It is derived from the integral equation of this file."""
     eta, v = np.polynomial.legendre.leggauss(_WAVES)
     eta, v = _LAST_WAVE * (eta + 1) / 2, _LAST_WAVE * v / 2
     missing = v * stiffening(eta, poisson)
@@ -160,6 +162,6 @@ def series(chi: np.ndarray, poisson: float) -> np.ndarray:
 
 
 def dimitriadis(chi: np.ndarray) -> np.ndarray:
-    """Return the factor of a sphere on an incompressible layer for small chi = sqrt(R d)/h, as printed by Dimitriadis
-    et al. (equation 12)."""
+    """Return the force of a sphere on an incompressible layer, divided by its force on a half-space, for small chi =
+    sqrt(R d)/h (radius R, depth d, thickness h). The formula is printed by Dimitriadis et al. (equation 12)."""
     return 1 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4

@@ -13,8 +13,8 @@ from liverjax.scenes.scene import Scene
 
 
 def order_of_steps(scene: Scene) -> int:
-    """Return the order, in the time step, of the error of a run. If parts of the scene have different orders, the
-    smallest order is returned."""
+    """Return the order of the error of a run: the error is proportional to the time step to the power of this order. If
+    parts of the scene have different orders, the smallest order is returned."""
     dynamic_euler = scene.solve.kind == "dynamic" and scene.solve.integrator == "euler"
     old_recursion = scene.viscosity is not None and scene.viscosity.scheme == "backward_euler"
     return 1 if dynamic_euler or old_recursion or scene.porosity is not None else 2

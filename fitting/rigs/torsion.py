@@ -4,8 +4,8 @@ The sample is a cylinder of tetrahedra. Its bottom is fixed, and its top turns r
 sinusoidal torque (as in the stress-controlled rheometer AR2000) or a sinusoidal angle drives the top. Every time step
 is solved by Newton's method and differentiated implicitly. The moduli come from demodulation of the last cycle.
 
-By default, the run starts on the steady cycle of the linearised discrete problem. So there is no transient in the
-linear range.
+By default, the run starts on the steady cycle of the linearised problem with the same time steps. So there is no
+transient in the linear range.
 """
 
 import math
@@ -78,7 +78,7 @@ class Drive(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One oscillation: values at the times 0, dt, … (n + 1,), and Newton's statistics for each of the n steps."""
+    """One oscillation of n steps: values (n + 1,) at the times 0, dt, …, and Newton's statistics for each step."""
 
     time: jax.Array  # [s]
     angle: jax.Array  # [rad]
@@ -170,7 +170,8 @@ class _Oscillation(NamedTuple):
 
 
 class _Cycle(NamedTuple):
-    """The steady cycle of the linearised discrete problem, and the preconditioner for the solution of a step."""
+    """The steady cycle of the rig linearised about rest (with time steps), and the preconditioner for the solution of a
+    step."""
 
     steady: Response
     arc: Number | complex  # amplitude of the last coordinate [m]
@@ -353,9 +354,9 @@ def moduli(
     compiled program.
 
     The moduli are divided by the bias of the mesh, `geometry_factor`. If only the isochoric part relaxes, the bias
-    depends on the frequency, because the bulk modulus has more effect when the shear modulus has relaxed. With a
-    density, the inertial part is divided by the bias too. This is not exact: refine the mesh. Multiply the moduli by
-    `Moduli.bias` to get the moduli of the mesh without this correction.
+    depends on the frequency, because the bulk modulus has more effect when the shear modulus has relaxed. If the rig
+    has a density, the inertial part of the torque is divided by the bias too. This is not exact, so refine the mesh.
+    Multiply the moduli by `Moduli.bias` to get the moduli of the mesh without this correction.
 
     Args:
         omega, amplitude: arrays (n,) or single values, which are broadcast; see `oscillate`.
@@ -395,7 +396,8 @@ def linearity_limit(strains: Numbers, storage: Numbers, deviation: float = 0.05)
     """Return the strain at which G' differs by `deviation` from its value at the smallest strain. Returns infinity if
     G' never differs that much.
 
-    If a modulus is not finite (a diverged run) before this strain, the last strain with a finite modulus is returned.
+    If a modulus is not finite (a diverged run) before this strain, the last strain with a finite modulus is returned,
+    or NaN if there is none.
     """
     strains, change = np.asarray(strains), np.abs(np.asarray(storage) / np.asarray(storage)[0] - 1)
     beyond = np.flatnonzero(~(change <= deviation))
@@ -403,5 +405,5 @@ def linearity_limit(strains: Numbers, storage: Numbers, deviation: float = 0.05)
         return math.inf
     k = beyond[0]
     if not np.isfinite(change[k]):
-        return float(strains[k - 1])
+        return float(strains[k - 1]) if k else math.nan
     return float(np.exp(np.interp(deviation, change[k - 1 : k + 1], np.log(strains[k - 1 : k + 1]))))

@@ -40,8 +40,8 @@ class Matrices(NamedTuple):
     There are E elements, V nodes and I unknowns at inner nodes. I is also the number of rows of C.
     """
 
-    shear: np.ndarray  # (n, 3, n, 3, E) for a shear modulus of 1 Pa [N/m/Pa]
-    mass: np.ndarray  # (n, n, E) [kg], the same for x, y and z
+    shear: np.ndarray  # (n, 3, n, 3, E) stiffness for a shear modulus of 1 Pa [N/m/Pa]
+    mass: np.ndarray  # (n, n, E) [kg] mass matrices, the same for x, y and z
     unknowns: np.ndarray  # (n, 3, E) index of each unknown in a vector (3 V,) with x, y, z of a node together
     rows: np.ndarray  # (n, 3, E) row of C for each unknown, -1 if the node is not an inner node
     pattern: scipy.sparse.csr_array  # positions of the entries of C
@@ -53,8 +53,8 @@ class Matrices(NamedTuple):
 
 
 #: FREE: size of the pressure term g B B^H of S, divided by the size of the term C C^H at the modulus `TYPICAL` [Pa].
-#: Since this ratio is finite, the relative error is about 1 / FREE. The pressure term is the same for all moduli, so
-#: that values of chi^2 for different moduli can be compared.
+#: Since this ratio is finite, the pressure is not quite free; the relative error due to this is about 1 / FREE. The
+#: pressure term is the same for all moduli, so that values of chi^2 for different moduli can be compared.
 FREE, TYPICAL = 1e4, 3000.0
 
 
@@ -84,8 +84,8 @@ class Balanced(NamedTuple):
         return self._replace(multipliers=self.multipliers[rows], factor=self.factor[:, rows])
 
     def whitened(self, columns: scipy.sparse.csc_array, kind: type = np.complex128) -> np.ndarray:
-        """Return the k whitened columns L^-1 `columns` (I, k). For two columns a and b, the scalar product of the
-        whitened columns is a^H S^-1 b."""
+        """Return the k whitened columns L^-1 `columns` (I, k), computed with numbers of the type `kind`. For two
+        columns a and b, the scalar product of the whitened columns is a^H S^-1 b."""
         left, (bands, n) = columns.astype(kind).toarray(), self.factor.shape
         for a in range(0, n, bands):
             b = min(a + bands, n)
@@ -157,8 +157,9 @@ def by_part_and_slice(voxel: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 
 def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy.sparse.csr_array:
-    """Return B (I, P) for P pressures at the corners: integrals of the linear shape function of each corner times the
-    divergence of the quadratic shape function of each inner node."""
+    """Return the matrix B (I, P): the forces on the I unknowns of inner nodes due to P corner pressures of 1 Pa. An
+    entry is the integral of the linear shape function of a corner times the divergence of the quadratic shape function
+    of an inner node."""
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
     gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3) of linear shape functions
     second = (1 + np.eye(4)) / 20  # integrals of the products of two linear functions, divided by the volume
@@ -220,8 +221,8 @@ def likeliest(
     if len(S) < len(B):
         S = np.pad(S, ((0, len(B) - len(S)), (0, 0)))
     S[: len(B)] += B
-    # A banded factorisation is faster here than a sparse factorisation, because the sparse factor would also fill the
-    # band.
+    # A banded factorisation is faster here than a sparse factorisation, because the factor fills the band in both
+    # cases.
     factor = _factor_of_blocks(S)
     r = C @ d
     q = scipy.linalg.cho_solve_banded((factor, True), r, check_finite=False)

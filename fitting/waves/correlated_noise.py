@@ -2,11 +2,11 @@
 white noise.
 
 Scanners and filters smooth the data, so the noise of neighbouring voxels is correlated. Then the data contain fewer
-independent values, and fourth differences show only a part of the noise. The residual motion d - u (measured minus
-fitted) shows both effects. The residual is a projection of the noise, so even white noise leaves residuals with a small
-negative correlation between neighbours. Therefore random white noise and smoothed noise are projected in the same way.
-The comparison shows which width of a Gaussian filter gives the observed correlation along each axis, and which fraction
-of the noise remains in the residuals.
+independent values, and the estimate of the noise from fourth differences is too small. The residual motion d - u
+(measured minus fitted) shows both effects. The residual is a projection of the noise, so even white noise leaves
+residuals with a small negative correlation between neighbours. Therefore simulated noise, white or smoothed, is
+projected in the same way. The comparison shows which width of a Gaussian filter gives the observed correlation along
+each axis, and which fraction of the noise remains in the residuals.
 
 The error of a modulus is the sum v^H n / H over the voxels, with the noise n, v = C^H S^-1 C' u and H = (C' u)^H S^-1
 C' u (the symbols are explained in `fitting.waves.balance`). So the variance for white noise is multiplied by
@@ -26,7 +26,8 @@ import scipy.sparse
 from fitting.waves.balance import Balanced
 
 #: WIDTHS: standard deviations [voxels] of the Gaussian filters that are tried. DRAWS: number of random draws for each
-#: width if the body has SMALL voxels (fewer in a larger body). REACH: half length of a filter [voxels].
+#: width in a body of SMALL voxels (inversely proportional to the number of voxels). REACH: half length of a filter
+#: [voxels].
 WIDTHS = (0.0, 0.35, 0.45, 0.55, 0.65, 0.75, 0.9, 1.1, 1.4, 1.8)
 DRAWS, SMALL, REACH = 6, 1500, 6
 #: The noise is regarded as correlated if the correlation of neighbouring residuals exceeds the correlation for white
@@ -37,14 +38,15 @@ SEEN, BY_CHANCE = 0.04, 4.0
 class Correlation(NamedTuple):
     """The correlation of the noise at one frequency, estimated from the residuals."""
 
-    beyond: float  # largest correlation of neighbours along an axis, minus the correlation for white noise
+    beyond: float  # correlation of neighbouring residuals minus that for white noise: the largest value of the 3 axes
     seen: bool  # whether this difference is larger than expected from white noise
-    enlarged: np.ndarray  # (R,) error of each modulus, divided by that for white noise (with the given sd if `seen`)
+    # (R,) error of each modulus, divided by its error for white noise with the same sd (if `seen`: with the given sd)
+    enlarged: np.ndarray
 
 
 class _Projection(NamedTuple):
-    """Computes the residuals of fits at fixed moduli, from the matrix C of the force balance, the most probable motion,
-    and the voxels of the nodes."""
+    """Data for the residuals of fits at fixed moduli: the matrix C of the force balance, the most probable motion, and
+    the voxels of the nodes."""
 
     C: scipy.sparse.csr_array
     here: Balanced
@@ -61,7 +63,7 @@ class _Projection(NamedTuple):
         return out
 
     def residual(self, noise: np.ndarray) -> np.ndarray:
-        """Return the residuals (nx, ny, nz, 3) of a fit to the most probable motion plus `noise` (nx, ny, nz, 3)."""
+        """Return the residuals (nx, ny, nz, 3) if the most probable motion plus `noise` (nx, ny, nz, 3) is fitted."""
         n = np.zeros(self.C.shape[1], complex)
         n[: self.measured] = noise[tuple(self.voxel.T)].ravel()
         q = scipy.linalg.cho_solve_banded((self.here.factor, True), self.C @ n, check_finite=False)
@@ -112,8 +114,9 @@ def _of_neighbours(values: np.ndarray) -> np.ndarray:
 
 
 def _drawn(own: _Projection, width: float, draws: int) -> tuple[np.ndarray, float]:
-    """Simulate random noise that is smoothed by a Gaussian with this width [voxels]. Return the correlation (3,) of
-    neighbouring residuals, and the root mean square of the residuals divided by that of the noise."""
+    """Simulate random noise that is smoothed by a Gaussian with the standard deviation `width` [voxels]. Return the
+    correlation (3,) of neighbouring residuals, and the root mean square of the residuals divided by that of the
+    noise."""
     rng, shape = np.random.default_rng(0), tuple(own.voxel.max(axis=0) + 1 + 2 * REACH)
     inside = (slice(REACH, -REACH),) * 3
     found, parts = [], []
@@ -137,9 +140,9 @@ def _filter(width: float) -> np.ndarray:
 
 
 def _enlargement(own: _Projection, column: np.ndarray, widths: np.ndarray) -> float:
-    """Return the error of one modulus for noise smoothed with these widths (3,), divided by the error for white noise
-    with the same standard deviation at each node. Nodes of different parts of the body at the same voxel have the same
-    noise."""
+    """Return the error of one modulus for noise smoothed with `widths` (3,) [voxels] along x, y and z, divided by the
+    error for white noise with the same standard deviation at each node. Nodes of different parts of the body at the
+    same voxel have the same noise."""
     q = scipy.linalg.cho_solve_banded((own.here.factor, True), column, check_finite=False)
     each = (own.C.conj().T @ q)[: own.measured]
     v = np.zeros((*(own.voxel.max(axis=0) + 1), 3), complex)

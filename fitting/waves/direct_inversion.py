@@ -20,7 +20,7 @@ from liverjax.core.errors import InputError
 
 #: Standard deviation of the Gaussian that smooths displacements before they are differentiated [voxels].
 SMOOTHING = 1.0
-#: Side of the window of least squares [voxels].
+#: Side of the window of voxels for the least-squares fit [voxels].
 WINDOW = 3
 
 
@@ -33,7 +33,7 @@ def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, windo
         density: [kg/m^3].
         smoothing: standard deviation of the Gaussian [voxels]. An axis that is too short for the Gaussian is not
             smoothed.
-        window: side of the window [voxels], an odd number.
+        window: side of the window of the least-squares fit [voxels], an odd number.
     """
     if not density > 0 or window < 1 or window % 2 == 0 or smoothing < 0:
         raise InputError(
@@ -47,7 +47,7 @@ def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, windo
 
 def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.ndarray:
     inside = field.mask & np.all(np.isfinite(U), axis=-1)
-    # A derivative and a second difference use one voxel more on each side. The Gaussian uses three standard deviations.
+    # The first and the second derivative each use one voxel more on each side; the Gaussian uses 3 standard deviations.
     reach = [2 + math.ceil(3 * smoothing)] * 3
     ends = [np.flatnonzero(inside.any(axis=tuple(b for b in range(3) if b != a))) for a in range(3)]
     widths = [0.0] * 3

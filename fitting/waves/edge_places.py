@@ -93,7 +93,7 @@ def _level(above: np.ndarray, place: np.ndarray, count: int) -> float:
     the field is positive is the volume of the label (`count` voxels)."""
     reach = ndimage.find_objects(place.astype(int))[0]
     box = tuple(slice(max(0, r.start - 2), r.stop + 2) for r in reach)
-    # Values at several points within each voxel, by linear interpolation between the centres of the voxels.
+    # The values are interpolated linearly between the centres of the voxels, at several points within each voxel.
     inside = [np.clip(np.arange(n * FINE) / FINE + (0.5 / FINE - 0.5), 0, n - 1) for n in above[box].shape]
     fine = ndimage.map_coordinates(above[box], np.meshgrid(*inside, indexing="ij"), order=1)
     return -float(np.partition(fine.ravel(), -count * FINE**3)[-count * FINE**3])

@@ -26,8 +26,8 @@ from fitting.waves.edge_places import NO_PATCHES, Patches, patches_of
 from fitting.waves.voxels import VoxelBody
 from liverjax.mesh.adjacency import PAIRS
 
-#: HALVINGS: number of times that the sides of cut elements are halved; in each of the resulting small tetrahedra, edges
-#: are planes. CHUNK: number of elements that are computed at once.
+#: HALVINGS: number of times that the sides of cut elements are halved. In each of the resulting small tetrahedra, the
+#: edges of regions are planes. CHUNK: number of elements that are computed at once.
 HALVINGS, CHUNK = 3, 60
 
 
@@ -42,8 +42,8 @@ class RegionMatrices(NamedTuple):
     stiffness: np.ndarray  # (R, N) entries of C for a shear modulus of 1 Pa in each region
     mass: np.ndarray  # (N,) entries of C that are multiplied by -omega^2
     pattern: scipy.sparse.csr_array  # (I, U): positions of these entries
-    forces: scipy.sparse.csr_array  # (I, P) nodal forces of the pressures, which have the same large variance
-    pressure: np.ndarray  # covariance of these forces, stored as `Matrices.pressure`
+    forces: scipy.sparse.csr_array  # (I, P) nodal forces of P pressures with the same large prior variance
+    pressure: np.ndarray  # covariance of these forces, in the form of `Matrices.pressure`
     kinks: int  # number of unknowns of the kinks, which are not measured
     patches: Patches
     patch: np.ndarray  # (I,) index of the nearest patch for each row of C, -1 for rows away from cut elements
@@ -99,7 +99,8 @@ def region_matrices(
         m, body: the result of `balance.matrices`, and the body for which this result was computed.
         density: [kg/m^3].
         s: smoothed indicator functions (R, V) from `edge_places.places`.
-        farther: the same functions with edges moved outwards by `edge_places.FARTHER`.
+        farther: the same functions with edges moved outwards by `edge_places.FARTHER`. If it is None, the edges keep
+            the positions of the labels.
     """
     nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
     both = [s] if farther is None else [s, farther]
@@ -194,7 +195,8 @@ def _parts_by_region(at: np.ndarray) -> np.ndarray:
     out = []
     for k in range(len(at)):
         g = at[k] - np.delete(at, k, axis=0).max(axis=0)
-        # The formula fails if two corners have equal values. So the values are changed slightly, by about 1e-3.
+        # The formula fails if two corners have equal values. So the values are changed by about 1e-3 of the largest
+        # value.
         g = g + 1e-3 * np.abs(g).max(axis=-1, keepdims=True) * np.array([0.0, 1.0, -1.5, 2.5]) + 1e-30
         apart = g[..., :, None] - g[..., None, :] + np.where(np.eye(4, dtype=bool), 1.0, 0.0)
         out.append(np.sum(np.maximum(g, 0) ** 3 / np.prod(apart, axis=-1), axis=-1))
@@ -262,8 +264,9 @@ def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: 
 def _pattern(
     parts: list[_CutElements], rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the sparsity pattern of C: sorted keys of the matrix entries and ends of the rows. Also return, for each
-    part, which of its entries exist and the positions of these entries."""
+    """Return the sparsity pattern of C: the sorted keys of the matrix entries (row times U plus column, for U columns),
+    and the ends of the rows in this list. Also return, for each entry of `parts`, which of its values belong to C, and
+    their positions in this list."""
     keys, insides, U = [], [], len(rows)
     for p in parts:
         unknowns, lines = _unknowns_and_rows(p, rows)

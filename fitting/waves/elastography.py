@@ -24,8 +24,8 @@ DIRECTIONS = tuple(n for n in itertools.product((1, 0, -1), repeat=3) if n > (0,
 SHARPNESS = 4
 
 
-#: Minimum number of equations at one frequency, minus the number of unknown pressures. These equations must determine
-#: two values (storage and loss modulus) from noisy data.
+#: Minimum difference between the number of equations at one frequency and the number of unknown pressures. The
+#: equations must determine two values (storage and loss modulus) from noisy data.
 FEWEST_BALANCES = 10
 
 
@@ -47,7 +47,7 @@ class Found(NamedTuple):
     labels: np.ndarray | None  # (R,) label of each region
     parts: Regions | None  # fit with R regions
     mesh_bias: np.ndarray  # (F,) complex mesh bias of `whole`: weighted mean over plane waves
-    # (F, 2 D) contribution of each of the 2 D plane waves (D directions, two polarisations) to the error of this mean
+    # (F, 2 D) contribution of each of 2 D plane waves (D directions, two polarisations) to the uncertainty of this mean
     bias_left: np.ndarray
     parts_bias: np.ndarray | None = None  # (F, R) mesh bias of `parts`
     parts_bias_left: np.ndarray | None = None  # (F, R, 2 D) contributions to the uncertainty of `parts_bias`
@@ -108,7 +108,7 @@ def notes_on_gaps(field: WaveField) -> list[str]:
     ]
 
 
-#: A note is given if more than this fraction of the voxels lies in outer layers without elements.
+#: A note is given if this fraction of the voxels, or more, lies in outer layers without elements.
 LEFT_OUT = 0.1
 
 
@@ -260,8 +260,8 @@ def plane_wave_biases(G: complex, omega: float, organ: Organ, strength: np.ndarr
     The errors are due to the finite elements. A weight is the energy of a wave times the information about the modulus
     in this wave. The weighted mean of the errors is the error of one modulus that is fitted to all waves.
 
-    An error is one Gauss-Newton step from the true modulus. The step is computed for the elements of the organ, because
-    the surface and the holes of the body increase the error.
+    Each error is computed as one Gauss-Newton step that begins at the true modulus. The step is computed for the
+    elements of the organ, because the surface and the holes of the body increase the error.
 
     Args:
         G: modulus [Pa].

@@ -19,11 +19,12 @@ _NUMBERS = tuple(name for name in Regions._fields if name != "correlations")
 
 
 def kept_in(file: Path, resume: bool, marks: dict[str, object]) -> Keep:
-    """Return a function `Keep` that stores the regions of an organ in `file`, each under its name.
+    """Return a function `Keep` that stores the fitted moduli of an organ (`Regions`) in `file`, each result under its
+    name.
 
     Args:
-        file: HDF5 file. It is written each time new regions are found, completely or not at all.
-        resume: whether regions that are already in the file are used; if not, a new file is made.
+        file: HDF5 file. It is written again after each new result. An interruption leaves the earlier file unchanged.
+        resume: whether results that are already in the file are used; if not, a new file is made.
         marks: dictionary with a mark for each name. A mark is a digest or a value that identifies the organ and its
             data.
 

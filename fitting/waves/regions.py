@@ -15,8 +15,8 @@ from fitting.waves.edges import RegionMatrices
 #: STARTS: storage moduli [Pa] from which the starting point of a search is chosen. LOSS: ratio of loss to storage
 #: modulus at the starting point.
 STARTS, LOSS = np.geomspace(500.0, 40500.0, 5), 0.3
-#: ITERATIONS: maximum number of iterations. ENOUGH: the iteration ends if the change of each modulus, divided by the
-#: standard error of this modulus, is below this value.
+#: ITERATIONS: maximum number of iterations. ENOUGH: the iterations end if the next change of each modulus, divided by
+#: the standard error of this modulus, is below this value.
 ITERATIONS, ENOUGH = 20, 0.1
 
 
@@ -34,10 +34,10 @@ class Regions(NamedTuple):
     modulus: np.ndarray  # (F, R) complex [Pa]
     covariance: np.ndarray  # (F, 2 R, 2 R) [Pa^2]: storage moduli of all regions, then loss moduli
     farther: np.ndarray  # (F, R) mean outward shift of the edges, relative to the labels [voxels]
-    chi2: np.ndarray  # (F,)
+    chi2: np.ndarray  # (F,) chi^2 for the fitted moduli
     components: int  # number of real equations in chi^2 of one frequency
-    iterations: np.ndarray  # (F,)
-    converged: np.ndarray  # (F,) bool
+    iterations: np.ndarray  # (F,) number of Gauss-Newton iterations
+    converged: np.ndarray  # (F,) bool: whether the iterations converged
     correlations: tuple[Correlation, ...] = ()  # correlation of the noise at each frequency, if it was computed
 
     @property
@@ -47,7 +47,7 @@ class Regions(NamedTuple):
 
         Without an estimate of the correlation, the factor is sqrt(chi^2 / number of equations). If the noise is
         correlated, the factor is `Correlation.enlarged`. If the noise is not correlated, the factor is the product of
-        these two values.
+        `Correlation.enlarged` and this square root.
         """
         factor = np.repeat(np.maximum(1.0, np.sqrt(self.chi2 / self.components))[:, None], self.modulus.shape[1], 1)
         for f, own in enumerate(self.correlations):
@@ -68,13 +68,13 @@ class _State(NamedTuple):
 
     G: np.ndarray
     here: Balanced
-    gradient: np.ndarray  # (2 R + P,) with respect to storage and loss moduli, and shifts of the P patches of the edges
-    hessian: np.ndarray
+    gradient: np.ndarray  # (2 R + P,): R storage moduli, R loss moduli, and shifts of the P patches of the edges
+    hessian: np.ndarray  # (2 R + P, 2 R + P)
 
 
 def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
-    """Return a starting point: the complex modulus [Pa] of a uniform body, chosen from `STARTS` and `LOSS`, with the
-    lowest chi^2 at the lowest frequency."""
+    """Return a starting point of the search for the moduli [Pa]: the complex modulus of a uniform body. It is the value
+    from `STARTS` and `LOSS` with the lowest chi^2 at the lowest frequency."""
     ones = np.ones(m.rows.shape[-1])
 
     def out_of_balance(G):
@@ -98,9 +98,9 @@ def moduli_of_regions(
     Args:
         m: matrices from `edges.region_matrices`.
         waves: the measured waves.
-        start: complex modulus of each region (R,) [Pa], from which the search at the lowest frequency starts. The
+        start: starting point of the search at the lowest frequency: the complex modulus of each region (R,) [Pa]. The
             search at each other frequency starts from the moduli of the frequency before.
-        progress: called after every iteration with the number of the iteration and chi^2 per equation.
+        progress: function that is called after every iteration, with its number and chi^2 per equation.
         voxel: voxel index of each node (V, 3), needed to estimate the correlation of the noise. If it is None, the
             noise is assumed to be white.
     """
@@ -118,15 +118,15 @@ def moduli_of_regions(
 
 
 def _one_frequency(m, waves, f, G, progress):
-    """Fit one frequency. Return moduli (R,), covariance (2 R, 2 R), mean shifts of the edges (R,), chi^2, number of
-    iterations, whether the search converged, and the last state."""
+    """Fit the waves at frequency number f. Return moduli (R,), covariance (2 R, 2 R), mean shifts of the edges (R,),
+    chi^2, number of iterations, whether the search converged, and the last state."""
     R, at = len(G), (waves.omega[f], waves.motion[f], waves.sd[f])
     now, converged, k = _state_of_regions(m, G, *at), False, 0
     labels = _of_labels(m, R)
     step, covariance = _gauss_newton(now, labels)
     for k in range(1, ITERATIONS + 1):
         both = step[:R] + 1j * step[R : 2 * R]
-        part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # a modulus changes by at most 50 %
+        part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # one step changes a modulus by at most 50 %
         new = None
         # The most probable positions of the edges change with the moduli, which also changes chi^2. So chi^2 does not
         # show whether a step shorter than a standard error is an improvement.
@@ -160,9 +160,9 @@ def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarr
     these unknowns.
 
     In every step, the edges start from the labels, because the equations are nearly linear in the positions of the
-    edges. The derivatives with respect to the moduli are also computed with these edges. With the most probable edges,
-    the errors of the edges would count twice, and the modulus of a cylinder with a radius of 2.5 voxels would be 1 %
-    larger.
+    edges. The derivatives with respect to the moduli are also computed with these edges. If the most probable edges
+    were used instead, the errors of the edges would count twice, and the modulus of a cylinder with a radius of 2.5
+    voxels would be 1 % larger.
     """
     H = now.hessian + labels
     silent = np.diagonal(H) == 0  # the region has no element
@@ -196,7 +196,7 @@ def _state_of_regions(m: RegionMatrices, G: np.ndarray, omega: float, motion: np
     R, J = len(G), np.concatenate([m.by_moduli(here.motion), m.by_edges(here, G, omega)], axis=1)
     g = (J.conj().T @ here.multipliers) / sd**2
     X = here.whitened(scipy.sparse.csc_array(J))
-    # A loss modulus acts like i times a storage modulus.
+    # The derivative with respect to a loss modulus is i times the derivative with respect to the storage modulus.
     X = np.concatenate([X[:, :R], 1j * X[:, :R], X[:, R:]], axis=1)
     gradient = np.concatenate([g[:R].real, g[:R].imag, g[R:].real])
     return _State(G, here, gradient, np.real(X.conj().T @ X) / sd**2)

@@ -16,11 +16,11 @@ decreases. Here z is the whitened field, and n is chi^2 divided by its expected 
 the highest evidence is used. For each standard deviation, the Gauss-Newton method minimises chi^2/2 + |z|^2/2. A search
 ends if the next step is shorter than `NEAR` standard deviations of the map.
 
-The uncertainty has two parts. The first part comes from the Hessian H. It includes that correlated noise of
-neighbouring voxels causes larger errors (`fitting.waves.correlated_noise`). The second part is needed because the
-position of a jump of the modulus is not known exactly. The prior smooths a jump over a width w: the correlation length,
-or the side of a brick if the side is longer. The jump may lie anywhere within this width, so the variance of its
-position is w^2/12. This adds |w dc/dx|^2/12 to the variance of c.
+The uncertainty has two parts. The first part comes from the Hessian H. This part is larger if the noise of neighbouring
+voxels is correlated (`fitting.waves.correlated_noise`). The second part is needed because the position of a jump of the
+modulus is not known exactly. The prior smooths a jump over a width w: the correlation length, or the side of a brick if
+the side is longer. The jump may lie anywhere within this width, so the variance of its position is w^2/12. So
+|w dc/dx|^2/12 is added to the variance of c.
 """
 
 import time
@@ -63,7 +63,7 @@ class WaveMap(NamedTuple):
     sd: np.ndarray  # (F, P) complex. Real part: sd of ln |G|; imaginary part: sd of the loss angle
     posterior_sd: np.ndarray  # (F, P) sd of real and of imaginary part of c + l_f, without uncertainty of positions
     prior_sd: np.ndarray  # (F, P) sd of the same quantities before the data are used
-    draws: np.ndarray  # (D, F, P) complex: D posterior samples of c + l_f, randomly shifted within w
+    draws: np.ndarray  # (D, F, P) complex: D posterior samples of c + l_f, at random positions within the width w
     modulus: np.ndarray  # (F, P) complex [Pa]
     deviation: float  # chosen prior standard deviation of c
     length: float  # correlation length of the prior [m]
@@ -359,8 +359,9 @@ def _noise_factors(course: Course, point: _Reached, y: np.ndarray, excess: float
     """Return noise factors (F,): the errors of the map, divided by the errors for white noise with the given sd.
 
     It is assumed that correlated noise enlarges the errors of a map by the same factor as the error of one modulus of
-    the whole organ. The correlation is computed from the residuals of the map, because residuals of a uniform organ
-    also contain effects of real changes of the modulus. `excess`: chi^2 divided by its expected value, at least 1.
+    the whole organ. The correlation is computed from the residuals of the map. The residuals of a fit with a uniform
+    modulus would also contain effects of real changes of the modulus. `excess`: chi^2 divided by its expected value, at
+    least 1.
     """
     root, w = np.sqrt(excess), course.waves
     if course.voxel is None:
@@ -395,7 +396,7 @@ def _information(course: Course, point: _Reached, factors: np.ndarray | None = N
         for rows in course.m.parts:
             own = every[rows].tocsc()
             known = np.flatnonzero(np.diff(own.indptr))
-            X = b.of(rows).whitened(own[:, known], np.complex64)  # single precision is enough for the Hessian of a step
+            X = b.of(rows).whitened(own[:, known], np.complex64)  # single precision is enough for the Hessian
             H[np.ix_(known, known)] += X.conj().T @ X
     # The result is T^T H T, where T is the real matrix of the function `natural`.
     half = course.whitened(H)

@@ -12,8 +12,8 @@ from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 
 class VoxelBody(NamedTuple):
-    """Bricks of 3 x 3 x 3 voxels, each divided into six quadratic tetrahedra. Neighbouring bricks share the voxels on
-    their common face.
+    """Body of bricks of 3 x 3 x 3 voxels, each divided into six quadratic tetrahedra. Neighbouring bricks share the
+    voxels on their common face.
 
     A large body is divided into parts. At a voxel that belongs to two parts, each part has a separate node.
     """
@@ -39,7 +39,7 @@ def voxel_body(
         side: maximum number of bricks along the side of a part; None: the body has one part.
 
     Raises:
-        InputError: no brick fits into the mask, or no node has bricks on all sides.
+        InputError: no brick fits into the mask.
     """
     first = _corner(mask)
     cells = tuple(int(n) for n in (np.array(mask.shape) - 1 - first) // 2)
@@ -51,7 +51,7 @@ def voxel_body(
         )
     kept = _whole_bricks(mask[tuple(slice(f, None) for f in first)], cells)
     if not _surrounded(kept).any():
-        raise InputError("no voxel has two voxels of the mask on every side: give a larger mask")
+        raise InputError("no cube of 3 x 3 x 3 voxels lies within the mask: give a larger mask")
     parts = _part_of_each_brick(kept, side)
     used, tets = np.unique(_sixths(np.argwhere(kept), kept.shape), return_inverse=True)
     at = 2 * np.stack(np.unravel_index(used, tuple(n + 1 for n in kept.shape)), axis=1)
@@ -124,8 +124,8 @@ def _whole_bricks(mask: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
 
 
 def _surrounded(kept: np.ndarray) -> np.ndarray:
-    """Return for each voxel of the grid whether all bricks that contain this voxel are kept, and the voxel is not at
-    the end of the grid. Along each axis, n bricks have 2 n + 1 voxels."""
+    """Return for each voxel of the grid whether it is inside the body: all bricks that contain the voxel are in the
+    body (`kept`), and the voxel is not at the end of the grid. Along each axis, n bricks have 2 n + 1 voxels."""
     inside = np.ones(tuple(2 * n + 1 for n in kept.shape), bool)
     for offset in np.ndindex(3, 3, 3):
         inside[_every_second(offset, kept.shape)] &= kept

@@ -84,7 +84,7 @@ def read_waves(
     now_and_then = inside & ~np.isfinite(U).any(axis=4).all(axis=0)
     if now_and_then.any() and np.isfinite(U).any(axis=(1, 2, 3, 4)).all():
         notes.append(
-            f"{now_and_then.sum()} of {inside.sum()} voxels are not measured at every frequency, so they are not used"
+            f"{now_and_then.sum()} of {inside.sum()} voxels have no displacement at some frequencies and are not used"
         )
     regions = _whole_numbers(name, "labels", found.get("labels"), shape)
     order = np.argsort(hertz)
@@ -167,7 +167,7 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
 
 def with_noise(field: WaveField, noise: float | None) -> WaveField:
     """Return the field with `noise` [m] as the standard deviation of its noise. If `noise` is None, the estimated noise
-    of the field is kept, which must be above 0."""
+    of the field is kept. It must be above 0."""
     if noise is not None:
         return field._replace(noise=np.full(len(field.frequencies), noise))
     unknown = ~(field.noise > 0)
@@ -190,7 +190,9 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
     elif found.get("real") is not None and found.get("imag") is not None:
         parts = [_array_of_numbers(name, key, found[key]) for key in ("real", "imag")]
         if parts[0].shape != parts[1].shape:
-            raise InputError(f"{name}: real has shape {parts[0].shape}, but imag has {parts[1].shape}; use one shape")
+            raise InputError(
+                f"{name}: real has shape {parts[0].shape}, but imag has {parts[1].shape}; give both with one shape"
+            )
         U = parts[0] + 1j * parts[1]
     else:
         if _is_image(name):
@@ -246,8 +248,8 @@ def _instants(name: str, field: str, values: Numbers) -> np.ndarray:
     return u if u.ndim == 6 else u[None]
 
 
-#: A note is given if a period of T - 1 steps fits T instants much better than a period of T steps: if the residual is
-#: below this fraction of the other residual.
+#: T instants are fitted with a period of T steps, and with a period of T - 1 steps. A note is given if the residual of
+#: the second fit is below this fraction of the residual of the first fit.
 _REPEATED = 0.5
 
 
@@ -395,8 +397,8 @@ def coarsened(field: WaveField, stride: int) -> WaveField:
 
 
 def _most_frequent(labels: np.ndarray, stride: int, blocks: tuple[int, ...]) -> np.ndarray:
-    """Return the most frequent label in each block. If two labels are equally frequent, neighbouring blocks get the
-    lower and the higher label in turn."""
+    """Return the most frequent label in each block. If two labels are equally frequent, the lower and the higher label
+    are used alternately from block to block."""
     known = np.unique(labels)
     turn = np.where(np.indices(blocks[::2]).sum(axis=0) % 2, 1.0, -1.0)
     counts = [

@@ -18,14 +18,14 @@ FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 
 def show_unknown_letters() -> None:
-    """Show "?" for characters that the terminal cannot display, e.g. "±". Call this before the command line is
-    parsed."""
+    """Show "?" for characters that the terminal cannot display, e.g. "±". Call this function before the command line
+    is parsed."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
 
 
 def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace, resumable: bool = False) -> int:
-    """Run a command and return its exit code, or 2 for unusable input and 130 for Ctrl-C.
+    """Run a command and return its exit code. The exit code is 2 for unusable input or a full disk, and 130 for Ctrl-C.
 
     Compiled programs are kept on disk for the next command (see `liverjax.core.program_cache`). If `options` has
     `optional_files`, a note lists those files in the folder of results that come from an earlier run.

@@ -1,4 +1,4 @@
-"""``liverjax simulate SCENE.toml`` for a scene with kind = "harmonic"."""
+"""Run ``liverjax simulate SCENE.toml`` for a scene with kind = "harmonic"."""
 
 import argparse
 import sys

@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
     target = options.out / "result.h5"
     writable(options.out, (target.name,))
     long_run.refuse_unfinished(target, options.resume, text)
-    bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only
+    bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # shown only on a terminal
     report = None if bar.disable else lambda _: bar.update()
     try:
         ran, scene = _reduced(scene)
@@ -145,8 +145,8 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
 
 
 def _sizes_of_places(scene: "Scene") -> list[str]:
-    """Return lines with the area of each traction and the volume of each region. The user should check
-    these sizes, because only whole triangles and whole elements are selected."""
+    """Return one line with the area of each traction, and one line with the volume of each region. The user should
+    check these sizes, because only whole triangles and whole elements are selected."""
     import numpy as np
 
     from liverjax.mesh.surface import areas

@@ -33,7 +33,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
         "--probe", nargs="+", type=int, default=[], metavar="NODE", help="nodes whose positions are stored at all steps"
     )
     command.add_argument(
-        "--rows", nargs="+", type=int, default=[], metavar="N", help="only these rows, numbered from 1"
+        "--rows", nargs="+", type=int, default=[], metavar="N", help="run only these rows, numbered from 1"
     )
     command.add_argument(
         "--chunk", type=int, default=16, metavar="N", help="write the results after each N rows (default 16)"
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
             f"{options.scene}: [solve] {own} cannot be used in a sweep; use python -m liverjax simulate for each row"
         )
     out = options.out or options.parameters.with_suffix(".h5")
-    bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # on a terminal only
+    bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # shown only on a terminal
     try:
         done = sweep.run(table, out, options.resume, process, bar.update)
     except OSError as error:
@@ -106,8 +106,8 @@ def _of_crushed(rows: dict[int, float]) -> list[str]:
     named = ", ".join(map(str, list(rows)[:20])) + (", …" if len(rows) > 20 else "")
     how_many = f"{len(rows)} row{'s' if len(rows) > 1 else ''} ({named}; worst: row {worst}, J = {rows[worst]:.2g})"
     return [
-        f"at the end, some elements have less than a fifth or more than five times their volume in {how_many}, which "
-        "is impossible in tissue: use a larger bulk modulus or smaller loads"
+        "at the end, some elements have less than a fifth or more than five times their initial volume in "
+        f"{how_many}, which is impossible in tissue: use a larger bulk modulus or smaller loads"
     ]
 
 

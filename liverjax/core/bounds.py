@@ -162,7 +162,7 @@ def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
 def finite(value: float) -> bool:
     """Return whether a number is finite as a float.
 
-    A whole number with hundreds of digits is not: it is too large for a float.
+    A whole number with hundreds of digits is not finite in this sense, because it is too large for a float.
     """
     try:
         return math.isfinite(value)

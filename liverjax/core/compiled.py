@@ -38,7 +38,7 @@ _QUICK: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False} if jax.__
 
 
 class _Unknown(Exception):
-    """Raised if the key cannot describe a function or an argument, for example a law that a user has written."""
+    """Raised if no key can be computed for a function or an argument, for example for a law that a user has written."""
 
 
 def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False) -> Callable[..., Any]:
@@ -125,7 +125,7 @@ def _function_name(function: Callable[..., Any]) -> str:
 def _top(function: Any) -> str:
     """Return the name of a function at the top level of a module.
 
-    For a function inside another one, `_Unknown` is raised.
+    Raises `_Unknown` if the function is defined inside another function, or outside of the packages `OWN`.
     """
     module, name = function.__module__, function.__qualname__
     if not module.startswith(OWN) or not name.isidentifier():

@@ -4,5 +4,5 @@
 class InputError(ValueError):
     """Raised for unusable input. The message gives the file or field, its value and a remedy.
 
-    Commands exit with code 2.
+    A command that raises this error exits with code 2.
     """

@@ -63,7 +63,7 @@ def mark_of(*arrays: object) -> str:
 def refuse_other(file: Path, held: Mapping[str, object], marks: Mapping[str, object]) -> None:
     """Raise `InputError` if the marks `held` (from `file`) differ from `marks`.
 
-    The message lists the marks that differ.
+    Marks are named digests of a problem (`mark_of`). The message lists the names of the marks that differ.
     """
     other = [name for name, own in marks.items() if held.get(name) != own]
     if other:

@@ -100,8 +100,10 @@ def check_times(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1
     if isinstance(times, jax.core.Tracer):
         return
     falls = np.flatnonzero(~(np.diff(np.asarray(times)) > 0))
-    if not count[0] or falls.size:
-        found = f"{times[falls[0] + 1]:g} s after {times[falls[0]]:g} s" if count[0] else "none"
+    if not count[0]:
+        raise InputError(f"{name} history is empty: give at least one time, or remove times and history")
+    if falls.size:
+        found = f"{times[falls[0] + 1]:g} s after {times[falls[0]]:g} s"
         raise InputError(f"{name} history must have increasing times, but has {found}: sort the times")
 
 

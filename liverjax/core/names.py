@@ -89,7 +89,7 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
 
 
 def _names_that_end_in(thing: object, name: str) -> list[str]:
-    """Return at most three dotted names of numbers that end in `name`. Capitals and a unit in brackets are ignored."""
+    """Return at most three dotted names in `thing` that end in `name`. Capitals and a unit in brackets are ignored."""
     end = name.partition("[")[0].strip().lower()
     every = _names_of_numbers(thing) if end else ()
     return list(itertools.islice((own for own in every if f".{own}".lower().endswith(f".{end}")), 3))
@@ -111,7 +111,7 @@ def _names_of_numbers(struct: object, before: str = "") -> Iterator[str]:
 
 
 def _keys(thing: Any, path: list[str], refusal: str, before: str) -> tuple[list, list[str]]:
-    """Return the keys for the first words of a path, and the remaining words.
+    """Return the keys of `thing` for the first words of a path, and the remaining words of the path.
 
     `before` is the beginning of the dotted name, without the path. It is used in messages.
     """
@@ -155,7 +155,7 @@ def _is_whole(value: object) -> bool:
 
 
 def _is_place(word: str) -> bool:
-    """Return whether a word is an index in Python's notation: 2 is allowed. 02 is not, so that 2 has only one name."""
+    """Return whether a word is an index, for example 2. The word 02 is not, so that each index has one name only."""
     return word.isascii() and word.isdigit() and str(int(word)) == word
 
 

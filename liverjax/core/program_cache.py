@@ -36,11 +36,12 @@ def folder() -> Path | None:
 
 @contextmanager
 def kept_on_disk() -> Iterator[Path | None]:
-    """Read and write compiled programs on disk inside this context. It yields the folder of the cache.
+    """Read and write compiled programs on disk inside this context.
 
-    It yields None if there is no cache. There is no cache if `LIVERJAX_CACHE` is "off" or if the folder cannot be
-    written. If the user has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder, and there
-    is no cache here. Programs that cannot be read are compiled again.
+    The context manager yields the folder of the cache, or None if there is no cache. There is no cache if
+    `LIVERJAX_CACHE` is "off" or if the folder cannot be written. If the user has set a folder for JAX's cache
+    (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder, and there is no cache here. Programs that cannot be read are
+    compiled again.
     """
     chosen = _folder()
     with warnings.catch_warnings():
@@ -94,7 +95,7 @@ def _folder() -> Path | None:
         if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
             return None
         bound(root)
-    except (OSError, RuntimeError):  # RuntimeError: a user without a home directory
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home directory
         return None
     return folder.absolute()
 

@@ -12,23 +12,23 @@ ONE_STEP = 8
 
 ADVICE = {
     CONVERGED: "converged",
-    STALLED: "the residual stopped decreasing above the tolerance: use float64, smaller steps or a looser tolerance "
+    STALLED: "the residual stopped decreasing above the tolerance: use float64, smaller steps or a larger tolerance "
     "(in float32, with very stiff springs or with very short time steps, roundoff may not allow a smaller residual)",
     NOT_FINITE: "a residual was not finite, usually because of an inverted element: use smaller loads or steps, or a "
-    "law with continued_below; check a law that you wrote with `python -m liverjax check`",
+    "law with continued_below; if you wrote the law, check it with `python -m liverjax check`",
     INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (the body buckles, collapses, "
-    "or is nearly incompressible): use linear_solver = 'direct' or volumetric = 'mixed' if bulk is far above mu, "
-    "otherwise smaller steps, robust = 'projected' or, for a static scene, kind = 'dynamic'",
+    "or is nearly incompressible): if bulk is far above mu, use linear_solver = 'direct' or volumetric = 'mixed'; "
+    "otherwise use smaller steps, robust = 'projected' or, for a static scene, kind = 'dynamic'",
     INVERTED: "equilibrium was reached, but with inverted elements, which are not physical: use smaller loads, a "
     "stiffer volumetric energy or a finer mesh",
-    STEP_CUT: "the step was halved as often as allowed and still failed: use smaller steps, robust = 'projected', "
-    "kind = 'dynamic' if a static body buckles or topples, or a lower stiffness if an obstacle has a given stiffness",
-    GRADIENT_UNCONVERGED: "a step did not converge, so the derivative is not the derivative of a solution: correct "
-    "the run first (see Result.status)",
+    STEP_CUT: "the step was halved as often as allowed and still failed: use smaller steps or robust = 'projected'; if "
+    "a static body buckles or topples, use kind = 'dynamic'; if an obstacle has a given stiffness, use a lower value",
+    GRADIENT_UNCONVERGED: "a step did not converge, so the derivative is not the derivative of a solution: first "
+    "change the run so that all steps converge (see Result.status)",
     ADJOINT_FAILED: "the linear solves of the derivative did not converge, and the derivative is not finite: use "
     "linear_solver = 'direct' or smaller steps",
-    ONE_STEP: "newton = 'one_step' solved once and left the residual above the tolerance: use smaller steps, a looser "
-    "tolerance, or newton = 'converged'",
+    ONE_STEP: "with newton = 'one_step', the residual is above the tolerance after the only linear solve of the step: "
+    "use smaller steps, a larger tolerance, or newton = 'converged'",
 }
 
 

@@ -54,7 +54,7 @@ def param(
     """Declare a numeric field, which is a leaf of the pytree.
 
     Args:
-        unit: SI unit, ``"1"`` for a pure number. Fields in ``Pa`` scale together in `liverjax.laws.scaled`.
+        unit: SI unit, ``"1"`` for a pure number. `liverjax.laws.scaled` multiplies all fields in ``Pa``.
         about: one line for ``python -m liverjax laws``.
         each: whether the value is a sequence: one number for each term of a law, or the components of a direction.
         typical: value for a soft tissue with a shear modulus of about 1 kPa. It is used if a user gives only the name
@@ -81,8 +81,9 @@ def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.
 
     Args:
         about: one line about the field.
-        places: name of a method of the struct. For a word, the method returns the indices of this field whose entries
-            have this name. For example, `support.0` is the entry at the first index of ``named("support")``.
+        places: name of a method of the struct. For a given word, the method returns the indices of those entries of the
+            field that have this word as their name. For example, `support.0` is the entry at the first index of
+            ``named("support")``.
         default: see `dataclasses.field`.
     """
     return dataclasses.field(default=default, metadata={"about": about, "unnamed": places or True})

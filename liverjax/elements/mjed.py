@@ -149,7 +149,7 @@ def element_matrices(
 
 
 def of_nodes(order: int, corners: jax.Array) -> jax.Array:
-    """Matrices (E, 9 n^2) of elements with n nodes, from those (Q, E, 144) of the corners at Q integration points."""
+    """Matrices (E, 9 n^2) of elements with n nodes, from matrices (Q, E, 144) of corners at Q integration points."""
     Q, E = corners.shape[:2]
     c = jnp.asarray(basis(order).c, corners.dtype)
     K = jnp.einsum("akq,qekilj,blq->eaibj", c, corners.reshape(Q, E, 4, 3, 4, 3), c)
@@ -157,7 +157,7 @@ def of_nodes(order: int, corners: jax.Array) -> jax.Array:
 
 
 def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
-    """Assemble element matrices (E, 9 n^2) to a matrix (3V, 3V). Degree of freedom: 3 * node + component."""
+    """Assemble matrices (E, 9 n^2) of elements with n nodes to a matrix (3V, 3V), with row 3 * node + component."""
     import scipy.sparse  # imported here, since it takes a fifth of the package's import time
 
     nodes = mesh.element_nodes_on_host.T
@@ -174,8 +174,8 @@ def stiffness_matrix(
 
     Args:
         mesh, law, x: the same arguments as for `internal_force`.
-        regularised: use the regularisation of section 4.1.2 iii, with an unchanged trace. The regularisation changes
-            the path of Newton's iterations, but not their solution.
+        regularised: use the regularisation of section 4.1.2 iii of the book chapter, modified such that it does not
+            change the trace. The regularisation changes the path of Newton's iterations, but not their solution.
         terms: "contracted", or "chapter" for the six terms per product g(I1, I2) h(J) of the chapter. Both give
             the same matrix up to roundoff.
     """

@@ -95,7 +95,7 @@ def blocks(
     """Stiffness blocks in the form of `invariant_terms.blocks`, for an element matrix without negative eigenvalues.
 
     Args:
-        parts: pairs (weight, law); the energy is the weighted sum.
+        parts: pairs (weight, law). The energy is the weighted sum of the energies of the laws.
         S: constant second Piola-Kirchhoff stress that is added, or None.
         F: deformation gradient, a tuple matrix.
         D: gradients of the shape functions of the nodes.

@@ -1,6 +1,7 @@
 """Reference methods: force and stiffness by automatic differentiation of the energy, and by standard finite elements.
 
-These methods do not use the hand-derived formulas. They start only from `law.strain_energy`, and speed does not matter.
+These methods do not use the hand-derived formulas. They use only `law.strain_energy`, and they are not optimised for
+speed.
 """
 
 from typing import TYPE_CHECKING
@@ -121,7 +122,7 @@ def _voigt(S: jax.Array) -> jax.Array:
 
 
 def _strain_displacement(F: jax.Array, D: jax.Array) -> jax.Array:
-    """Matrix B (..., E, 6, n, 3): derivative of Green's strain (shears doubled) with respect to the node positions."""
+    """Matrix B (..., E, 6, n, 3): derivative of Green's strain (shears doubled) with respect to n node positions."""
     rows = []
     for i, j in _VOIGT:
         term = jnp.einsum("...k,...a->...ak", F[..., :, i], D[..., :, j])

@@ -47,7 +47,7 @@ def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
 
 
 def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol", seed: int = 0) -> np.ndarray:
-    """Return a table (N, P) of parameter sets within the ranges, with one set per row.
+    """Return a table (N, P) of N sets of P parameters within the ranges, with one set per row.
 
     Args:
         ranges: lower and upper bound of every parameter.
@@ -56,7 +56,8 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
         seed: random seed of "latin" and "sobol".
 
     Raises:
-        InputError: an unknown kind, no rows, or a grid with too few rows for two values of each parameter.
+        InputError: `kind` is unknown, `rows` is below 1, no parameter is given, or `rows` is too small for a grid with
+            two values of each parameter.
     """
     from scipy.stats import qmc
 
@@ -95,7 +96,7 @@ def write_table(file: Path, names: list[str], rows: np.ndarray, note: str) -> No
             raise InputError(
                 f"{file} exists and is not a table of `liverjax design`: give another file, or remove this file"
             )
-        if file.exists() and not file.is_file():  # e.g. the terminal, a pipe
+        if file.exists() and not file.is_file():  # e.g. the terminal or a pipe, which cannot be replaced
             file.write_text(text, encoding="utf-8")
             return
         with whole(file) as beside:

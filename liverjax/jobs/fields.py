@@ -33,10 +33,11 @@ FIELDS = {
 
 
 def check(names: list[str], scene: Scene) -> None:
-    """Raise `InputError` if a field is unknown, or if the scene does not have it.
+    """Check that all fields are known and can be computed for the scene.
 
     Raises:
-        InputError: a field is unknown, or needs a porous body. The message names the field.
+        InputError: a field is unknown, or needs a porous body that the scene does not have. The message names the
+            field.
     """
     for name in names:
         if name not in FIELDS:
@@ -58,7 +59,7 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
         names: some of `FIELDS`.
 
     Raises:
-        InputError: a field is unknown, or the scene does not have it.
+        InputError: a field is unknown, or needs a porous body that the scene does not have.
     """
     check(names, scene)
     scene, names = prepared(scene), list(dict.fromkeys(names))
@@ -76,15 +77,15 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
 
 @jax.jit
 def _put_again(scene: Scene, sizes: Sizes, state: State, given: Any) -> tuple[State, tuple]:
-    """Return the state after a step that ended at positions x, and values (…, Q, E) at Q points of each element.
+    """Return the state after a step, and values at the integration points of all elements.
 
-    The points are integration points. The values are first Piola-Kirchhoff stress, deformation gradient F, energy
-    density and fluid velocity.
+    The values are first Piola-Kirchhoff stress, deformation gradient F, energy density and fluid velocity. `given`
+    contains the number of the step, the positions x (V, 3) [m] at the end of the step, and the pressures [Pa] or None.
     """
     k, x, pressure = given
     mesh, e = scene.mesh, equations(scene, state, k, sizes)
     F = deformation_gradient(mesh, x)
-    if e.mixed is not None:  # pressures of mixed volumes are not in the result, but follow from the volumes
+    if e.mixed is not None:  # the result does not contain the pressures of volumetric = 'mixed'
         pressure = e.mixed.settled(mesh, determinant(F))
     P = _whole_stress(e, F, pressure)
     law = law_at_rest(scene)
@@ -110,7 +111,10 @@ def _whole_stress(e: Equations, F: Matrix, pressure: jax.Array) -> Matrix:
 
 
 def _velocity(scene: Scene, F: Matrix, pressure: jax.Array) -> jax.Array:
-    """Darcy velocity (3, Q, E) [m/s]: minus the permeability times the spatial gradient of the pressure."""
+    """Return the Darcy velocity [m/s]: minus the permeability times the spatial gradient of the pressure.
+
+    Its shape is (3, E), or (3, Q, E) if elements have Q > 1 integration points.
+    """
     mesh: TetMesh = scene.mesh
     corner, g, J = pressure[mesh.tetrahedra.T], volume_gradients(mesh, F), determinant(F)
     of = corner if mesh.order == 1 else corner[:, None]
@@ -136,7 +140,8 @@ def _means(P: np.ndarray, F: np.ndarray, energy: np.ndarray, velocity: np.ndarra
 
 
 def at_vertices(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
-    """Return fields at the vertices (T, V, …): means of the surrounding elements (T, E, …), weighted by volume."""
+    """Return fields (T, V, …) at the vertices: means of the values (T, E, …) of the elements around each vertex,
+    weighted by volume."""
     tets, volumes = np.asarray(mesh.tetrahedra), np.asarray(mesh.volumes)
     total = np.zeros((len(values), mesh.number_of_vertices, *values.shape[2:]))
     weight = np.zeros(mesh.number_of_vertices)

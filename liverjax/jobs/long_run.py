@@ -30,12 +30,12 @@ _ROWS = ("times", "positions", "reactions", "pressure", "status")
 
 
 class Ran(NamedTuple):
-    """A finished run and its computing time. Parts that were read from disk do not count."""
+    """A finished run and its computing time, which does not include parts that were read from disk."""
 
-    result: Result  # numpy arrays
+    result: Result  # all arrays are NumPy arrays
     steps: int  # number of steps that were computed and not read from disk
-    run_time: float  # [s]
-    compile_time: float  # [s]
+    run_time: float  # computing time of these steps [s]
+    compile_time: float  # time of the compilation [s]
     beside: Mapping[str, tuple[np.ndarray, str]] = {}  # additional datasets of the result: name -> values, unit
 
 
@@ -53,9 +53,9 @@ def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
         try:
             with h5py.File(out) as file:
                 before = tomllib.loads(str(file.attrs.get("scene", text)).lstrip("\ufeff"))
-        except (OSError, tomllib.TOMLDecodeError):  # not a result of a scene
+        except (OSError, tomllib.TOMLDecodeError):  # the file is not a result of a scene
             return
-        if before != tomllib.loads(text):  # comments may differ
+        if before != tomllib.loads(text):  # the two files may differ in comments
             raise InputError(f"{out} is the result of another scene: give another --out, or remove --resume")
 
 

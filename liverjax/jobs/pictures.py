@@ -15,7 +15,7 @@ from liverjax.mesh.tetrahedra import tet_mesh
 class Surface(NamedTuple):
     """The surface to draw, with the labels of the picture."""
 
-    before: np.ndarray  # # (V, 3) [m] positions before the run
+    before: np.ndarray  # (V, 3) [m] positions before the run
     after: np.ndarray  # (V, 3) [m] positions after the run
     triangles: np.ndarray  # (m, 3) node numbers of m triangles
     values: np.ndarray  # (V,) values that the colours show
@@ -23,7 +23,7 @@ class Surface(NamedTuple):
     title: str
 
 
-#: Field -> name of the quantity that is drawn.
+#: Name of each field -> quantity that is drawn.
 DRAWN = {
     "cauchy_stress": "von Mises stress [Pa]",
     "green_strain": "largest principal strain [1]",
@@ -59,7 +59,7 @@ def draw_surface(file: Path, surface: Surface) -> None:
 
 
 def of_result(file: Path, name: str, step: int | None = None) -> Surface:
-    """Read the surface from result.h5. A field, `displacement` or `pressure` gives its colours.
+    """Read the surface from result.h5. Its colours show a field, the displacement or the pressure.
 
     Args:
         file: result.h5 of `liverjax simulate`.
@@ -67,7 +67,7 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
         step: number of the step, from 1. None means the last step.
 
     Raises:
-        InputError: the file, the field or the step does not exist.
+        InputError: the file is not the result of one run, or the field or the step does not exist.
     """
     import h5py
 

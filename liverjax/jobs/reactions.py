@@ -42,8 +42,8 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
 
 
 def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
-    """Return {name: force (T, 3) [N]} of each fixed, displaced or sliding condition. `reactions` (T, V, 3) [N]: T
-    steps.
+    """Return {name: force (T, 3) [N]} of each fixed, displaced or sliding condition. `reactions` (T, V, 3) [N] are the
+    reactions of the nodes at T steps.
 
     The force of a fixed or displaced condition acts along the axes that it constrains. The force of a sliding support
     acts along its normal. If two conditions constrain the same axis of a node, the force along this axis counts only

@@ -30,7 +30,8 @@ def learnt(model: ReducedModel) -> str:
         return "no correction, because there were too few training runs or no correction reduced the errors"
     left = np.asarray(model.correction.left)
     return (
-        f"corrected; errors in cross-validation: {np.median(left):.2g} of the motion (median; largest {left.max():.2g})"
+        f"with a learnt correction; relative error in cross-validation: {np.median(left):.2g} (median), "
+        f"{left.max():.2g} (largest)"
     )
 
 
@@ -97,7 +98,7 @@ def tried(scene: Scene) -> Tried:
     failed = int(np.count_nonzero(np.asarray(first.status)))
     if failed or not small:
         limit = f"{float(np.asarray(solve.reduced_tolerance)):.2%}"
-        why = f"{failed} of its steps failed" if failed else f"The error is above {limit}"
+        why = f"{failed} steps of the reduced run failed" if failed else f"The error is above {limit}"
         return Tried(None, f"{said}. {why}, so the full model runs")
     ran = Ran(_as_result(found, x, P), len(found.times), run_time, compile_time, beside)
     return Tried(ran, said)

@@ -62,7 +62,7 @@ class Sweep(NamedTuple):
     rows: np.ndarray  # (N, P) parameter sets
     numbers: np.ndarray  # (N,) row numbers of the sets in the file, from 1
     outputs: tuple[str, ...]
-    probes: tuple[int, ...]  # nodes with positions that are stored over time
+    probes: tuple[int, ...]  # nodes whose positions are stored at all steps
     chunk: int
     identity: dict[str, object]
 
@@ -73,7 +73,7 @@ class Done(NamedTuple):
     file: Path | None  # None: other processes still have chunks to compute
     failed: dict[int, int]  # row number -> status code
     computed: int  # number of runs that this process computed now
-    crushed: dict[int, float]  # row number of a converged run -> final volume ratio J if it is impossible in tissue
+    crushed: dict[int, float]  # row number of a converged run -> final volume ratio J, if J is impossible in tissue
 
 
 def read_sweep(
@@ -87,13 +87,13 @@ def read_sweep(
     """Read a sweep from a scene file and a table with a header of dotted names. All rows are checked before any run.
 
     Raises:
-        InputError: the scene or the table cannot be used; the scene does not have a name; a value is out of bounds.
+        InputError: the scene or the table cannot be used, a name is not in the scene, or a value is out of bounds.
     """
     scene = load_scene(scene_file)
     names, rows = read_table(parameters)
     for name in names:
         if np.shape(numbers_at(scene, name)):
-            raise InputError(f"parameter {name!r} is a list in the scene file: name one number of it, by its index")
+            raise InputError(f"parameter {name!r} is a list in the scene file: name one of its numbers by the index")
     parts = {".".join(name.split(".")[:2]) for name in names}
     held = holding(scene, parts)
     for k, row in enumerate(rows.tolist()):
@@ -142,8 +142,8 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     """Read the header and the numbers (N, P) of a CSV file. Lines that begin with # are comments.
 
     Raises:
-        InputError: an unreadable or empty file, a name that occurs twice, a row with another length than the header, or
-            a value that is not a finite number.
+        InputError: the file cannot be read or has no rows, a name is missing or occurs twice, a row and the header
+            differ in length, or a value is not a finite number.
     """
     try:
         text = file.read_text(encoding="utf-8-sig")

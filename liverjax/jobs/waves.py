@@ -88,7 +88,7 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
 
 
 def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> list[str]:
-    """Return a warning if the reactions (V, 3) [N] of the run differ from those of the relaxed body at positions x.
+    """Return a warning if the reactions (V, 3) [N] of a run differ from those of the relaxed body at the positions x.
 
     If so, the stress of the run also differs from the relaxed stress. There is no warning for a porous body.
     """
@@ -112,13 +112,15 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
 
 
 def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
-    """Return the relative mesh errors of the motion (F,), and of the largest support force (F,), at F frequencies.
+    """Return the relative mesh errors of motion (F,) and of support forces (F,) at F frequencies.
 
-    The errors are NaN at frequencies without motion or without force. The mesh error must have been estimated before.
+    The error of the motion is divided by the motion. The largest error of a support force is divided by the largest
+    support force. The errors are NaN at frequencies without motion or without force. The mesh error must have been
+    estimated before.
     """
     error, found = waves.mesh_error, waves.found
     if error is None:
-        raise ValueError("the mesh's error was not estimated")
+        raise ValueError("the mesh error was not estimated: use mesh_error = True")
     sizes = [np.linalg.norm(np.asarray(u), axis=(1, 2)) for u in (error.displacement, found.displacement)]
     more, force = (held_forces(scene, np.asarray(own)) for own in (error.reactions, found.reactions))
 
@@ -131,7 +133,8 @@ def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str, object]) -> None:
-    """Write F frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), mesh and `attributes`."""
+    """Write an HDF5 file with F frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), the mesh
+    and `attributes`."""
     import h5py
 
     arrays = {name: (getattr(waves.found, name), unit) for name, unit in _UNITS.items()}

@@ -57,7 +57,7 @@ class Law(Energies):
         if self.fibre is None or any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(self.fibre)):
             return
         if not np.all(np.linalg.norm(np.asarray(self.fibre, float), axis=-1) > 0):
-            raise InputError(f"law {type(self).__name__}: a fibre has length 0: give a direction that is not zero")
+            raise InputError(f"law {type(self).__name__} has a fibre of length 0: give a direction that is not zero")
 
     # -- parts of a law -----------------------------------------------------------------------------------------------
 
@@ -159,7 +159,7 @@ class Sum(Law):
             law.check()
 
     def measures(self, F):
-        """Return one set of invariants for each law of the sum. Invariants that several laws need are computed once."""
+        """Return one set of invariants for each law of the sum. The compiler removes computations that occur twice."""
         return tuple(law.measures(F) for law in self.laws)
 
     def strain_energy(self, I):
@@ -169,7 +169,7 @@ class Sum(Law):
     def energy_derivatives(self, I):
         """Return the sum of the laws' derivatives with respect to the invariants.
 
-        The derivatives are added before stress and stiffness are computed, so a second law adds only scalar
+        The derivatives are added before stress and stiffness are computed, so each additional law needs only scalar
         operations.
         """
         first, second = {}, {}

@@ -41,13 +41,13 @@ class ByRegion(Law):
             law.check()
 
     def isochoric_part(self) -> Any:
-        """Return the isochoric part of each law. Returns None if a law has no isochoric part."""
+        """Return the isochoric parts of all laws. Returns None if one of the laws has no isochoric part."""
         if any(law.isochoric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.isochoric_part())
 
     def volumetric_part(self) -> Any:
-        """Return the volumetric part of each law. Returns None if no law has a volumetric part."""
+        """Return the volumetric parts of all laws. Returns None if none of the laws has a volumetric part."""
         if all(law.volumetric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.volumetric_part() or Volumetric(bulk=0.0))

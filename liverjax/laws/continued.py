@@ -37,7 +37,7 @@ class Continued(Law):
         return None if part is None else Volumetric(bulk=part.bulk, volumetric=part.volumetric, below=self.below)
 
     def without_volume(self) -> Law | None:
-        """Return the continued law without its volumetric energy."""
+        """Return the continued law without its volumetric energy. Returns None if it has no other energy."""
         part = self.law.without_volume()
         return self if part is self.law else None if part is None else Continued(law=part, below=self.below)
 
@@ -78,7 +78,7 @@ class Continued(Law):
         return self.law.bulk_modulus()
 
     def _whole(self) -> Law:
-        """Return the original law without its volumetric energy, or with it if the energy cannot be split."""
+        """Return the original law without its volumetric energy, or unchanged if its energy cannot be split."""
         part = self.law.isochoric_part()
         return self.law if part is None else part
 

@@ -15,14 +15,14 @@ ORDER = ("I1", "I2", "I4", "J")
 
 
 def accumulate(total: dict, key: object, value: object) -> None:
-    """Add a value to the entry `key` of a table of derivatives, in place. A missing entry gets this value."""
+    """Add `value` to the entry `key` of the dictionary `total` of derivatives. A missing entry is set to `value`."""
     total[key] = total[key] + value if key in total else value
 
 
 def reduced(I: Invariants) -> tuple[Any, Any]:
     """Return the isochoric invariants Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2.
 
-    These do not exist for J < 0 and are NaN there.
+    For J < 0, these invariants do not exist, and the results are NaN.
     """
     m = I.J ** (-2 / 3)
     return (None if I.I1 is None else m * I.I1), (None if I.I2 is None else m * m * I.I2)

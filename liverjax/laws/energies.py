@@ -103,7 +103,7 @@ class Energies:
 
 
 def fibre_invariants(laws: tuple) -> dict[str, Energies]:
-    """Return {name of an invariant a . C a: law with the fibre a} for a sum of laws. Fibres of the laws may differ."""
+    """Return a dictionary for a sum of laws: name of an invariant I4 = a . C a -> law with the fibre a."""
     if len(laws) == 1:
         return {"I4": laws[0]} if "I4" in laws[0].invariants else {}
     return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}

@@ -40,7 +40,7 @@ class Row(NamedTuple):
 
 
 class Check(NamedTuple):
-    """The rows of the table, and the data of the figure."""
+    """Result of the gradient check: the rows of the table, and the data of the figure."""
 
     law: Law
     rows: list[Row]
@@ -58,14 +58,14 @@ def load(name: str) -> Law:
     """Return an included law by its name, or the law FILE.py:LAW of a Python file. A class gets its typical values.
 
     Raises:
-        InputError: the law or file does not exist, the file does not run, or a parameter has no typical value.
+        InputError: the law or file does not exist or does not work, or a parameter has no typical value.
     """
     if ":" not in name and not name.endswith(".py"):
         return laws.typical(name)
     file, _, attribute = name.rpartition(":") if ":" in name else (name, "", "")
     if not Path(file).is_file():
         raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
-    # `dataclasses` needs a module in `sys.modules`. It gets another name than its file, which may be called jax.py.
+    # `dataclasses` needs the module in `sys.modules`, under another name than the file's (which may be jax.py).
     spec = importlib.util.spec_from_file_location(f"_law_file_{Path(file).stem}", file)
     if spec is None:
         raise InputError(f"{file} is not a Python file: give FILE.py:LAW")
@@ -159,7 +159,7 @@ def _typical_law(cls: type, name: str) -> Law:
 
 
 def check(law: Law) -> Check:
-    """Run all checks, and return one row for each. A wrong law raises no error, but some rows have `passed` = False."""
+    """Run all checks of a law, and return their rows. A wrong law raises no error: some rows have `passed` = False."""
     programs = [jax.jit(lambda law, F, what=what: getattr(law, what)(F)) for what in _PROGRAMS]
     energy, stress, tangent = (partial(program, law) for program in programs)
     more, stable = _stability(law, tangent)
@@ -226,7 +226,7 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
         exact, found = jax.jit(oracle), []
         for where, own, at in sets:
             ours, theirs = (_as_numbers(partial(f, own), at).reshape(len(at), -1) for f in (program, exact))
-            # A law may have a limiting stretch. So values that are not finite are ignored beyond moderate stretches.
+            # A law may have a limiting stretch. So values that are not finite are ignored, except in the first set.
             known = (np.isfinite(ours) & np.isfinite(theirs)).all(axis=1) | (where == "")
             if np.any(known):
                 found.append(_exact(f"{name} by hand against autodiff{where}", ours[known], theirs[known]))
@@ -240,7 +240,7 @@ def _with_other_parameters(law: Law) -> Law:
 
 
 def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]:
-    """Check that the energy is the sum of its isochoric and volumetric parts. Viscosity uses only these parts."""
+    """Check that the energy is the sum of its isochoric and volumetric parts. Viscosity may use these parts."""
     isochoric, volumetric = law.isochoric_part(), law.volumetric_part()
     if isochoric is None or volumetric is None:
         return []
@@ -318,7 +318,7 @@ def _exact(name: str, ours: np.ndarray, theirs: np.ndarray, size: float | None =
 def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> list[Row]:
     """Return rows about energy, stress and moduli of the undeformed state.
 
-    The moduli are Voigt means. For an isotropic law, the moduli are the same in every direction.
+    The moduli are Voigt means. For an isotropic law, each mean is the modulus in every direction.
     """
     W, P, A = (_as_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
     if not np.isfinite(A).all():
@@ -357,7 +357,7 @@ def _mean_moduli(A: np.ndarray) -> np.ndarray:
 
 
 def _near_rest() -> np.ndarray:
-    """Return deformation gradients (n, 3, 3) with very small strains, in pairs of opposite strains."""
+    """Return n deformation gradients (n, 3, 3) with very small strains, in pairs of opposite strains."""
     D = _samples()[1]
     D = np.concatenate([np.eye(3)[None], D + np.transpose(D, (0, 2, 1))])
     return np.eye(3) + NEAR * np.concatenate([D, -D])
@@ -416,16 +416,17 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
     return rows, ranges
 
 
-#: If the energy jumps in a step of the stretch, its change differs from the work of the stress. If the difference is
-#: above the fraction `_MISSED` of the change, the step is divided into `_PARTS` substeps, then its worst substep, and
-#: so on (`_CUTS` times). The difference due to a jump stays in one substep. Other differences decrease.
+#: If the energy jumps in a step of the stretch, the change of the energy differs from the work of the stress. If the
+#: difference is above the fraction `_MISSED` of the change, the step is divided into `_PARTS` substeps. The substep
+#: with the largest difference is divided again, and so on (`_CUTS` divisions). A difference due to a jump stays in one
+#: substep. Other differences become smaller with each division.
 _MISSED, _PARTS, _CUTS = 0.05, 32, 3
 
 
 def _jumps(law: Law, energy: Callable) -> list[Row]:
     """Return a row if the energy jumps, so that its change is not the work of the stress.
 
-    The other checks, at single states, cannot find a jump.
+    The other checks use only single states, so they cannot find a jump.
     """
     stress = jax.jit(partial(homogeneous.nominal_stress, law))
     # If a law depends only on the volume, its energy is 0 in these tests, apart from roundoff.
@@ -460,14 +461,14 @@ def _jumps(law: Law, energy: Callable) -> list[Row]:
 
 
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Return whether the nominal stress increases at each state (n,). At the ends, differences are one-sided."""
+    """Return whether the nominal stress increases at each of n states (n,). At the ends, differences are one-sided."""
     stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
     with np.errstate(all="ignore"):
         return np.gradient(stress, driven) > 0
 
 
 def ellipticity(A: np.ndarray) -> np.ndarray:
-    """Return the minimum eigenvalue (n,) [Pa] of the acoustic tensor A_iJkL n_J n_L over 203 directions n."""
+    """Return the minimum eigenvalue [Pa] of the acoustic tensor A_iJkL n_J n_L over 203 directions n, for every A."""
     k = np.arange(200) + 0.5
     z, angle = 1 - k / 200, np.pi * (1 + 5**0.5) * k  # the directions n are Fibonacci points on a half sphere
     n = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)

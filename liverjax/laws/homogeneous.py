@@ -44,9 +44,9 @@ def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
     """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample without traction along axis 3.
 
     P = dW/dF - p cof F, with the pressure p for which P_33 = 0. The volumetric energy of a law does not contribute. A
-    law without a separate volumetric energy is evaluated at det F = 1. `constant` means that F is data and that no
-    derivative with respect to F is needed. Then the derivatives of a law of principal stretches with respect to its
-    parameters need much less time.
+    law without a separate volumetric energy is evaluated at det F = 1. `constant` = True is allowed if F is given data,
+    so that no derivative with respect to F is needed. For a law of principal stretches, the derivatives with respect to
+    its parameters then need much less time.
     """
     split = law.isochoric_part()
     if constant and split is not None and split.stretch_energy is not None:

@@ -34,7 +34,7 @@ def read_layer(table: object, name: str) -> Law:
 
 
 def check(law: Law, name: str) -> None:
-    """Raise `InputError` if a law has directions, or parameters that contradict each other.
+    """Check that a law can be used for a layer or bar.
 
     Raises:
         InputError: the law has directions (then the message begins with `name`), or its parameters contradict each
@@ -68,8 +68,10 @@ def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
 
 
 def _thinned(density: Any, start: jax.Array) -> jax.Array:
-    """Return the logarithm (Q, m) of the thickness stretch for which the energy is a minimum. The derivatives of
-    this result are exact."""
+    """Return the logarithm (Q, m) of the thickness stretch at which the energy `density` has its minimum.
+
+    The iterations begin at `start`. The first and second derivatives of the result are exact.
+    """
 
     def slope(u: jax.Array) -> jax.Array:
         return jax.jvp(density, (u,), (jnp.ones_like(u),))[1]

@@ -48,7 +48,13 @@ def _isochoric(c: Number, i: int, j: int) -> list[Product]:
 
 
 def groups(law: Law) -> list[Group]:
-    """Return the energy of a law (not a sum of laws) as groups of products. If impossible, raise `InputError`."""
+    """Return groups of products whose sum is the energy of a law, without constants and terms that depend only on J.
+
+    `law` is not a sum of laws.
+
+    Raises:
+        InputError: the energy is not a function of such products.
+    """
     match law:
         case NeoHookean():
             return [Group(_isochoric(law.mu / 2, 1, 0))]

@@ -88,7 +88,7 @@ def create(name: str, **values: Numbers) -> Law:
 
 
 def _sequence(value: Any) -> Any:
-    """Return a list of numbers as a tuple, so that each number is a leaf of the pytree. Directions stay an array."""
+    """Return a list of numbers as a tuple (each number is a leaf of the pytree), or a list of vectors as an array."""
     if isinstance(value, (list, tuple)) and not any(isinstance(v, (list, tuple)) for v in value):
         return tuple(value)
     if jnp.ndim(value) == 0:

@@ -14,10 +14,10 @@ from liverjax.core.struct import Indices, param, static, struct
 #: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
-#: Patches are groups of nearby nodes for the coarse space of the linear solver. A mesh has patches of `PATCH_SIZE`
-#: nodes, but at most `FEW_PATCHES` patches. A larger mesh has patches of `LARGE_PATCH` nodes, so that the number of
-#: iterations of the solver does not grow with the mesh. There are at most `MOST_PATCHES` patches, since the coarse
-#: matrix is dense with 12 unknowns per patch.
+#: Patches are groups of nearby nodes for the coarse space of the linear solver. A small mesh has patches of about
+#: `PATCH_SIZE` nodes, and at most `FEW_PATCHES` patches. A large mesh has patches of about `LARGE_PATCH` nodes, so that
+#: the solver does not need more iterations for a larger mesh. There are at most `MOST_PATCHES` patches, since the
+#: coarse matrix is dense with 12 unknowns per patch.
 PATCH_SIZE, FEW_PATCHES, LARGE_PATCH, MOST_PATCHES = 80, 32, 160, 192
 
 #: Clusters are groups of near nodes in thin elements. Two neighbours are near if their distance is below `NEAR` times
@@ -28,10 +28,11 @@ NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
 
 @struct
 class Clusters:
-    """Groups (clusters) of near nodes in thin elements, and the pairs of nodes that give the entries of their matrices.
+    """Groups (clusters) of near nodes in thin elements, and the pairs of nodes that are coupled within a cluster.
 
     There are G clusters with at most M nodes. The matrix of a cluster has M x M blocks, one for each pair of members.
-    The block of the members a and b has the index a M + b. n is the number of pairs of nodes.
+    The block of the members a and b has the index a M + b. n is the number of coupled pairs of nodes. A pair occurs
+    once for each element that contains it, or once for each edge.
     """
 
     nodes: jax.Array = param("1", "members of every cluster (G, M), padded with 0")
@@ -39,7 +40,8 @@ class Clusters:
     places: jax.Array = param("1", "index (n,) of the block of each pair of nodes, among all blocks (G M M)")
     sources: tuple[jax.Array, ...] = param(
         "1",
-        "arrays (n,), one entry for each pair: its edge; or its element, two functions, and the sign of their product",
+        "arrays (n,), with one entry for each pair. Vertices: the number of the edge. Shape functions: the numbers of "
+        "the element and of the two functions in it, and the sign of the product of both functions",
     )
 
 
@@ -57,7 +59,7 @@ class Pattern:
     edge_slots: jax.Array = param("1", "index of each edge (N,) in the flattened rows, in the row of its lower node")
     patches: jax.Array = param("1", "number of the patch of every node (V,), for the coarse space")
     patch_functions: jax.Array = param("1", "for every node: 1, and its scaled position in its patch (-1 to 1), (V, 4)")
-    patch_width: jax.Array = param("m", "mean of the largest extents of the patches")
+    patch_width: jax.Array = param("m", "largest extent of a patch along x, y or z, averaged over all patches")
     clusters: Any = param("1", "`Clusters` of the vertices, where elements are thin", default=None)
     number_of_patches: int = static(default=1, about="P")
 
@@ -106,7 +108,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
 
 
 def node_numbers(of: Any) -> jax.Array:
-    """Return a copy as 32-bit integers. NumPy makes it, because JAX would compile a program for each shape."""
+    """Return a copy of an array as 32-bit integers. NumPy copies it: JAX would compile a program for each shape."""
     return jax.device_put(np.asarray(of).astype(np.int32))
 
 
@@ -129,7 +131,7 @@ def patches(points: np.ndarray) -> np.ndarray:
 
 
 def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    # NumPy is used if the positions are known: JAX would need a second to compile small programs for this.
+    # NumPy is used if the positions are known. JAX would need a second to compile small programs for these operations.
     xp: Any = jnp if isinstance(points, jax.core.Tracer) else np
     given: Any = points if xp is jnp else np.asarray(points)
     members = [given[patch == k] for k in range(int(patch.max(initial=0)) + 1)]
@@ -161,8 +163,8 @@ def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) 
 def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Return the group number of every node (V,).
 
-    A chain of near nodes (see `NEAR`) connects the nodes of a group. `pairs` (2, N): nodes that are neighbours. Groups
-    that are too large are divided.
+    Two nodes belong to one group if they are connected by a chain of near nodes (see `NEAR`). `places` (V, 3) [m] are
+    the positions of the nodes, and `pairs` (2, N) are the pairs of neighbours. Groups that are too large are divided.
     """
     count, (one, other) = len(places), pairs
     square = np.sum((places[one] - places[other]) ** 2, axis=1)
@@ -189,7 +191,7 @@ def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _packed(group: np.ndarray) -> np.ndarray:
-    """Join small groups until they are about as large as the largest group. Then their matrices need little padding."""
+    """Join small groups until they are about as large as the largest group. Their matrices then need little padding."""
     size = np.bincount(group)
     largest, free, last = int(size.max()), 0, 0
     new = np.arange(len(size))
@@ -208,7 +210,7 @@ def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, 
     size = np.bincount(group)
     if size.max(initial=0) < 2:
         return None
-    number = np.cumsum(size > 1) - 1  # number of a group, counting only groups with several nodes
+    number = np.cumsum(size > 1) - 1  # number of each group, if only groups with several nodes are counted
     order = np.argsort(group, kind="stable")
     place = np.empty(len(group), int)
     place[order] = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)

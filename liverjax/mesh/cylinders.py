@@ -14,8 +14,8 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.prisms import stacked
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: Increase of the cell length per distance from a rim. With quadratic elements, a smaller increase hardly improves the
-#: accuracy (experiments/TABLES.md).
+#: Increase of the cell length, divided by the distance from a rim. With quadratic elements, a smaller increase hardly
+#: improves the accuracy (experiments/TABLES.md).
 GROWTH = 0.7
 
 
@@ -26,7 +26,7 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
         length: total length [m].
         cells: position [m] -> length of a cell there [m]. The result contains all these positions.
         largest: maximum length of a cell [m].
-        growth: increase of the cell length per distance from such a position.
+        growth: increase of the cell length, divided by the distance from such a position.
 
     Returns:
         Increasing positions (n,) [m].
@@ -34,7 +34,7 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
     stops = np.unique([0.0, *cells, length])
     parts = [np.zeros(1)]
     for low, high in itertools.pairwise(stops):
-        # The spacing of x is geometric at both ends, so that cells much shorter than the interval are resolved.
+        # The points x have geometric spacing near both ends, so that cells much shorter than the interval are resolved.
         half = np.concatenate([np.zeros(1), np.geomspace(1e-6, 0.5, 500)])
         x = low + (high - low) * np.concatenate([half, 1 - half[-2::-1]])
         cell = np.full_like(x, largest)
@@ -127,7 +127,7 @@ def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1
 
 
 def _stretch(corners: int) -> float:
-    """Return the radius of the corners of a regular polygon, divided by the radius of the circle with the same area."""
+    """Return the circumradius of a regular polygon, divided by the radius of the circle with the same area."""
     step = 2 * np.pi / corners
     return float(np.sqrt(step / np.sin(step)))
 

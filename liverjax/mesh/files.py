@@ -27,7 +27,8 @@ CELLS = {1: "tetra", 2: "tetra10"}
 _NAMES = {1: "linear", 2: "quadratic"}
 #: Edges of a quadratic element in the order of VTK and meshio.
 _VTK = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
-#: An edge counts as curved if the distance of its middle node from its middle is above this fraction of its length.
+#: An edge counts as curved if the distance between its midside node and its middle is above this fraction of its
+#: length.
 _STRAIGHT = 1e-6
 
 
@@ -140,7 +141,7 @@ def _permuted(points: np.ndarray, middles: np.ndarray, length: np.ndarray) -> bo
 #: Pattern at the beginning of a file that meshio cannot read -> kind of the file, and a remedy.
 _FOREIGN = {
     r"\$NOD\b": "the file has Gmsh's format of version 1 ($NOD, $ELM); open it in Gmsh and save it as version 4 or VTK",
-    r"DATASET\s+POLYDATA|type=.PolyData": "it contains VTK polygons (a surface); fill the surface with tetrahedra "
+    r"DATASET\s+POLYDATA|type=.PolyData": "the file has VTK polygons (a surface); fill the surface with tetrahedra "
     "(Gmsh, TetGen) and export an unstructured grid",
 }
 
@@ -172,7 +173,7 @@ def _read_quietly(path: Path) -> Any:
     raise InputError(f"mesh file {path} cannot be read by meshio ({reason[:120]}); export the mesh as VTU or Gmsh 2.2")
 
 
-#: Cells of surfaces and edges. A file may have them in addition to its tetrahedra.
+#: Types of surface and edge cells. A file may contain such cells in addition to its tetrahedra.
 _FLAT_CELLS = ("vertex", "line", "triangle", "quad", "polygon")
 #: If a body is longer than this [m], the unit of the mesh file is probably millimetres.
 _LARGE = 10.0
@@ -198,8 +199,8 @@ def _node_sets(data: Any, tets: np.ndarray, name: str) -> dict[str, np.ndarray]:
     return sets
 
 
-#: An array of whole numbers, one for each cell, is ignored if it has more different numbers than this: such numbers are
-#: probably numbers of cells, not of groups.
+#: Maximum number of groups in an array with one whole number for each cell. An array with more different numbers is
+#: ignored, because it probably contains numbers of cells and not of groups.
 _MOST_GROUPS = 100
 
 
@@ -212,12 +213,12 @@ def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
     return _cell_groups(data, (cell,), 3)
 
 
-#: Types of surface cells whose named groups become node sets; edges of a triangle.
+#: _TRIANGLES: types of surface cells. Their named groups become node sets. _EDGES: edges of a triangle.
 _TRIANGLES, _EDGES = ("triangle", "triangle6"), ((0, 1), (1, 2), (0, 2))
 
 
 def _surface_sets(data: Any, tets: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the nodes of each named group of triangles. In a quadratic mesh, 3-node triangles get middle nodes."""
+    """Return the nodes of each named group of triangles. In a quadratic mesh, the midside nodes are included."""
     sets = {}
     for name, parts in _triangle_groups(data).items():
         nodes = [part.ravel() for part in parts]
@@ -257,7 +258,7 @@ def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str, np.ndarray]:
-    """Return {name of a group: numbers of its cells}. The cells of all blocks of types `cells` are counted together.
+    """Return {name of a group: numbers of its cells}. Cells are numbered through all blocks whose type is in `cells`.
 
     A group of tetrahedra without a name is named by its number. A group of surface cells without a name is ignored.
     """
@@ -279,13 +280,14 @@ def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str,
             continue
         values = values.astype(int)
         if name.startswith("set:"):
-            if values.any() or all(kind in cells for kind in kinds):  # otherwise it is a set of other cells
+            if values.any() or all(kind in cells for kind in kinds):  # otherwise the set has only cells of other types
                 sets[name.removeprefix("set:")] = np.flatnonzero(values)
             continue
         groups = np.unique(values)
         for group in groups if len(groups) <= _MOST_GROUPS else ():
             if dimension == 3 or (int(group), name) in names:
-                # In these arrays a cell has only the number of its first group. Cell sets contain all groups of a cell.
+                # In these arrays a cell has only the number of its first group. A cell set of the same name is
+                # complete, so it is not replaced.
                 sets.setdefault(names.get((int(group), name), f"{name}={group}"), np.flatnonzero(values == group))
     return sets
 
@@ -298,7 +300,7 @@ def _are_whole(values: np.ndarray) -> bool:
 
 
 def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, object] | None = None) -> None:
-    """Write a mesh [m] with meshio. Sets are written as 0/1 data ``set:NAME`` in formats that can store data."""
+    """Write a mesh [m] with meshio. In formats that can store data, sets are written as 0/1 data ``set:NAME``."""
     import meshio
 
     data = {name: np.asarray(values) for name, values in (point_data or {}).items()}

@@ -13,7 +13,8 @@ from liverjax.mesh.tetrahedra import TetMesh
 _INSIDE = 1e-9
 #: Two vertices coincide if their distance is below this fraction of the body's size.
 SAME_PLACE = 1e-9
-#: A vertex lies on a face if its distance is below this fraction of the size of the face. Files may have six digits.
+#: A vertex lies on a face if its distance is below this fraction of the size of the face. The fraction is not smaller,
+#: because coordinates in mesh files may have only six digits.
 _ON_FACE = 1e-5
 #: A piece of a line is ignored if it is shorter than this fraction of the line.
 _SHORTEST = 1e-9
@@ -84,7 +85,7 @@ def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarra
 
 
 def around_a_point(corners: np.ndarray) -> np.ndarray:
-    """Return for each tetrahedron (E,) whether it contains the origin. `corners`: (E, 4, 3)."""
+    """Return, for each of E tetrahedra, whether it contains the origin. `corners` (E, 4, 3): their corners."""
     a, b, c, d = np.moveaxis(corners, 1, 0)
 
     def volume(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -95,7 +96,10 @@ def around_a_point(corners: np.ndarray) -> np.ndarray:
 
 
 def around_a_point_in_plane(corners: np.ndarray) -> np.ndarray:
-    """Return for each tetrahedron (E,), projected to a plane, whether it contains the origin. `corners`: (E, 4, 2)."""
+    """Return, for each of E tetrahedra, whether its projection onto a plane contains the origin of the plane.
+
+    `corners` (E, 4, 2): positions of the corners in the plane.
+    """
     met = np.zeros(len(corners), bool)
     for face in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]):
         a, b, c = np.moveaxis(corners[:, face], 1, 0)
@@ -111,7 +115,10 @@ _EIGHTHS = np.array(
 
 
 def straight_corners(mesh: TetMesh, x: np.ndarray) -> np.ndarray:
-    """Return corners (E, 4, 3) of straight tetrahedra at positions x (V, 3) [m]; (8 E, 4, 3) for 10-node elements."""
+    """Return the corners (E, 4, 3) [m] of the elements at positions x (V, 3) [m].
+
+    A 10-node element is replaced by eight straight tetrahedra. The result is then (8 E, 4, 3).
+    """
     if mesh.order == 1:
         return x[np.asarray(mesh.tetrahedra)]
     nodes = mesh.element_nodes_on_host[:10].T
@@ -119,14 +126,19 @@ def straight_corners(mesh: TetMesh, x: np.ndarray) -> np.ndarray:
 
 
 def _all_alike(parts: np.ndarray) -> np.ndarray:
-    """Return for each element (E,) whether its n numbers (n, E) have the same sign, except for roundoff. The result is
-    False if the sum of these numbers is 0."""
+    """Return, for each of E elements, whether its n numbers in `parts` (n, E) have the same sign, except for roundoff.
+
+    The result is False if the sum of these numbers is 0.
+    """
     whole = parts.sum(axis=0)
     return (whole != 0) & ((np.sign(whole) * parts).min(axis=0) >= -_INSIDE * np.abs(whole))
 
 
 def weights(mesh: TetMesh, element: np.ndarray, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes (n, m) of elements (m,), and their shape functions at barycentric coordinates L (4, m)."""
+    """Return the nodes (n, m) of m elements, and the values (n, m) of their shape functions at one point per element.
+
+    `L` (4, m): barycentric coordinates of the points.
+    """
     nodes = mesh.element_nodes_on_host[: 4 if mesh.order == 1 else 10, element]
     return nodes, L if mesh.order == 1 else functions(2, L)[0]
 
@@ -149,7 +161,8 @@ def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
         least = (a[:, None] + b[:, None] * middle[None, :, None]).min(axis=0)
         element = least.argmax(axis=1)
         inside = least[np.arange(len(middle)), element] > -_INSIDE
-        # Planes of distant elements also cut the lines, so neighbouring pieces in the same element are joined.
+        # The lines were also cut at the planes of distant elements, so neighbouring pieces in the same element are
+        # joined.
         start = np.flatnonzero(inside & ~np.concatenate([[False], (element[1:] == element[:-1]) & inside[:-1]]))
         for k in start:
             stop = k

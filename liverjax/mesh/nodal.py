@@ -34,9 +34,10 @@ def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def gathered(mesh: TetMesh, shares: jax.Array) -> jax.Array:
-    """Return sums (V,) at the vertices of values at integration points (Q, E), times the linear shape functions.
+    """Multiply values at the integration points by the linear shape functions. Return the sums (V,) at the vertices.
 
-    This is the transpose of `interpolated`.
+    `shares`: values (Q, E) at Q points per element, or (E,) in linear elements. The function is the transpose of
+    `interpolated`.
     """
     if mesh.order == 1:
         return to_nodes(mesh, shares / 4)
@@ -50,7 +51,10 @@ def summed(mesh: TetMesh, values: jax.Array) -> jax.Array:
 
 
 def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """Interpolate a field, linear in each element, from the vertices (V,) to the integration points, (E,) or (Q, E)."""
+    """Interpolate a field that is linear in each element from the vertices (V,) to the integration points.
+
+    Return values (E,) in linear elements, otherwise (Q, E) with Q integration points per element.
+    """
     corner = [taken(values, mesh.tetrahedra[:, a]) for a in range(4)]
     if mesh.order == 1:
         return (corner[0] + corner[1] + corner[2] + corner[3]) / 4
@@ -58,9 +62,9 @@ def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
     return sum((L[a][:, None] * corner[a][None] for a in range(1, 4)), L[0][:, None] * corner[0][None])
 
 
-#: Order -> fractions of an element's volume: at each vertex, and at each middle of an edge. `_LUMPED` is for the lumped
-#: mass (Hinton, Rock and Zienkiewicz 1976: positive, proportional to the integrals of the squared functions).
-#: `_INTEGRALS` is for the integrals of the shape functions.
+#: Order of the elements -> fraction of an element's volume for each vertex, and for each middle of an edge. `_LUMPED`
+#: is for the lumped mass (Hinton, Rock and Zienkiewicz 1976). These fractions are positive and proportional to the
+#: integrals of the squared shape functions. `_INTEGRALS` is for the integrals of the shape functions.
 _LUMPED = {1: (1 / 4,), 2: (1 / 36, 4 / 27)}
 _INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
 
@@ -73,7 +77,7 @@ def nodal_volumes(mesh: TetMesh) -> jax.Array:
 
 @partial(jax.jit, inline=True)
 def load_volumes(mesh: TetMesh) -> jax.Array:
-    """Integrals of the shape functions (V,) [m^3]: the nodal forces of a uniform weight of 1 N/m^3."""
+    """Integrals of the shape functions (V,) [m^3]. They equal the nodal forces [N] of a uniform weight of 1 N/m^3."""
     total = _weighted_parts(mesh, _INTEGRALS[mesh.order])
     if mesh.order < 3:
         return total
@@ -89,10 +93,11 @@ def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
 
 @cache
 def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Split the consistent mass matrix of an element, divided by its mass, into a diagonal (n,) and a remainder (n, n).
+    """Split the consistent mass matrix of an element, divided by its mass, into a diagonal and a remainder.
 
-    The diagonal is the lumped mass. Functions of order 3 have no lumped mass, so their diagonal entries are those
-    of the consistent mass matrix.
+    For n nodes of the element, the diagonal has the shape (n,) and the remainder has the shape (n, n). The diagonal is
+    the lumped mass. Functions of order 3 have no lumped mass, so their diagonal entries are those of the consistent
+    mass matrix.
     """
     whole = products(order)
     parts, lumped = np.diag(whole).copy(), _LUMPED[min(order, 2)]
@@ -102,7 +107,8 @@ def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def products(order: int) -> np.ndarray:
-    """Return the exact integrals (n, n) of products of two shape functions over an element, divided by its volume."""
+    """Return the exact integrals of products of two shape functions over an element, divided by its volume: a matrix
+    (n, n) for n functions."""
     vertex = [tuple(int(k == a) for k in range(4)) for a in range(4)]
     if order == 1:
         functions: list[dict[tuple, float]] = [{v: 1.0} for v in vertex]

@@ -20,9 +20,10 @@ def stacked(plane: np.ndarray, triangles: np.ndarray, heights: np.ndarray) -> tu
 def _split(prisms: np.ndarray) -> np.ndarray:
     """Cut each prism (bottom nodes a b c, top nodes d e f) into three tetrahedra.
 
-    Diagonals start at the node with the lowest number, so the faces of neighbouring prisms match.
+    On each side of a prism, the diagonal starts at the node with the lowest number, so neighbouring prisms match.
     """
-    # Rotate each prism so that the bottom node with the lowest number is first. Then only one diagonal can be chosen.
+    # Rotate each prism so that its bottom node with the lowest number is first. Then only the diagonal of the opposite
+    # side differs between prisms.
     shift = np.argmin(prisms[:, :3], axis=1)
     turn = (np.arange(3)[None] + shift[:, None]) % 3
     a, b, c = np.take_along_axis(prisms[:, :3], turn, axis=1).T

@@ -10,7 +10,8 @@ from liverjax.mesh.selection import boundary_triangles, face_codes
 from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Two adjacent surface triangles are nearly parallel if the cosine of the angle between their normals is above this.
+#: Two adjacent surface triangles count as nearly parallel if the cosine of the angle between their normals is above
+#: this value.
 _ONE_PLACE = 0.7
 
 
@@ -40,8 +41,8 @@ def _points_and_middles(points: jax.Array, edges: jax.Array) -> jax.Array:
 def middles_of_set(mesh: TetMesh, name: str) -> np.ndarray:
     """Return the node numbers (V + edge number) of the edge middles that belong to a node set of the mesh.
 
-    If the mesh has a triangle set with the same name and the same vertices, these are the middles of the edges of
-    its triangles.
+    If the mesh has a triangle set with the same name and the same vertices, the result contains the middles of the
+    edges of its triangles. Otherwise `middles_of_places` finds the edge middles.
     """
     V, nodes = mesh.number_of_vertices, np.asarray(mesh.node_sets[name])
     nodes = nodes[nodes < V]
@@ -60,12 +61,13 @@ def middles_of_places(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     """Return the node numbers (V + edge number) of the edge middles on the regions that the vertices `nodes` form.
 
     A region consists of element faces with all their vertices in `nodes`, for example a fixed side of the body. Two
-    regions may meet at an edge of the body. A face there can have all its vertices in the two regions without belonging
-    to one of them. On the surface, such a face is at an angle to the faces of the regions, and nearly parallel to a
-    neighbour outside them. If the positions of the mesh are unknown (inside jit, grad or vmap), all faces on the
-    surface belong to a region. Inside the body, a face belongs to a region only if one of its vertices is below the
-    surface, or has an edge to a vertex of `nodes` below the surface. Where the body is only one element thick, no
-    vertex is below the surface, and all faces belong to a region.
+    regions may meet at an edge of the body. A face at this edge can have all its vertices in the two regions without
+    belonging to one of them. On the surface, such a face is at an angle to the faces of the regions, and nearly
+    parallel to a neighbouring face outside the regions. If the positions of the mesh are unknown (inside jit, grad or
+    vmap), all faces on the surface belong to a region. Inside the body, a face belongs to a region only if one of its
+    vertices is below the surface, or has an edge to a vertex of `nodes` below the surface. Where the body is only one
+    element thick, no vertex is below the surface. There, all faces with all their vertices in `nodes` belong to a
+    region.
     """
     V = mesh.number_of_vertices
     inside = np.zeros(V, bool)
@@ -110,8 +112,8 @@ def _edges_of(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
 def _in_a_place(mesh: TetMesh, surface: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Return which of the surface triangles with all vertices `inside` belong to a region (see `middles_of_places`).
 
-    A triangle does not belong to a region if it has neighbours inside and outside the regions, and is nearly parallel
-    only to neighbours outside.
+    A neighbour is inside if all its vertices are `inside`. A triangle does not belong to a region if it has neighbours
+    inside, is nearly parallel to none of them, and is nearly parallel to a neighbour that is not inside.
     """
     own = inside[surface].all(axis=1)
     normal = _normals(mesh, surface)
@@ -141,7 +143,10 @@ def _pairs_at_edges(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cubic(mesh: TetMesh) -> TetMesh:
-    """Return a quadratic mesh with additional functions of order 3. Their unknowns are 0 in the reference shape."""
+    """Return a quadratic mesh with additional shape functions of order 3, on edges and faces.
+
+    The unknowns of these functions are 0 in the reference shape.
+    """
     tets = np.asarray(mesh.tetrahedra)
     triples = np.concatenate([np.sort(tets[:, face], axis=1) for face in map(list, FACES)])
     _, number = np.unique(triples, axis=0, return_inverse=True)
@@ -194,9 +199,9 @@ def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
 
 
 def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Return nodes (n,) of quadratic elements, followed by functions of order 3.
+    """Return the numbers of nodes (n,) of quadratic elements, followed by the numbers of functions of order 3.
 
-    These are the functions on all edges and faces whose nodes are in `nodes`.
+    These functions belong to the edges and faces that have all their nodes in `nodes`.
     """
     inside = np.zeros(mesh.number_of_nodes, bool)
     inside[nodes] = True

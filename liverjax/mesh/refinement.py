@@ -1,4 +1,4 @@
-"""Refine a mesh: cut every tetrahedron into eight of half its size, or cut only tetrahedra near some nodes in two."""
+"""Refine a mesh: cut every tetrahedron into eight of half its size, or cut only the tetrahedra near given nodes."""
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,9 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     may be unknown (inside jit, grad or vmap) if `near` is not given and the mesh has no triangle sets.
 
     Args:
-        near: node numbers (n,). If given, only edges at these nodes are halved, and other edges that must be halved to
-            keep the mesh conforming. An element is cut at its longest edge first (Rivara 1984), so elements do not
-            become flatter. `rim` returns the nodes around a clamp, where most of the mesh error occurs.
+        near: node numbers (n,). If given, only the edges at these nodes are halved, and the edges that must also be
+            halved so that the mesh stays conforming. An element is cut at its longest edge first (Rivara 1984), so
+            elements do not become flatter. `rim` returns the nodes around a clamp, where most of the mesh error occurs.
     """
     V = mesh.number_of_vertices
     points: Array = mesh.points if isinstance(mesh.points, jax.core.Tracer) else np.asarray(mesh.points)
@@ -105,7 +105,7 @@ def _eighths(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
 
 
 def _corners_of_parts(a: Array, b: Array, c: Array, d: Array, *middles: Array) -> np.ndarray:
-    """Return corners (8, 4, …) of the parts of an element, from its corners a, b, c, d and its edges' middles."""
+    """Return the corners (8, 4, …) of the eight parts of an element, from its corners a, b, c, d and edge middles."""
     ab, ac, ad, bc, bd, cd = middles
     return np.array(
         [
@@ -151,7 +151,7 @@ def _bisected(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
     """
     V, place = mesh.number_of_vertices, _by_length(mesh)
     low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
-    code = low * V + high  # the codes are in ascending order
+    code = low * V + high  # ascending, because the edges are sorted by their end nodes
     tets, done = np.asarray(mesh.tetrahedra).astype(np.int64), []
     while len(tets):
         ends = np.stack([np.sort(tets[:, pair], axis=1) for pair in map(list, PAIRS)])

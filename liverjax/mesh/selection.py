@@ -21,7 +21,8 @@ def select(
 
     Args:
         mesh: `TetMesh`.
-        where: x_min, x_max, y_min, … [m]. Bounds are inclusive, with a tolerance of 1e-9 of the mesh's size.
+        where: name of a bound (x_min, x_max, y_min, …) -> value [m]. Nodes on a bound are selected too, with a
+            tolerance of 1e-9 of the mesh's size.
         set: name of a node set.
         name: name of the condition, for messages.
 
@@ -75,7 +76,7 @@ def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> No
 
 
 def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:
-    """Return outer triangles (m, 3) with outward normals. Given `nodes`: only those with all vertices in `nodes`."""
+    """Return the outer triangles (m, 3), with outward normals. If `nodes` is given, all vertices must be in `nodes`."""
     tets = np.asarray(mesh.tetrahedra)
     faces = np.concatenate([tets[:, f] for f in FACES])
     codes = face_codes(np.sort(faces.astype(np.int64), axis=1), mesh.number_of_vertices)
@@ -85,7 +86,10 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
 
 
 def face_codes(triples: np.ndarray, V: int) -> np.ndarray:
-    """Return a different integer for each sorted triple of V vertices. For V up to two million, it is below 2^63."""
+    """Return an integer for each sorted triple of vertex numbers below V. Different triples have different integers.
+
+    If V is at most two million, all integers are below 2^63.
+    """
     return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
 
 
@@ -152,4 +156,7 @@ def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
     lost = np.flatnonzero(~np.isin(own @ code, faces @ code))
     if len(lost):
         first = numbers[lost[0]].tolist()
-        raise InputError(f"{name} has {first}, which is not a face of an element: use boundary_triangles of the mesh")
+        raise InputError(
+            f"{name} contains the triangle {first}, which is not a face of an element: use the triangles from "
+            "boundary_triangles(mesh)"
+        )

@@ -1,12 +1,13 @@
 """Shape functions of straight tetrahedra, and their integration points.
 
 L_k are the barycentric coordinates. Their gradients D_k are constant; these are the shape vectors of the linear
-element. With the shape functions N_a, the positions x_a of the nodes, c_ak = dN_a/dL_k and y_k = sum_a c_ak x_a,
+element. With the shape functions N_a, the positions x_a of the nodes, c_ak = dN_a/dL_k and y_k = sum_a c_ak x_a, the
+deformation gradient is F (⊗: tensor product):
 
-    grad N_a = sum_k c_ak D_k,    so    F = sum_a x_a (x) grad N_a = sum_k y_k (x) D_k
+    grad N_a = sum_k c_ak D_k,    so    F = sum_a x_a ⊗ grad N_a = sum_k y_k ⊗ D_k
 
-So at each point, an element of any order behaves like a linear element with corners y_k. The terms of force and
-stiffness (`liverjax.elements.mjed`) therefore hold at every point, and no matrix is inverted.
+So at each point, an element of any order behaves like a linear element with corners y_k. The formulas for force and
+stiffness of linear elements (`liverjax.elements.mjed`) therefore hold at every point, and no matrix is inverted.
 
 The functions of order 2 are L_k (2 L_k - 1) for the vertices and 4 L_i L_j for the edges (10 nodes). Order 3 adds L_i
 L_j (L_i - L_j) for the edges and 27 L_i L_j L_k for the faces. The unknowns of these additional functions are not
@@ -20,7 +21,7 @@ import numpy as np
 
 from liverjax.mesh.adjacency import PAIRS
 
-#: Corners of an element's faces; face k is opposite to corner k.
+#: Corners of the faces of an element. Face k is opposite to corner k.
 FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 
@@ -35,7 +36,10 @@ class Basis(NamedTuple):
 
 @cache
 def basis(order: int) -> Basis:
-    """Return the functions of `order` 2 or 3 at the points of a rule that integrates products of gradients exactly."""
+    """Return the shape functions of `order` 2 or 3 at the points of an integration rule.
+
+    The rule integrates products of two gradients of these functions exactly.
+    """
     weights, L = _four_points() if order == 2 else _fourteen_points()
     return Basis(weights, L, *functions(order, L))
 
@@ -57,13 +61,13 @@ def functions(order: int, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _four_points() -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (4,) and coordinates (4, 4) of a rule of degree 2 (Hammer and Stroud 1956)."""
+    """Return weights (4,) and barycentric coordinates (4, 4) of a rule of degree 2 (Hammer and Stroud 1956)."""
     near, far = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
     return np.full(4, 0.25), far + (near - far) * np.eye(4)
 
 
 def _fourteen_points() -> tuple[np.ndarray, np.ndarray]:
-    """Return positive weights (14,) and coordinates (4, 14) of a rule of degree 5 (Walkington 2000)."""
+    """Return positive weights (14,) and barycentric coordinates (4, 14) of a rule of degree 5 (Walkington 2000)."""
     columns, weights = [], []
     for a, w in ((0.31088591926330060980, 0.11268792571801585080), (0.092735250310891226402, 0.073493043116361949544)):
         columns += [np.where(np.arange(4) == k, 1 - 3 * a, a) for k in range(4)]

@@ -38,7 +38,7 @@ def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
             path = path[[0, 2, 1, 3]]
         nodes = corner[:, None, :] + path[None]
         sixths.append(np.ravel_multi_index(tuple(np.moveaxis(nodes, -1, 0)), shape))
-    # Tetrahedra of one brick stay together, so that neighbours in memory share their nodes.
+    # The tetrahedra of one brick follow each other, so that neighbours in memory share nodes.
     tets = np.stack(sixths, axis=1).reshape(-1, 4)
     points = grid * np.asarray(size, dtype=float) / np.asarray(cells)
     names = ("x_min", "x_max"), ("y_min", "y_max"), ("z_min", "z_max")

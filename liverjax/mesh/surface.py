@@ -51,9 +51,9 @@ def areas(points: jax.Array, triangles: Indices) -> jax.Array:
 def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float]]:
     """Return the nodes (m,) of flat triangles that carry a uniform load, and the share of the load of each node.
 
-    In a linear element, each vertex carries a third. In a quadratic element, the integrals of the vertices' functions
-    are 0, and the middle of each edge carries a third. Triangles (m, 4) of a mesh of order 3 have the number of their
-    face in the last column; the function of this face gets 9/20 of the load.
+    In a linear mesh, each vertex carries a third of the load. In a quadratic mesh, the integrals of the vertices' shape
+    functions are 0, and the middle node of each edge carries a third. Triangles (m, 4) of a mesh of order 3 have the
+    number of their face in the last column; the function of this face gets 9/20 of the load.
     """
     nodes = triangle_nodes(mesh, triangles)
     if mesh.order == 1:
@@ -73,7 +73,8 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
         nodes, own = triangles.T, jnp.broadcast_to(-1 / 6 * twice, (3, *twice.shape))
     else:
         nodes = jnp.stack(triangle_nodes(mesh, triangles))
-        # The integrals are exact for quadratic positions. Their derivatives at the reference shape are also exact.
+        # The integrals are exact if the positions are quadratic functions. Their derivatives at the reference shape are
+        # also exact.
         weights, l = triangle_rule(4 if mesh.order == 2 else 5)
         N, along = (_quadratic if mesh.order == 2 else _ten_functions)(l)
         signs = None if mesh.order == 2 else _signs_of_functions(triangles, x.dtype)
@@ -109,7 +110,7 @@ def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def triangle_functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
-    """Return the functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q).
+    """Return the n shape functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q).
 
     In a mesh of order 3 the functions on edges point to the vertex with the higher number. So the vertices of triangles
     must be in increasing order (`liverjax.mesh.promotion.with_faces`).
@@ -118,7 +119,10 @@ def triangle_functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
 
 
 def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return six functions (6, Q) at barycentric coordinates l (3, Q), and derivatives (see `triangle_slopes`)."""
+    """Return the six quadratic functions (6, Q) at barycentric coordinates l (3, Q) of Q points, and two derivatives.
+
+    The derivatives (6, Q) are in the directions from the first vertex to the second and to the third vertex.
+    """
     N = [l[k] * (2 * l[k] - 1) for k in range(3)] + [4 * l[a] * l[b] for a, b in _EDGES]
     zero = np.zeros_like(l[0])
     by = [[4 * l[k] - 1 if m == k else zero for m in range(3)] for k in range(3)]
@@ -128,7 +132,8 @@ def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def _ten_functions(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return ten functions (10, Q) and their derivatives: `_quadratic`, then order 3 on the edges and on the face."""
+    """Return ten functions (10, Q) and their derivatives: the functions of `_quadratic`, then those of order 3 on the
+    edges and on the face. The arguments are the same as for `_quadratic`."""
     N, slopes = _quadratic(l)
     zero = np.zeros_like(l[0])
     more, by = [], []

@@ -34,7 +34,9 @@ class TetMesh:
 
     points: jax.Array = param("m", "reference positions (V, 3)")
     tetrahedra: jax.Array = param("1", "vertices of every element (E, 4), positively oriented")
-    shape_vectors: jax.Array = param("1/m", "D_a = grad N_a of nodes a = 1, 2, 3, shape (3, 3, E); D_0 = -(sum)")
+    shape_vectors: jax.Array = param(
+        "1/m", "gradients D_a of the linear functions of corners a = 1, 2, 3, shape (3, 3, E); D_0 is minus their sum"
+    )
     volumes: jax.Array = param("m^3", "reference volumes (E,)")
     node_sets: dict[str, Any] = param("1", "named arrays of node numbers")
     element_sets: dict[str, Any] = param("1", "named arrays of element numbers")
@@ -42,13 +44,16 @@ class TetMesh:
     triangle_sets: dict[str, jax.Array] | None = param(
         "1", "named arrays of triangles' vertices (m, 3); None if the file has no triangle sets", default=None
     )
-    faces: Any = param("1", "numbers of every element's faces (4, E), for order 3", default=None)
+    faces: Any = param("1", "numbers of the four faces of every element (4, E), only for order 3", default=None)
     clusters: Any = param("1", "`Clusters` of all nodes, if elements are thin and the order is above 1", default=None)
     order: int = static(default=1, about="order of the shape functions: 1 linear, 2 quadratic", lower=1)
 
     @property
     def number_of_nodes(self) -> int:
-        """Number V of nodes: vertices, in order 2 also middles of edges, in order 3 also the additional functions."""
+        """Number V of nodes. The nodes are the vertices and, in order 2, the middles of edges.
+
+        In order 3 the additional functions are counted too.
+        """
         return self.points.shape[0]
 
     @property
@@ -71,7 +76,7 @@ class TetMesh:
 
     @property
     def gradients(self) -> jax.Array:
-        """`shape_vectors` with an axis for the integration points: (3, 3, 1, E). In linear elements: (3, 3, E)."""
+        """Shape vectors [1/m] with an axis for the integration points: (3, 3, 1, E). Linear elements: (3, 3, E)."""
         return self.shape_vectors if self.order == 1 else self.shape_vectors[:, :, None]
 
     def at_points(self, numbers: T) -> T:
@@ -92,7 +97,10 @@ class TetMesh:
 
     @property
     def element_nodes_on_host(self) -> np.ndarray:
-        """Return the n arrays of `element_nodes` as one NumPy array (n, E). JAX would compile a program for each."""
+        """Return `element_nodes` as one NumPy array (n, E), with n nodes in each element.
+
+        With JAX arrays, JAX would compile a program for each of the n rows.
+        """
         faces = None if self.faces is None else np.asarray(self.faces)
         return np.stack(self._nodes(np.asarray(self.tetrahedra), np.asarray(self.pattern.element_edges), faces))
 
@@ -145,9 +153,10 @@ class TetMesh:
         return columns
 
     def _slopes(self) -> jax.Array:
-        """Return c_ak - c_a0 of `liverjax.mesh.shape_functions` as a matrix (3 Q, n), for n nodes and Q points.
+        """Return the differences c_ak - c_a0 as a matrix (3 Q, n), for n nodes and Q integration points of an element.
 
-        With one matrix product, the compiled program of `edges` is small.
+        c_ak is the derivative of the shape function a with respect to the barycentric coordinate k. With one matrix
+        product, the compiled program of `edges` is small.
         """
         c = basis(self.order).c
         return jnp.asarray((c[:, 1:] - c[:, :1]).reshape(len(c), -1).T, self.volumes.dtype)
@@ -179,7 +188,7 @@ def tet_mesh(
         raise InputError(
             "tet_mesh: the node numbers are unknown inside jit, grad or vmap; make the mesh outside of these functions"
         )
-    # `asarray` may share memory with the caller's arrays, so copies are made. NumPy copies without a compiled program.
+    # `asarray` may share memory with the given arrays, so copies are made. NumPy needs no compiled program for a copy.
     points = jnp.array(points, float) if isinstance(points, jax.core.Tracer) else _float_copy(points)
     neighbours = pattern(tetrahedra, points)
     tetrahedra = node_numbers(tetrahedra)
@@ -201,7 +210,7 @@ def _float_copy(points: Numbers) -> jax.Array:
 
 
 def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:
-    """Return the mesh with other reference positions (V, 3) [m]. Its patches of nodes do not change.
+    """Return the mesh with other reference positions (V, 3) [m]. The patches of nodes (`Pattern`) do not change.
 
     The positions may be unknown (inside jit, grad or vmap). Edges stay straight: in a quadratic mesh the middles of
     edges are computed from the vertices.

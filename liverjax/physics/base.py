@@ -1,9 +1,9 @@
 """The base class of all physics, and the base classes of the force terms of a step.
 
 In this project, "a physics" is one object that adds forces or constraints to a body: a law, viscosity, loads, contact
-or a support. It is a frozen struct of numbers. A scene has a tuple of such objects. A physics may have internal
-variables, which it passes from step to step in the argument `memory`. In each step, a physics gives a force term, which
-stores everything that is constant during the step. The main methods are:
+or a support. Its numbers are stored in an immutable struct. A scene has a tuple of such objects. A physics may have
+internal variables, which are passed from step to step in the argument `memory`. In each step, a physics returns a force
+term. The force term stores everything that is constant during the step. The main methods are:
 
 * `begin(start)` -> memory: return the internal variables at the beginning of a run (any pytree);
 * `freeze(memory, step)`: return the force term of the step;
@@ -11,12 +11,13 @@ stores everything that is constant during the step. The main methods are:
   `acting`;
 * `check(...)`: raise InputError if a number cannot be used in any step.
 
-Loads and prescribed motions change during a step. Methods evaluate them at a fraction s of the step (0 at its
-beginning, 1 at its end).
+Loads and prescribed motions change during a step. Methods evaluate these loads and motions at a fraction s of the step
+(0 at its beginning, 1 at its end).
 
 There are three classes of force terms. The forces, the tangent and the energy of a step are sums over all force terms.
 
-* `Solid` and `VolumeStress` act in the elements, before assembly. They return stresses and blocks of the stiffness.
+* `Solid` and `VolumeStress` act in the elements, before assembly. They return stresses and blocks of the stiffness
+  matrix.
 * `NodalForce` acts at the nodes, after assembly. It returns nodal forces and their stiffness.
 
 A `VolumeStress` has pressures at the nodes. A mixed system of equations determines positions and pressures together
@@ -55,25 +56,26 @@ class Tied(Protocol):
         """Project a nodal field (V, 3) onto the free motions of the nodes. For forces, x (V, 3) are the positions."""
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Return `field` (V, 3) with the unknowns of the motion that moves the nodes to the positions x (V, 3).
+        """Return `field` (V, 3), in which the rows of these nodes contain the unknowns of their motion to x (V, 3).
 
-        `placed` is the inverse of this method.
+        x are positions. The method `placed` is the inverse of this method.
         """
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Return the positions (V, 3) for a field with these unknowns, at fraction s of the step."""
+        """Return `field` (V, 3), in which positions at fraction s of the step replace the unknowns of these nodes."""
 
     def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
-        """Return the mask (V, 3), set to 0 at nodes with a given motion, and the free directions (V, 3) of these nodes.
+        """Return `mask` (V, 3), with 0 at nodes with a given motion, and the free directions (V, 3) of these nodes.
 
-        A node with a given motion has at most one free direction. The directions are 0 at other nodes, and None if no
-        node has such a direction.
+        A node with a given motion has at most one free direction. At other nodes, the directions are 0. Instead of the
+        directions, None is returned if no node with a given motion has a free direction.
         """
 
     def rigid(self, x: jax.Array, velocity: jax.Array, acceleration: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return velocity and acceleration (V, 3), with the values of a rigid motion at these nodes.
 
-        The given values were computed for each node separately. x (V, 3) are the positions of the nodes.
+        The arguments `velocity` and `acceleration` (V, 3) were computed for each node separately. x (V, 3) are
+        positions.
         """
 
 
@@ -87,7 +89,7 @@ class Free(NamedTuple):
     def vectors(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
         """Project a nodal field (V, 3) onto the free directions.
 
-        For forces, positions x are needed if nodes move together.
+        If nodes move together and the field contains forces, the positions x (V, 3) are also needed.
         """
         field = self.mask * field
         if self.normals is not None:
@@ -112,7 +114,7 @@ class Start(NamedTuple):
     """The state at the beginning of a run."""
 
     mesh: TetMesh
-    x: jax.Array  # (V, 3) [m]
+    x: jax.Array  # (V, 3) [m] positions
     free: Free
     force: Callable[[], jax.Array]  # (V, 3) [N] nodal forces at x, without inertia
     moved: bool = False  # True: the body was just moved to x. False: it is at rest at x, or x is only a guess
@@ -125,9 +127,9 @@ class Step(NamedTuple):
     x: jax.Array  # (V, 3) [m] positions at the beginning of the step
     k: Number  # number of the step; the first step is 1
     steps: int  # number of steps of the run
-    dt: Any  # [s]; None for load steps without time
+    dt: Any  # [s] time step; None for load steps without time
     inertia: bool  # whether the run has inertia; if true, the full loads act from the first step on
-    tolerance: Any  # tolerance of the residual; derivatives do not depend on it
+    tolerance: Any  # tolerance of the residual, a constant in derivatives
     free: Free
     averaged: bool = False  # True (Newmark): the step uses the mean of the forces at its beginning and end
 
@@ -135,10 +137,10 @@ class Step(NamedTuple):
 class End(NamedTuple):
     """The state at the end of an accepted step."""
 
-    x: jax.Array  # (V, 3) [m]
+    x: jax.Array  # (V, 3) [m] positions
     F: Matrix  # deformation gradients (E,), or (Q, E) with Q integration points per element
     pressure: Any  # (V,) [Pa] at the nodes, or None
-    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] acceleration due to `NodalForce.at_end` terms, times -1
+    by_end_forces: jax.Array | None = None  # (V, 3) [m/s^2] minus the acceleration due to force terms with `at_end`
 
 
 class Solid:
@@ -207,7 +209,7 @@ class VolumeStress:
 class NodalForce:
     """A force term of one step with forces at nodes."""
 
-    #: Whether the term has a stiffness at every node. Then the linear solver also reduces errors of long wavelength
+    #: Whether the term has a stiffness at every node. If true, the linear solver also reduces errors of long wavelength
     #: quickly.
     everywhere: ClassVar[bool] = False
     #: Whether the force has an energy. A follower force has no energy, and its stiffness is not symmetric.
@@ -242,9 +244,10 @@ class NodalForce:
         return None
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
-        """Return the stiffness at x of elements that connect nodes. Returns None if the term has no such elements.
+        """Return the stiffness, at positions x, of additional elements that connect nodes (for example membranes).
 
-        The result does not contain the blocks of `stiffness`.
+        The result does not contain the stiffness of single nodes (method `stiffness`). Returns None if the term has no
+        such elements.
         """
         return None
 
@@ -263,11 +266,17 @@ class NodalForce:
         return None
 
     def predicted(self) -> jax.Array | None:
-        """Return positions (V, 3) [m] of the body without forces, where Newton's method can start; None if unknown."""
+        """Return the positions (V, 3) [m] that the body would reach without forces. Newton's method can start there.
+
+        Returns None if these positions are unknown.
+        """
         return None
 
     def accelerations(self, force: jax.Array, x: jax.Array) -> jax.Array | None:
-        """Return accelerations (V, 3) [m/s^2] of free nodes at x due to forces (V, 3) [N]; None without a mass."""
+        """Return the accelerations (V, 3) [m/s^2] of free nodes at positions x due to forces (V, 3) [N].
+
+        Returns None if the term has no mass.
+        """
         return None
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:
@@ -289,9 +298,9 @@ class Physics:
     __dataclass_fields__: ClassVar[Content]
     #: Name of the table in scene files. `keys` are the keys of this table.
     section: ClassVar[str] = ""
-    #: Whether nodes move together because of this physics. Then linear_solver = 'direct' cannot be used.
+    #: Whether nodes move together because of this physics. If true, linear_solver = 'direct' cannot be used.
     ties: ClassVar[bool] = False
-    #: Whether the physics needs the time step `step.dt`. Then a scene without a time step raises InputError.
+    #: Whether the physics needs the time step `step.dt`. If true, a scene without a time step raises InputError.
     in_time: ClassVar[bool] = False
     #: Whether the forces have an energy. Friction forces have no energy.
     conservative: ClassVar[bool] = True
@@ -314,18 +323,20 @@ class Physics:
         """
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Check that a run can begin with this mesh in its reference shape. Not called for a mesh in its loaded shape.
+        """Check that a run can begin with this mesh in its reference shape.
+
+        This method is not called if the mesh is in its loaded shape.
 
         Raises:
             InputError: the run cannot begin (e.g. an obstacle is inside the body). The message begins with `name`.
         """
 
     def in_body(self, mesh: TetMesh, law: Any) -> "Physics":
-        """Return the same physics. Numbers that the user did not give are computed from the law of the body."""
+        """Return the same physics. Numbers that the user did not give are set to values from the law of the body."""
         return self
 
     def at_beginning(self) -> "Physics":
-        """Return the same physics as it is at the beginning of a run, before anything moves."""
+        """Return the same physics in its state at the beginning of a run, before anything moves."""
         return self
 
     def begin(self, start: Start) -> Any:
@@ -358,7 +369,10 @@ class Physics:
         return np.zeros(0, int), np.zeros((0, 3))
 
     def pulls_single_nodes(self) -> bool:
-        """Return whether forces act at single nodes, not on an area. Then displacements there depend on the mesh."""
+        """Return whether forces act at single nodes, not on an area.
+
+        In this case, the displacements of these nodes depend on the size of the elements.
+        """
         return False
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Physics":

@@ -47,7 +47,7 @@ def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Arr
     """Return a mask (V,) of the vertices: 0 if the vertex is drained or its pressure is given, otherwise 1."""
     mask = jnp.ones(mesh.number_of_vertices, dtype)
     if porosity.drained is not None:
-        # Only vertices have pressures, so edge middles among these nodes are ignored.
+        # Only vertices have pressures, so edge midpoints in this list are ignored.
         mask = mask.at[porosity.drained].set(0.0, mode="drop")
     for inlet in porosity.inlet:
         if inlet.nodes is not None:
@@ -56,14 +56,18 @@ def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Arr
 
 
 def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tolerance: jax.Array) -> Flow:
-    """Return the pressure equation of a step dt [s]. F and the volume ratios J (E,) are those at its beginning."""
+    """Return the pressure equation of a step of length dt [s].
+
+    F (deformation gradient) and J (E,) (volume ratios) are values at the beginning of the step.
+    """
     mask = unknown_pressures(porosity, mesh, J.dtype)
     # The whole equation is multiplied by dt, so that the storage term does not depend on the time step.
     J = jnp.maximum(J, LEAST_J)
     by_element = jnp.ndim(porosity.limit_bulk) > 0
     store = integrals(mesh, J / porosity.limit_bulk) if by_element else integrals(mesh, J) / porosity.limit_bulk
     g = volume_gradients(mesh, F)
-    # The gradients grad N_a = cof(F) D_a / J occur twice, and the current volume is J V0. So one factor 1/J remains.
+    # In the flow term, gradients grad N_a = cof(F) D_a / J occur twice, and the volume is J V0. So one factor 1/J
+    # remains.
     weight = dt * porosity.permeability * mesh.weights / J
     rows = block_matrix.off_diagonal(mesh, {(a, b): ((summed(mesh, weight * dot(g[a], g[b])),),) for a, b in PAIRS})
     diagonal = ((store - block_matrix.row_sums(rows)[0][0],),)
@@ -78,7 +82,8 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tole
 def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: jax.Array) -> jax.Array:
     """Estimate the minimum eigenvalue of D^-1 A outside the coarse space, with the diagonal D of A.
 
-    `rate` is dt kappa, one number or one per element (E,).
+    The coarse space is that of the preconditioner. `rate` is the time step dt times the permeability kappa: one number,
+    or one per element (E,).
     """
     stored, total = jnp.sum(store), jnp.sum(diagonal)
     if jnp.ndim(rate):
@@ -86,8 +91,9 @@ def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: j
         # body.
         fastest, mean = jnp.max(rate), jnp.sum(jnp.ravel(rate) * mesh.volumes) / jnp.sum(mesh.volumes)
         total, rate = stored + (total - stored) * fastest / jnp.where(mean > 0, mean, 1.0), fastest
-    # The numerator of the estimate is the storage plus the Darcy flow of a pressure wave with wave number 5 / (patch
-    # width). In numerical tests, this number was 4.9 to 5.4 instead of 5. The coarse space corrects longer waves.
+    # The numerator of the estimate is the storage plus the Darcy flow of a pressure wave with wave number 5 / (width of
+    # a patch of the coarse space). In numerical tests, this number was 4.9 to 5.4 instead of 5. The coarse space
+    # corrects longer waves.
     waves = rate * (5 / mesh.pattern.patch_width) ** 2 * jnp.sum(mesh.volumes)
     return (stored + waves) / total
 
@@ -112,7 +118,7 @@ def lack(flow: Flow, b: jax.Array, pressure: jax.Array) -> jax.Array:
 class Guess(NamedTuple):
     """Starting pressures of a solve, and the accuracy that this solve needs."""
 
-    pressure: jax.Array  # (V,) [Pa]; derivatives do not depend on it
+    pressure: jax.Array  # (V,) [Pa]; derivatives of the solution do not depend on them
     looser: Number  # tolerance of the solve, divided by `Flow.tolerance`
 
 
@@ -129,8 +135,8 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) 
     """
 
     def apply(p):
-        # Rows of given pressures are rows of the identity, since the right-hand side of an adjoint solve may be nonzero
-        # there.
+        # For given pressures, the rows of the matrix are rows of the identity, since the right-hand side of an adjoint
+        # solve may be nonzero there.
         return flow.mask * flow_product(flow, flow.mask * p) + (1 - flow.mask) * p
 
     diagonal = flow.mask * flow.matrix.diagonal[0][0] + (1 - flow.mask)
@@ -158,7 +164,7 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) 
 
 
 def flow_product(flow: Flow, p: jax.Array) -> jax.Array:
-    """Return the product A p, from differences of p between neighbours. So a uniform p causes exactly no flow."""
+    """Return A p, with the flow computed from differences of p between neighbours. So a uniform p causes no flow."""
     rows, nodes = flow.matrix.rows[0][0], flow.matrix.nodes
     # One operation for all neighbours takes a third of the time of a loop over the neighbours, on small and large
     # meshes.

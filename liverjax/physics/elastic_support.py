@@ -88,9 +88,9 @@ class ElasticSupport(Physics):
             bounds.check_bound(f"{name} history", {"lower": 0.0}, self.history)
 
     def freeze(self, memory: None, step: Step) -> "Springs | Foundation":
-        """Return the force term of the springs for one step, with one symmetric stiffness block per node.
+        """Return the force term of the springs for one step, with one symmetric 3 x 3 stiffness matrix per node.
 
-        On surfaces of elements of higher order, there is one block per integration point.
+        On surfaces of elements of higher order, there is one stiffness matrix per integration point.
         """
         kind: Any = Foundation if self.triangles is not None and step.mesh.order > 1 else Springs
         own = point_blocks(self, step.mesh) if kind is Foundation else blocks(self, step.mesh)
@@ -232,7 +232,7 @@ class Foundation(NodalForce):
         return 0.5 * jnp.einsum("iqm,ijqm,jqm->", u, jnp.stack([jnp.stack(row) for row in self.blocks]), u)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Return the stiffness between the nodes: the second derivative of the energy."""
+        """Return the stiffness between the nodes of each triangle: the second derivative of the energy."""
         nodes, N, _ = self._at_points(mesh, x, s)
         H = jnp.stack([jnp.stack(row) for row in self.blocks])
         return Attached(nodes, jnp.einsum("aq,bq,ijqm->aibjm", N, N, H))

@@ -60,7 +60,7 @@ class Inertia(Physics):
         return True
 
     def freeze(self, memory: Motion | None, step: Step) -> "Moving":
-        """Return the force term. It stores the masses and the motion at the beginning of the step."""
+        """Return the force term of a step. It stores the masses and the motion at the beginning of the step."""
         if memory is None:
             still = jnp.zeros_like(step.x)
             memory = Motion(still, still if self.integrator == "newmark" else None)
@@ -150,8 +150,8 @@ class Moving(NodalForce):
         velocity = (x - self.x) / dt
         acceleration = (velocity - before.velocity) / dt
         if before.acceleration is not None:
-            # Newmark's formula is used only in free directions. For a prescribed motion, its acceleration would
-            # oscillate forever.
+            # Newmark's formula is used only in free directions. With a prescribed motion, the acceleration from this
+            # formula would oscillate forever.
             average = 4 * acceleration - before.acceleration
             velocity = self._where_free(before.velocity + 0.5 * dt * (before.acceleration + average), velocity)
             acceleration = self._where_free(average, acceleration)
@@ -198,7 +198,10 @@ class Moving(NodalForce):
         return diagonal(FACTOR[self.integrator] / self.dt**2 * self.mass)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Masses | None:
-        """Return k/dt^2 times the remaining part of the consistent mass matrix (see `stiffness`), or None if lumped."""
+        """Return k/dt^2 (see `stiffness`) times the remaining part of the consistent mass matrix.
+
+        Returns None if the mass is lumped.
+        """
         if self.shared is None:
             return None
         return self.shared._replace(size=FACTOR[self.integrator] / self.dt**2 * self.shared.size)

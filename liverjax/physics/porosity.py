@@ -6,8 +6,8 @@ sigma_p is the volumetric stress, J the volume ratio, P the pressure of the flui
 lap the Laplacian, and 1/K_lim the stored fluid volume per volume and pressure. The Kerdok-Hencky stress is sigma_Heq =
 K0 r_w ln((r_w + J - 1)/r_w), with the drained bulk modulus K0 and the fluid fraction r_w. Below J0 = 1 - r_w + r_w
 K0/K_lim it is replaced by its tangent line at J0, which has the slope K_lim. (The chapter prints J0 without the factor
-r_w. The slope would then be r_w K_lim.) The pressure equation uses the volumes at the beginning of a step, so that it
-is linear in P. There are two schemes:
+r_w. Without this factor, the slope would be r_w K_lim.) The pressure equation uses the volumes at the beginning of a
+step, so that it is linear in P. There are two schemes:
 
 * "implicit": P at the end of the step follows from the volume change of the same step. P is a function of the positions
   x and is eliminated. The equations for x are symmetric, and stable for any time step. Newton's direction is computed
@@ -66,7 +66,9 @@ class Porosity(Physics):
     limit_bulk: Number = param("Pa", "K_lim, bulk modulus of the compressed body and of fluid storage", above=0.0)
     fluid_fraction: Number = param("1", "r_w", above=0.0, upper=1.0)
     permeability: Number = param("m^4/(N s)", "kappa", lower=0.0)
-    drained: Indices | None = param("1", "numbers (n,) of the nodes where P = 0; None: sealed", lower=0, default=None)
+    drained: Indices | None = param(
+        "1", "numbers (n,) of the nodes where P = 0; None: no fluid leaves", lower=0, default=None
+    )
     inlet: tuple[Inlet, ...] = param("1", "given pressures and fluxes", default=())
     initial_pressure: Number | None = param("Pa", "pressure of the fluid at the beginning; None: 0", default=None)
     scheme: str = static(default="implicit", about="implicit, or lagged as in the chapter", words=SCHEMES)
@@ -189,7 +191,7 @@ def bulk_in_force(porosity: Porosity, law: Law) -> str:
 def volumetric_stress(porosity: Porosity, J: Number) -> Number:
     """Return the stress sigma_Heq(J) [Pa]: Hencky's logarithm above J0, and its tangent line below J0.
 
-    This stress is finite for every volume ratio J.
+    This stress is finite for every volume ratio J. J0 is defined in the docstring of the module.
     """
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
@@ -208,6 +210,7 @@ def volumetric_energy(porosity: Porosity, J: Number) -> Number:
     """Return the volumetric energy density [Pa]: the integral of sigma_Heq from 1 to J.
 
     Above J0, this energy is K0 r_w^2 (u ln u - u + 1) with u = (r_w + J - 1)/r_w. Below J0, it is a parabola.
+    The other symbols are defined in the docstring of the module.
     """
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
@@ -242,7 +245,7 @@ def pressure(
 ) -> jax.Array:
     """Return the pressures P (V,) [Pa] at the end of a step.
 
-    J_end (E,) are the volume ratios at the end of the step.
+    `fluid` is the state of the fluid at the beginning of the step, and J_end (E,) are the volume ratios at its end.
     """
     before: Any = fluid.J_before
     increment = fluid.J - before if porosity.scheme == "lagged" else J_end - fluid.J
@@ -254,7 +257,7 @@ def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_
     """Return the energy b . P / 2 [J] of the fluid. P = A^-1 b are the pressures at the end of a step.
 
     A P = b is the pressure equation (`liverjax.physics.darcy`). J_end (E,) are the volume ratios at the end of the
-    step.
+    step. If pressures or fluxes are given, terms are added such that the gradient of the energy with respect to b is P.
     """
     b = flow.store * fluid.pressure - integrals(mesh, J_end - fluid.J)
     P = pressure(porosity, mesh, fluid, flow, J_end)

@@ -23,7 +23,7 @@ class Fixed:
 class Displaced:
     """Nodes with a prescribed displacement.
 
-    It grows linearly and reaches `by` at the last step, or follows a history.
+    The displacement grows linearly and reaches `by` at the last step, or it follows a history.
     """
 
     nodes: Indices = param("1", "node numbers (n,)", lower=0)
@@ -42,7 +42,7 @@ def check_axes(axes: object, name: str) -> None:
         InputError: the value is not a string of different letters x, y and z. The message begins with `name`.
     """
     if not isinstance(axes, str) or not axes or set(axes) - set(AXES) or len(set(axes)) != len(axes):
-        raise InputError(f"{name} axes = {axes!r} is not known: give some of the letters xyz")
+        raise InputError(f"{name} axes = {axes!r} is not known: give one or more of the letters x, y and z, each once")
 
 
 def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:

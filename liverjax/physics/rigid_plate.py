@@ -56,7 +56,7 @@ class RigidPlate(Physics):
             raise InputError(f"{name} needs ascending times and one value of turn for each time: correct the history")
         arms = self.at_rest(mesh).arms(mesh.points)
         if not np.abs(np.asarray(arms)).max() > 1e-9 * np.ptp(np.asarray(mesh.points)):
-            raise InputError(f"{name} has no node off its axis: add nodes, or move the centre")
+            raise InputError(f"{name} has only nodes on its axis: add other nodes, or move the centre")
 
     def at_rest(self, mesh: TetMesh) -> "Plate":
         """Return the nodes of the plate in their reference positions."""
@@ -177,7 +177,10 @@ class Plate(NamedTuple):
         return velocity, acceleration.at[nodes].set(growth * arms + towards + up)
 
     def spread(self, field: jax.Array, turn: Number, lift: Number) -> jax.Array:
-        """Return `field` with new rows of the plate's nodes: its two motions with the amplitudes `turn` and `lift`."""
+        """Return `field` (V, 3) with new rows of the plate's nodes.
+
+        These rows contain the sum of the plate's two motions, multiplied by the amplitudes `turn` and `lift`.
+        """
         rows = turn * self._arms(self.carrier) / self.radius
         if self.plate.lifts:
             rows = rows + lift * self._axis(field)[None] / len(self.reference) ** 0.5
@@ -186,7 +189,8 @@ class Plate(NamedTuple):
     def amplitudes(self, field: jax.Array, arms: jax.Array) -> tuple[Number, Number]:
         """Return R times the rotation, and sqrt(n) times the axial displacement, of n plate nodes in a field (V, 3).
 
-        `arms` (n, 3) are the vectors e x (x - c) of the nodes. R, e and c: docstring of the module.
+        If the angle is given, the first number is 0. `arms` (n, 3) are the vectors e x (x - c) of the nodes. R, e and
+        c: docstring of the module.
         """
         rows = field[self.plate.nodes]
         turn = jnp.sum(arms * rows) / self.radius if self.plate.by == "torque" else 0.0
@@ -201,12 +205,12 @@ class Plate(NamedTuple):
         return self.before + s * (self.after - self.before)
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Return `field` (V, 3) with the plate's unknowns for positions x (V, 3) in the rows of its nodes."""
+        """Return `field` (V, 3), in which the rows of the plate's nodes contain its unknowns for positions x (V, 3)."""
         turn = self.radius * self.angle(x) if self.plate.by == "torque" else 0.0
         return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Return the positions (V, 3) [m] for a field with the plate's unknowns, at fraction s of the step."""
+        """Return `field` (V, 3), in which positions [m] at fraction s of the step replace the plate's unknowns."""
         turn, lift = self.amplitudes(field, self._arms(self.carrier))
         angle = turn / self.radius if self.plate.by == "torque" else self.given(s)
         return self.moved(field, angle, lift / len(self.reference) ** 0.5)
@@ -237,5 +241,5 @@ class Torque(NodalForce):
         return jnp.zeros_like(x).at[self.plate.plate.nodes].set(rows)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Return the energy [J]: torque times angle, times -1."""
+        """Return the energy [J] at the end of the step: torque times angle, times -1."""
         return -self.plate.after * self.plate.angle(x)

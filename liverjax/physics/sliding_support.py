@@ -80,8 +80,8 @@ def on_plane(mesh: TetMesh, nodes: np.ndarray, name: str = "support") -> Sliding
     off = np.abs((points - points.mean(axis=0)) @ axes[2]).max()
     if off > _FLAT * size[0]:
         raise InputError(
-            f"{name} where selects nodes up to {off:.3g} m off one plane: select a plane part of the surface, or "
-            "write several supports"
+            f"{name} where selects nodes that lie up to {off:.3g} m from one plane: select a plane part of the "
+            "surface, or write several supports"
         )
     numbers = jnp.asarray(nodes, jnp.int32)
     along = np.flatnonzero(np.abs(np.abs(axes[2]) - 1) < _FLAT**2 + 1e-12)

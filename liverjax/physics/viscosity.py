@@ -1,10 +1,10 @@
 """Prony viscohyperelasticity (book chapter, section 4.2): S_v = S_h - sum_k gamma_k.
 
 S_v is the second Piola-Kirchhoff stress of the viscoelastic body, and S_h is the stress of the law. Each mode k has one
-internal (history) variable, the symmetric tensor gamma_k. It is the stress that this mode has relaxed. The history
-variables are updated from step n-1 to step n by a recursion: gamma^n = a S^n + c S^(n-1) + b gamma^(n-1). S is the
-stress that relaxes (S_h or its isochoric part), dt the time step, and g and tau are ratio and relaxation time of the
-mode. There are two schemes:
+internal (history) variable, the symmetric tensor gamma_k. It is the part of the stress that has relaxed in this mode.
+The history variables are updated from step n-1 to step n by a recursion: gamma^n = a S^n + c S^(n-1) + b gamma^(n-1). S
+is the stress that relaxes (S_h or its isochoric part), dt the time step, and g and tau are ratio and relaxation time of
+the mode. There are two schemes:
 
 * ``"exponential"``: exact if the stress changes linearly during the step. e = exp(-dt/tau), q = (1 - e) tau/dt,
   a = g (1 - q), c = g (q - e), b = e. This scheme is of second order in dt.
@@ -50,7 +50,7 @@ PARTS = ("all", "isochoric")
 class Prony:
     """Prony series alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): stress at time t, divided by the initial stress.
 
-    There are N modes k. After a long time, the fraction 1 - sum_k g_k of the stress remains.
+    The series has N modes k. After a long time, the fraction 1 - sum_k g_k of the stress remains.
     """
 
     ratios: Any = param("1", "g_k, fraction that relaxes in mode k (N,), or per element (N, E)", lower=0.0, upper=1.0)
@@ -71,20 +71,20 @@ class Prony:
 
 
 class History(NamedTuple):
-    """History variables of N modes at the end of a step.
+    """History variables of N modes at the end of a step: six components of symmetric tensors.
 
     The last axes are (Q, E), not (E,), if elements have Q integration points.
     """
 
-    gamma: jax.Array  # (N, 6, E) [Pa]
-    stress: jax.Array | None  # S^n (6, E) [Pa]; backward Euler does not need it
+    gamma: jax.Array  # (N, 6, E) [Pa] stress that has relaxed in each mode
+    stress: jax.Array | None  # (6, E) [Pa] stress S^n that relaxes; None for backward Euler
 
 
 class Recall(NamedTuple):
     """Contribution of the history variables to the stress in a step. It is constant during Newton's iterations."""
 
-    past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
-    now: jax.Array  # 1 - sum_k a_k: one number (), or an array that broadcasts over the integration points
+    past: Matrix  # [Pa] known part of the relaxed stress: sum_k (c_k S^(n-1) + b_k gamma_k^(n-1))
+    now: jax.Array  # factor of the current stress, 1 - sum_k a_k: one number, or one per element or integration point
 
 
 def check_viscosity(prony: Prony, law: Law) -> None:
@@ -107,7 +107,7 @@ def check_part(part: str, law: Law, section: str) -> None:
     if part == "isochoric" and isochoric_part(law) is None:
         raise InputError(
             f"{section} part = 'isochoric' needs a law with an isochoric part, unlike {type(law).__name__}: "
-            "use part = 'all' or a law with bulk"
+            "use part = 'all', or a law with the parameter bulk"
         )
 
 
@@ -122,7 +122,9 @@ def check_series(prony: Prony) -> None:
     both = (prony.ratios, prony.relaxation_times)
     for key, values in zip(("ratios", "relaxation_times"), both, strict=True):
         if not isinstance(values, (tuple, list)) and not np.ndim(values):
-            raise InputError(f"viscosity.{key} = {values} is one number: give one per mode, e.g. [{values}]")
+            raise InputError(
+                f"viscosity.{key} = {values} is one number: give a list with one number per mode, e.g. [{values}]"
+            )
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(both)):
         # NumPy cannot find the shape of a tuple of JAX tracers (numbers that are unknown inside jit).
         ratios, times = (len(v) if isinstance(v, (tuple, list)) else (*np.shape(v), 1)[0] for v in both)
@@ -167,7 +169,7 @@ def lasting(prony: Prony, order: int = 1) -> jax.Array:
 
 
 def _beside(numbers: jax.Array, ndim: int) -> jax.Array:
-    """Add axes to numbers (N,) or (N, E), so that they broadcast with arrays (N, 6, …, E) of `ndim` dimensions."""
+    """Add axes to `numbers`, (N,) or (N, E) for N modes, to broadcast with arrays (N, 6, …, E) of `ndim` dimensions."""
     if numbers.ndim == 1:
         return numbers[(slice(None), *(None,) * (ndim - 1))]
     return numbers[(slice(None), *(None,) * (ndim - 2))]
@@ -191,9 +193,10 @@ def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
 def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax.Array:
     """Return the complex ratios gamma_k / S_h (N, ...) of N modes in steady vibration.
 
-    `omega` [rad/s] are angular frequencies. With `dt` [s] the ratios are exact for the time-discrete recursion. Without
-    `dt` they are the ratios in continuous time, g/(1 + i omega tau). The complex modulus G*, divided by the
-    instantaneous modulus G0, is 1 minus the sum of the ratios over the modes.
+    gamma_k is the stress that has relaxed in mode k, and S_h the stress of the law. `omega` [rad/s] are angular
+    frequencies. With `dt` [s] the ratios are exact for the time-discrete recursion. Without `dt` they are the ratios in
+    continuous time, g/(1 + i omega tau). The complex modulus G*, divided by the instantaneous modulus G0, is 1 minus
+    the sum of the ratios over the modes.
     """
     omega = jnp.asarray(omega)[None]
     column = (-1,) + (1,) * (omega.ndim - 1)
@@ -261,7 +264,7 @@ def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Number) -> 
 
 
 def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
-    """Return the second Piola-Kirchhoff stress (6, E) [Pa] that relaxes: S_h of the law, or its isochoric part."""
+    """Return the second Piola-Kirchhoff stress (6, E) [Pa] that relaxes: that of the law, or its isochoric part."""
     s = invariant_terms.state(relaxing(prony, law), F)
     S = invariant_terms.second_piola(F, invariant_terms.stress(s))
     return jnp.stack([S[i][j] for i, j in SIX])
@@ -327,7 +330,7 @@ class Viscoelasticity(Physics):
         if memory.stress is None or not start.moved:
             return memory
         F = deformation_gradient(start.mesh, start.x)
-        # The stress in inverted elements is set to 0 (F = I).
+        # In inverted elements F = I is used, so that the stored stress is 0.
         whole = determinant(F) > 0
         F = tuple(tuple(jnp.where(whole, F[i][j], float(i == j)) for j in range(3)) for i in range(3))
         return memory._replace(stress=relaxing_stress(self.prony, self.law, F))

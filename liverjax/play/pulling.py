@@ -134,7 +134,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
     # The compiled program needs arrays with the precision for which it was compiled.
     spring = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), spring, playing.scene.physics[-1])
     scene = replace(playing.scene, physics=(*others, spring))
-    first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # step STEPS has the full load
+    first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # the full load acts at step STEPS
     result, state = jax.block_until_ready(playing.program(scene, playing.state, float(first)))
     code = int(result.status[0])
     if code not in (status.CONVERGED, status.ONE_STEP):

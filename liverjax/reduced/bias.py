@@ -30,7 +30,7 @@ def reduced_bias(
 
     Args:
         model, scene: the same arguments as for `simulate_reduced`.
-        values: dotted names of parameters -> their values that were identified with the model.
+        values: dotted names of the parameters -> values that were identified with the model.
         observed: function of the positions (T, V, 3) [m] of the nodes. It returns the quantities that were fitted to
             the data, multiplied by the weights of the fit.
 
@@ -47,7 +47,7 @@ def reduced_bias(
     full = simulate(with_parameters(scene, shaped(flat))).check()
     off = np.asarray(jnp.ravel(observed(full.positions)) - jax.jit(answer)(flat))
     J = np.asarray(jax.jit(jax.jacfwd(answer))(flat))
-    # The parameters have different units, so the columns are scaled to length 1.
+    # The parameters have different units, so the columns of J are scaled to length 1.
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
     found = np.linalg.lstsq(J / size, off, rcond=None)[0] / size

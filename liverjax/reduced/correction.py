@@ -8,11 +8,11 @@ time derivatives of the coordinates are also terms of the polynomial. The factor
 squares with a small ridge penalty (closures of reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys.
 Fluids 33, 091301). The differences of each run are divided by the largest displacement of this run.
 
-In a cross-validation, one group of runs after another is left out of the fit. The errors of the left-out runs determine
-how many coordinates have quadratic terms. These errors also give a model of the error of the corrected motion (the
-stated error). In this model, the logarithm of the error is linear in the logarithms of three numbers, which are known
-without a full run: the size of the correction, the largest displacement, and the leverage of the terms. The leverage is
-the variance of the least-squares prediction, divided by the variance of the data (Hoaglin, Welsch 1978).
+In a cross-validation, the fit is repeated without one group of runs, for each group. The errors of the left-out runs
+determine how many coordinates have quadratic terms. These errors also give a model of the error of the corrected motion
+(the stated error). In this model, the logarithm of the error is linear in the logarithms of three numbers, which are
+known without a full run: the size of the correction, the largest displacement, and the leverage of the terms. The
+leverage is the variance of the least-squares prediction, divided by the variance of the data (Hoaglin, Welsch 1978).
 """
 
 from functools import partial
@@ -27,13 +27,13 @@ from liverjax.tensors.principal_fields import principal_fields
 
 #: GROUPS: number of groups of runs in the cross-validation. FEWEST_RUNS: minimum number of runs for a correction.
 GROUPS, FEWEST_RUNS = 12, 6
-#: PRODUCTS: numbers of coordinates with quadratic terms that are tried. RATES: maximum number of coordinates that are
-#: multiplied by time derivatives.
+#: PRODUCTS: the numbers of coordinates with quadratic terms that are tried. RATES: maximum number of coordinates that
+#: are multiplied by time derivatives.
 PRODUCTS, RATES = (0, 6, 12, 20), 8
-#: RIDGE: ridge penalty, relative to the mean squares of the terms. OUTSIDE: fraction of the differences that the fields
-#: may neglect. MOST_FIELDS: maximum number of fields.
+#: RIDGE: ridge penalty, relative to the mean squares of the terms. OUTSIDE: fraction of the differences of full and
+#: reduced motion that the fields may neglect. MOST_FIELDS: maximum number of fields.
 RIDGE, OUTSIDE, MOST_FIELDS = 1e-6, 0.02, 150
-#: Maximum number of states whose differences are used to compute the fields.
+#: Maximum number of training states whose differences of full and reduced motion are used to compute the fields.
 FIELD_STATES = 1500
 #: Prior values of the three exponents of the stated error. With few runs, the exponents stay close to these values.
 #: With the prior values, the stated error of the motion is a constant times the square root of the leverage.
@@ -47,7 +47,7 @@ class Correction:
     """Polynomials with k terms for the coefficients of m fields, and numbers that determine the stated error (module
     docstring). They are learnt from R training runs."""
 
-    fields: jax.Array = param("1", "(m, V, 3), orthonormal with the lumped volumes of the nodes")
+    fields: jax.Array = param("1", "(m, V, 3), orthonormal with the nodal volumes as weights")
     factors: jax.Array = param("m^2.5", "factor of each term in the coefficient of each field (k, m)")
     inverse: jax.Array = param("1", "inverse of the normal matrix of the terms (k, k)")
     scale: jax.Array = param("m", "standard deviation of the first coordinate in the training")
@@ -71,7 +71,7 @@ def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.
     """Return the values (T, k) [1] of the k terms of the polynomial at every step of a run that begins at rest.
 
     Args:
-        q: coordinates (T, n) [m].
+        q: the n reduced coordinates at T steps (T, n) [m].
         scale: standard deviation of the first coordinate in the training [m].
         products: number of coordinates with quadratic terms.
         dt: time step [s]; None if the scene has no time.
@@ -87,13 +87,13 @@ def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.
 
 
 def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Return the correction (T, V, 3) [m] of the node positions, for reduced coordinates q (T, n) [m] and the time step
-    dt [s]."""
+    """Return the correction (T, V, 3) [m] of the node positions at T steps, for the n reduced coordinates q (T, n) [m]
+    and the time step dt [s]."""
     return jnp.tensordot(terms(q, own.scale, own.products, dt) @ own.factors, own.fields, axes=1)
 
 
 def size_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Return the maximum length (T,) [m] of the correction of a node, up to each step."""
+    """Return the maximum correction (T,) [m] of a node position up to each of T steps."""
     return jax.lax.cummax(_largest_of_steps(correction_at(own, q, dt)))
 
 
@@ -103,7 +103,7 @@ def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None
 
     Args:
         own: `Correction`.
-        q: coordinates (T, n) [m].
+        q: the n reduced coordinates at T steps (T, n) [m].
         moved: corrected displacements of the nodes (T, V, 3) [m].
         dt: time step [s]; None if the scene has no time.
     """
@@ -122,25 +122,25 @@ def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None
 def _largest_of_steps(u: jax.Array) -> jax.Array:
     """Return the maximum length (T,) of the vectors u (T, V, 3) at each step."""
     square = jnp.max(jnp.sum(u**2, axis=-1), axis=-1)
-    # The square root has no derivative at zero.
+    # The square root has no derivative at 0, so the length 0 is treated separately.
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def _leverage(a: jax.Array, inverse: jax.Array) -> jax.Array:
-    """Return the leverage (T,) [1] of terms a (T, k): the variance of the least-squares prediction, divided by the
-    variance of the data."""
+    """Return the leverage (T,) [1] of the k terms a (T, k) at T steps: the variance of the least-squares prediction,
+    divided by the variance of the data."""
     return jnp.sum((a @ inverse) * a, axis=1)
 
 
 def _logarithms(corrected: jax.Array, moved: jax.Array, leverage: jax.Array) -> jax.Array:
     """Return three logarithms (R, 3) for R runs or steps: of the correction divided by the displacement, of the
-    displacement `moved` [m], and of the leverage. The stated error is computed from these."""
+    displacement `moved` [m], and of the leverage. The stated error is computed from these logarithms."""
     tiny = jnp.finfo(moved.dtype).tiny
     return jnp.log(jnp.maximum(jnp.stack([corrected / moved, moved, leverage], axis=1), tiny))
 
 
 class _LeftOut(NamedTuple):
-    """Maxima over each run (R,), with a correction that was learnt without the group of this run."""
+    """Maxima over the steps of each of R runs (R,), with a correction that was learnt without the group of this run."""
 
     off: np.ndarray  # maximum error [m]
     corrected: np.ndarray  # maximum correction [m]
@@ -191,11 +191,11 @@ def _left_out(
     """Return the errors of every run, with a correction learnt without the group of this run.
 
     Args:
-        A: values of the terms of the polynomial (R, T, k).
+        A: values of the k terms of the polynomial in R runs (R, T, k).
         sums: normal equations of each group of runs.
-        group: group of each run (R,).
+        group: index of the group of each run (R,).
         missing: full minus reduced motion (R, T, V, 3) [m].
-        fields: fields of the correction (m, V, 3).
+        fields: the m fields of the correction (m, V, 3).
     """
     found = np.zeros((3, len(A)))
     for g in range(len(sums.squares)):
@@ -209,7 +209,7 @@ def _left_out(
 
 def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the constant and the exponents (4,) of the stated error, and the stated error divided by the true error
-    (R,) for the left-out runs.
+    (R,) for the R left-out runs.
 
     The exponents come from a least-squares fit of the logarithms. With few runs they stay close to
     `FEW_RUNS_EXPONENTS`. The constant is chosen so that the logarithms of the 1 % and 99 % quantiles of this ratio have
@@ -231,7 +231,7 @@ def _farthest(u: np.ndarray) -> np.ndarray:
 
 
 def _error_fields(weighted: np.ndarray) -> np.ndarray:
-    """Return orthonormal fields (m, 3 V) that approximate the differences `weighted` (N, 3 V) of full and reduced
+    """Return m orthonormal fields (m, 3 V) that approximate N differences `weighted` (N, 3 V) of full and reduced
     motion. Fields and differences are multiplied by the square roots of the nodal volumes."""
     return principal_fields(weighted[:: max(1, len(weighted) // FIELD_STATES)], OUTSIDE)[:MOST_FIELDS]
 
@@ -255,8 +255,8 @@ class _LeastSquares(NamedTuple):
 
 
 def _least_squares(A: np.ndarray, parts: np.ndarray, moved: np.ndarray, group: np.ndarray) -> _LeastSquares:
-    """Return the normal equations of the terms A (R, T, k) for the field coefficients `parts` (R, T, m). Each run is
-    weighted by the inverse of its largest displacement `moved` (R,)."""
+    """Return the normal equations of the k terms A (R, T, k) for the coefficients `parts` (R, T, m) of m fields. Each
+    of the R runs is weighted by the inverse of its largest displacement `moved` (R,)."""
     size = np.sqrt(np.mean(A**2, axis=(0, 1)))
     size = np.where(size > 0, size, 1.0)
     weight = (1 / moved / np.sqrt(np.mean(1 / moved**2)))[:, None, None]

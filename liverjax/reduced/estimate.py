@@ -7,10 +7,10 @@ solution of the linear equations of the same body,
     M a(e) + K e - memory(e) = -r,
 
 with the mass matrix M, the acceleration a(e), the stiffness K of the reference shape, and the forces memory(e) of the
-history variables. These variables are updated from step to step by the same recursion as in the full model. The matrix
-of the left-hand side is factorised once per run. So a step needs the forces of the full mesh and one linear solve, but
-no Newton iterations. In statics the energy norm of e is the dual norm of r. The estimate neglects terms of second order
-in e and the change of the stiffness with the deformation.
+history variables. These variables are updated from step to step as in the full model. The matrix of the left-hand side
+is factorised once per run. So a step needs the forces of the full mesh and one linear solve, but no Newton iterations.
+In statics the energy norm of e is the dual norm of r. The estimate neglects terms of second order in e and the change
+of the stiffness with the deformation.
 
 In a scene with a porous body, the fluid pressures on the full mesh are computed from the reduced motion. Then the
 volume balance of the fluid is fulfilled, and only the forces are out of balance. These forces cause the errors of
@@ -123,8 +123,8 @@ def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
 
 
 def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the errors of displacement (T, V, 3) [m] and pressure (T, V) [Pa]: the response of the linear body to the
-    forces -residuals (T, V, 3) [N]. The pressures are None if the scene has no fluid."""
+    """Return the errors of displacement (T, V, 3) [m] and pressure (T, V) [Pa]: the response of the linearised body to
+    the forces -residuals (T, V, 3) [N]. The pressures are None if the scene has no fluid."""
     import scipy.sparse
 
     free = np.flatnonzero(np.asarray(free_directions(scene).mask).ravel())
@@ -175,7 +175,8 @@ def _recursion(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the coefficients a, b, c (N,) [1] of the recursion gamma_new = a S + b gamma + c S_before for the history
     variables gamma of N Prony terms.
 
-    S is the stress at the end of the step. The arrays are empty if the scene has no viscosity.
+    S is the stress at the end of the step, and S_before the stress at its beginning. The arrays are empty if the scene
+    has no viscosity.
     """
     if scene.viscosity is None:
         return np.zeros(0), np.zeros(0), np.zeros(0)

@@ -37,8 +37,9 @@ from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.tensors.matrices import Matrix, deformation_gradient
 from liverjax.tensors.places import taken
 
-#: A parameter may be outside of its training range by this fraction of the width of the range. For a viscous block, the
-#: stated error was half of the true error there, and a sixth of it at half of the width.
+#: A parameter may be outside of its training range by this fraction of the width of the range. In a test with a viscous
+#: block, the stated error was half of the true error at this distance outside of the range. At a distance of half of
+#: the width, the stated error was a sixth of the true error.
 BEYOND = 0.1
 #: Entries of a scene that contain numbers on which the motion depends.
 _PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction", "physics")
@@ -52,9 +53,9 @@ class PressureModes:
     """The m modes of the fluid pressure, with their values at the S points of the reduced model. The modes are 0 where
     the body is drained."""
 
-    modes: jax.Array = param("1", "(m, V), orthonormal with the lumped volumes of the vertices")
+    modes: jax.Array = param("1", "(m, V), orthonormal with the volumes of the vertices as weights")
     values: jax.Array = param("1", "values at the points (S, m)")
-    parts: jax.Array = param("1", "(m, 4, S) vertex values in each point's element, times roots of shape functions")
+    parts: jax.Array = param("1", "(m, 4, S) vertex values around each point, times square roots of shape functions")
     slopes: jax.Array = param("1/m", "gradients at the points (m, 3, S)")
 
 
@@ -63,10 +64,10 @@ class ReducedModel:
     """A reduced model of one scene with n modes and S points. The loads of the scene and the parameters of its law and
     viscosity can be changed."""
 
-    modes: jax.Array = param("1", "(n, V, 3), orthonormal with the lumped volumes of the nodes")
-    slopes: jax.Array = param("1/m", "gradients of the modes at the points (9, S, n), the matrix row by row")
+    modes: jax.Array = param("1", "(n, V, 3), orthonormal with the nodal volumes as weights")
+    slopes: jax.Array = param("1/m", "gradients of the modes at the points (9, S, n), with 9 entries row by row")
     weights: jax.Array = param("m^3", "reference volume that a point represents (S,), not negative")
-    points: jax.Array = param("1", "number q E + e of integration point q in element e of E (S,)")
+    points: jax.Array = param("1", "(S,) numbers q E + e: integration point q of element e, with E elements")
     ranges: dict[str, Any] = param("1", "name of each training parameter -> its lowest and highest value")
     correction: Correction | None = param("1", "correction of the motion (`Correction`), or None", default=None)
     pressures: PressureModes | None = param("1", "pressure modes; None if the scene has no porous body", default=None)
@@ -80,19 +81,19 @@ class ReducedModel:
 
 
 def flat_gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """Return the gradient (9, Q E) of a field x (V, 3) at all integration points of the mesh. The 3 x 3 gradient is
-    stored row by row."""
+    """Return the gradient (9, Q E) of a field x (V, 3) at the integration points, Q in each of E elements. The 3 x 3
+    gradient is stored row by row."""
     F = deformation_gradient(mesh, x)
     return jnp.stack([entry for row in F for entry in row]).reshape(9, -1)
 
 
 def as_matrix(flat: jax.Array) -> Matrix:
-    """Return a 3 x 3 matrix as nested tuples, from its nine entries (9, S)."""
+    """Return 3 x 3 matrices at S points as nested tuples, from their nine entries (9, S)."""
     return tuple(tuple(flat[3 * i + j] for j in range(3)) for i in range(3))
 
 
 def pressure_modes(mesh: TetMesh, modes: jax.Array) -> PressureModes:
-    """Return `PressureModes` at all integration points, from the values `modes` (m, V) of the pressure modes at the
+    """Return `PressureModes` at all integration points, from the values `modes` (m, V) of m pressure modes at the
     vertices."""
     L = jnp.full((4, 1), 0.25) if mesh.order == 1 else jnp.asarray(basis(mesh.order).L)
 
@@ -112,8 +113,8 @@ def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None 
 
     Args:
         scene: `Scene`.
-        modes: modes of the motion (n, V, 3).
-        pressures: modes of the pressure (m, V); None if the scene has no fluid.
+        modes: the n modes of the motion (n, V, 3).
+        pressures: the m modes of the pressure (m, V); None if the scene has no fluid.
     """
     mesh = scene.mesh
     slopes = jnp.moveaxis(jax.lax.map(lambda mode: flat_gradient(mesh, mode), modes), 0, -1)
@@ -263,8 +264,9 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
     vmap is not checked.
 
     Raises:
-        InputError: a number that was varied in the training is outside its training range by more than `BEYOND`, or a
-            number that was not varied differs from the training runs.
+        InputError: a number that was varied in the training is outside its training range by more than `BEYOND`; a
+            number that was not varied, or the time integrator, differs from the training runs; or the run is longer
+            than the training runs.
     """
     parts = [*(getattr(scene, part) for part in _PARTS), scene.solve.dt]
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((parts, model.ranges))):
@@ -279,7 +281,7 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
                 "model with a wider range"
             )
     if not model.others:
-        return  # the model was made by an earlier version of the program
+        return  # models of an earlier version of the program do not contain these digests
     made, own = json.loads(model.others), json.loads(other_numbers(scene, {n: b[0] for n, b in model.ranges.items()}))
     for name in _course(scene):
         before, after = made.pop(name, None), own.pop(name)

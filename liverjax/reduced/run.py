@@ -80,8 +80,8 @@ class _Given(NamedTuple):
 
 
 def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
-    """Return the reduced loads and the prescribed motion of all steps, and the reduced load (n,) [N] at the beginning
-    of the run."""
+    """Return the reduced loads and the prescribed motion of all steps. The second result is the reduced load (n,) [N]
+    on the n modes at the beginning of the run."""
     mesh, solve, body = scene.mesh, scene.solve, scene.body
     weight = {} if body is None else {k: getattr(body, k) for k in ("density", "gravity", "times", "history")}
     loads = Loads(traction=scene.traction, **weight)
@@ -114,8 +114,8 @@ def _prescribed_steps(scene: Scene) -> jax.Array:
 
 
 def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
-    """Return the deformation gradients of the prescribed motion at the points and at the end of every step, (T, 9, S).
-    Without prescribed motion, return unit matrices (1, 9, S)."""
+    """Return the deformation gradients (T, 9, S) of the prescribed motion at the S points, at the end of each of T
+    steps. Without prescribed motion, return unit matrices (1, 9, S)."""
     mesh, solve = scene.mesh, scene.solve
 
     def moved(k: jax.Array) -> jax.Array:
@@ -131,7 +131,7 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     """Return the initial state: reduced coordinates, history variables of viscosity, state of the fluid, velocity and
     acceleration, and a zero matrix for the inverse tangent, which is not yet known. The last result is the reduced mass
-    matrix (n, n) [kg].
+    matrix (n, n) [kg] of the n modes.
 
     Velocity, acceleration and mass are None without inertia. `load` (n,) [N]: reduced load at the beginning.
     """
@@ -143,7 +143,7 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     if scene.solve.kind != "dynamic" or scene.body is None:
         return q, memory, fluid, None, inverse, None
     density = jnp.asarray(scene.body.density)
-    if density.ndim == 0:  # then the mass is a multiple of Id: the modes are orthonormal with the volumes
+    if density.ndim == 0:  # the mass matrix is a multiple of the identity, because the modes are orthonormal
         mass = density * jnp.eye(n, dtype=q.dtype)
     else:
         nodal = density * nodal_volumes(scene.mesh)
@@ -156,7 +156,7 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
 
 
 def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> jax.Array:
-    """Return the reduced forces (n,) [N] due to a given initial pressure (see
+    """Return the reduced forces (n,) [N] on the n modes due to a given initial pressure (see
     `liverjax.simulation.equations.initial_state`)."""
     sponge = reduced_sponge(model, scene)
     flow = flowing(model, sponge, fluid, jnp.asarray(scene.solve.dt))

@@ -119,7 +119,8 @@ def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
 
 
 def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
-    """Return the reduced compliance (n, n) [m/N]: the inverse of the reduced stiffness at the reference shape."""
+    """Return the reduced compliance (n, n) [m/N] of n modes: the inverse of the reduced stiffness at the reference
+    shape."""
     modes = np.asarray(whole.modes).reshape(whole.number_of_modes, -1)
     K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), scene.mesh.points)
     springs = reduced_springs(whole.modes, scene)
@@ -130,10 +131,10 @@ def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
 def _contributions(
     whole: ReducedModel, scene: Scene, run: tuple[jax.Array, jax.Array | None], times: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Return (forces, balance): forces (K, n, P) [N] are the contributions of each point to the reduced forces at the K
-    steps `times` of a run; balance is the result of `_balance`, or None if the scene has no fluid.
+    """Return (forces, balance). forces (K, n, P) [N] are the contributions of the P points to the n reduced forces at
+    the K steps `times` of a run. balance is the result of `_balance`, or None if the scene has no fluid.
 
-    `run` contains the coordinates of motion (T, n) [m] and pressure (T, m) [Pa] of the run.
+    `run` contains the coordinates of the modes of motion (T, n) [m] and of the m modes of pressure (T, m) [Pa].
     """
     solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
     F0, (q, p) = prescribed_gradients(whole, scene), run
@@ -161,8 +162,8 @@ def _contributions(
 def _balance(
     whole: ReducedModel, scene: Scene, gradient: Callable[[jax.Array], jax.Array], p: jax.Array, times: jax.Array
 ) -> jax.Array:
-    """Return the contributions of each point to both sides of the fluid's volume balance, as pressures (2, K, m, P)
-    [Pa].
+    """Return the contributions of the P points to both sides of the fluid's volume balance at K steps, as pressures
+    (2, K, m, P) [Pa] in m modes.
 
     The first side is the change of volume in a step. The second side is the fluid that is stored or flows away.
 
@@ -204,9 +205,10 @@ def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) ->
 
     if not len(G):
         raise InputError(
-            "the training runs contain no forces, so no points can be selected: give two or more different rows"
+            "the training runs contain no forces, so no points can be selected: give two or more different parameter "
+            "sets"
         )
-    # The rows of V have length 1, so singular vectors with small singular values have the same weight as others.
+    # The rows of V have length 1, so singular vectors with small and with large singular values have the same weight.
     V = principal_fields(G, tolerance)
     V = np.concatenate([V, volumes[None] / np.linalg.norm(volumes)])
     return nnls(V, V.sum(axis=1), maxiter=20 * V.shape[1])[0]

@@ -28,7 +28,7 @@ from liverjax.simulation.batch import simulate_batch
 #: Maximum number of parameters, and maximum number of runs of the grid.
 MOST_PARAMETERS, MOST_RUNS = 4, 2000
 #: SWEEPS: maximum number of iterations of alternating least squares for a term. SETTLED: the iterations end if the
-#: relative change of the term's norm is at most this value.
+#: relative change of the norm of the term is at most this value.
 SWEEPS, SETTLED = 50, 1e-6
 
 
@@ -44,7 +44,9 @@ class SeparatedModel:
         "displacements that the terms do not describe, divided by all displacements (root mean square over nodes, "
         "weighted by volume, and over all runs of the grid)",
     )
-    error: jax.Array = param("1", "(c,) maximum error of a node, divided by the largest displacement, in c other runs")
+    error: jax.Array = param(
+        "1", "(c,) maximum error of a node divided by the largest displacement, in c runs not on the grid"
+    )
     names: tuple[str, ...] = static(default=(), about="dotted names of the parameters")
 
 
@@ -109,7 +111,9 @@ def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> 
     """
     wrong = sorted(set(model.names) ^ set(values))
     if wrong:
-        raise InputError(f"the parameters of this model are {', '.join(model.names)}: add or remove {wrong[0]}")
+        raise InputError(
+            f"the parameters of this model are {', '.join(model.names)}: add or remove the value of {wrong[0]}"
+        )
     product = jnp.ones(model.fields.shape[0], model.fields.dtype)
     for name, function, (low, high) in zip(model.names, model.functions, model.ranges, strict=True):
         value = jnp.asarray(values[name], model.fields.dtype)
@@ -144,7 +148,7 @@ def _names_and_limits(
         raise InputError(f"ranges has {len(ranges)} parameters: give 1 to {MOST_PARAMETERS}")
     if points < 2 or points ** len(ranges) > MOST_RUNS:
         raise InputError(
-            f"points = {points} needs {points ** len(ranges)} runs: give 2 points or more, and {MOST_RUNS} runs at most"
+            f"points = {points} needs {points ** len(ranges)} runs: give 2 points or more, but {MOST_RUNS} runs at most"
         )
     for name, limits in ranges.items():
         if np.ndim(numbers_at(scene, name)) != 0:
@@ -157,7 +161,7 @@ def _names_and_limits(
             check_numbers(with_parameters(scene, at))
         except InputError as error:
             where = ", ".join(f"{name} = {value:g}" for name, value in at.items())
-            raise InputError(f"ranges reach {where}: {error}") from None
+            raise InputError(f"the ranges contain {where}: {error}") from None
     return tuple(ranges), np.array([ranges[name] for name in ranges], float)
 
 
@@ -186,7 +190,8 @@ def _terms(
         shape: shape of the grid.
         tolerance, most: `tolerance` and `most_terms` of `separate`.
     """
-    # The runs are written in a basis of the space that they span. So each of N runs has at most N coordinates.
+    # The displacements of the N runs are written in a basis of the space that they span. So each run has at most N
+    # coordinates.
     U, S, _ = np.linalg.svd(known, full_matrices=False)
     data = U * S
     size, left = np.linalg.norm(data), data

@@ -39,7 +39,7 @@ class ReducedMotion(NamedTuple):
     velocity: jax.Array  # (n,) [m/s]
     acceleration: jax.Array  # (n,) [m/s^2]
     change: jax.Array  # change of the acceleration in the last step (n,) [m/s^2]
-    steady: jax.Array  # whether `change` is closer to the change of the step before than to 0
+    steady: jax.Array  # whether `change` is closer to the change in the step before than to 0
 
 
 class ReducedEquations(NamedTuple):
@@ -63,8 +63,8 @@ class ReducedEquations(NamedTuple):
 
 
 def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
-    """Return velocity and acceleration at the end of the step, for coordinates q (n,) [m] at this time. The formulas
-    are those of `liverjax.physics.inertia.Moving.kinematics`."""
+    """Return velocity and acceleration at the end of the step, for the n reduced coordinates q (n,) [m] at this time.
+    The formulas are those of `liverjax.physics.inertia.Moving.kinematics`."""
     assert e.motion is not None
     velocity = (q - e.q) / e.dt
     acceleration = (velocity - e.motion.velocity) / e.dt
@@ -77,19 +77,20 @@ def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
 
 
 def gradients_at(e: ReducedEquations, q: jax.Array) -> jax.Array:
-    """Return the deformation gradients (9, S) at the points for coordinates q (n,) [m]."""
+    """Return the deformation gradients (9, S) at the S points, for the n reduced coordinates q (n,) [m]."""
     return e.gradient + e.model.slopes @ q
 
 
 def _stresses(solid: Solid, F: jax.Array) -> jax.Array:
-    """Return the first Piola-Kirchhoff stress (9, S) [Pa] for deformation gradients F (9, S)."""
+    """Return the first Piola-Kirchhoff stress (9, S) [Pa] at S points with the deformation gradients F (9, S)."""
     return jnp.stack([jnp.broadcast_to(entry, F.shape[1:]) for row in solid.stress(as_matrix(F)) for entry in row])
 
 
 def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
     """Return the roundoff of the reduced forces due to a unit stretch along x, divided by the tolerance [N].
 
-    If there are no loads, residuals are divided by this force (see `liverjax.simulation.equations.Equations.noise`).
+    This force is added to the scale of the residuals, so that the scale is not 0 if there are no loads (see
+    `liverjax.simulation.equations.Equations.noise`).
     """
     own = solid_at_points(model, replace(scene, viscosity=None))
     assert isinstance(own, Elasticity)
@@ -100,14 +101,14 @@ def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _residual(e: ReducedEquations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return out-of-balance forces (n,) [N] and the size of all forces [N], for coordinates q (n,) [m] and their
-    deformation gradients F (9, S)."""
+    """Return out-of-balance forces (n,) [N] and the size of all forces [N], for the n reduced coordinates q (n,) [m]
+    and their deformation gradients F (9, S) at the S points."""
     P = _point_forces(e, F)
     return _unbalanced(e, q, P, _added_up(e, P))
 
 
 def _point_forces(e: ReducedEquations, F: jax.Array) -> jax.Array:
-    """Return the first Piola-Kirchhoff stress times the weight (9, S) [N m] of each point."""
+    """Return the first Piola-Kirchhoff stress times the weight of each of the S points, (9, S) [N m]."""
     P = _stresses(e.acting, F)
     if e.fluid is not None:
         p = pressure_coordinates(e.fluid, determinant(as_matrix(F)))
@@ -116,7 +117,7 @@ def _point_forces(e: ReducedEquations, F: jax.Array) -> jax.Array:
 
 
 def _added_up(e: ReducedEquations, P: jax.Array) -> jax.Array:
-    """Return the forces (n,) [N] on the modes, from stress times weight at the points (9, S)."""
+    """Return the forces (n,) [N] on the n modes, from stress times weight (9, S) [N m] at the S points."""
     return jnp.tensordot(P, e.model.slopes, axes=2)
 
 
@@ -125,8 +126,8 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
 
     Args:
         e: constants of the step.
-        q: coordinates (n,) [m].
-        P: stress times weight at the points (9, S) [N m].
+        q: the n reduced coordinates (n,) [m].
+        P: stress times weight at the S points (9, S) [N m].
         internal: forces of P on the modes (n,) [N].
     """
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
@@ -143,8 +144,8 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
 
 
 def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
-    """Return the derivative of the out-of-balance forces with respect to q. The function for the
-    stiffness between two nodes gives the moduli, with unit vectors instead of the gradients of shape functions."""
+    """Return the derivative of the out-of-balance forces with respect to q. The moduli are computed by the function for
+    the stiffness between nodes, with unit vectors instead of the gradients of shape functions."""
     F = gradients_at(e, q)
     blocks = e.acting.blocks(as_matrix(F), list(IDENTITY), _PAIRS)
     if e.fluid is not None:
@@ -192,8 +193,8 @@ class _ReducedIterate(NamedTuple):
     tangents: jax.Array  # number of computed tangents
 
 
-#: If an iteration reduces the residual to more than this fraction, a new tangent is computed. A tangent needs as much
-#: time as ten iterations.
+#: If the residual after an iteration is more than this fraction of the residual before, a new tangent is computed. A
+#: tangent needs as much time as ten iterations.
 _LITTLE_GAIN = 0.95
 #: If the error due to single precision exceeds this fraction of the tolerance, the forces are computed again in double
 #: precision.
@@ -201,8 +202,8 @@ _DOUBT = 0.1
 
 
 def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Array:
-    """Return the inverse tangent after an update: `change` (n,) [N] is the change of the forces due to the motion
-    `moved` (n,) [m].
+    """Return the updated inverse tangent (n, n) [m/N]. `change` (n,) [N] is the change of the forces on the n modes due
+    to the motion `moved` (n,) [m].
 
     This is the update of Broyden, Fletcher, Goldfarb and Shanno (1970), which keeps the inverse symmetric and positive
     definite. If the forces decrease along the motion, no positive definite inverse is possible, and the old inverse is
@@ -235,14 +236,15 @@ def _upright(F: jax.Array) -> jax.Array:
 
 
 def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
-    """Do one iteration with the present inverse, update the inverse with the new forces, and return the new iterate.
+    """Do one iteration with the current inverse tangent, update this inverse with the new forces, and return the new
+    iterate.
 
     The changes of deformation gradients and forces are small. So they are computed in single precision, which needs
     half the time.
     """
     dq = at.inverse @ at.r
     dF = (e.light.slopes @ dq.astype(jnp.float32)).astype(dq.dtype)
-    # The correction is halved until no sampled point is inverted, at most six times.
+    # The correction is halved until the volume ratio is positive at all points, at most six times.
     part = jax.lax.while_loop(
         lambda part: (part > 0.02) & ~_upright(at.F - part * dF), lambda part: 0.5 * part, jnp.ones((), dq.dtype)
     )
@@ -256,7 +258,7 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
     lost = float(jnp.finfo(jnp.float32).eps) * e.steepest * jnp.linalg.norm(change) * size
     rounded = at.rounded + lost / jnp.maximum(jnp.linalg.norm(r), jnp.finfo(r.dtype).tiny)
     inverse = _updated(at.inverse, -part * dq, r - at.r)
-    # With an old inverse, |r| may increase. Then the iteration is rejected.
+    # With the inverse of an earlier tangent, the norm of r may increase. Then the iteration is rejected.
     before, after = jnp.linalg.norm(at.r), jnp.linalg.norm(r)
     good = at.fresh | (after < before)
     no = jnp.array(False)
@@ -276,7 +278,7 @@ def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, i
         most: maximum number of tangents that are computed.
         e: constants of the step.
         tolerance: maximum relative residual.
-        inverse: inverse tangent of the previous step (n, n) [m/N]; zeros in the first step.
+        inverse: inverse tangent of the previous step for n modes (n, n) [m/N]; zeros in the first step.
     """
     arrays, tree = jax.tree.flatten((e, tolerance, inverse))
 
@@ -334,8 +336,8 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
 
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
-        # The coordinates are predicted by a parabola or a cubic through the last coordinates: by the one that would
-        # have predicted the last step better. Accelerations of Newmark's method oscillate, so they are not used here.
+        # The coordinates are predicted by a parabola or a cubic through the last coordinates. The one that would have
+        # predicted the last step better is used. Newmark's accelerations oscillate, so they are not used here.
         more = jnp.where(e.motion.steady, e.motion.change, 0.0)
         start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = gradients_at(e, start), jnp.zeros((), jnp.int32)
@@ -346,11 +348,11 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     begin = _ReducedIterate(start, F, F, e.q, e.q, zero, zero, inverse, no, no, none, none)
     begin = _in_double_precision(e, begin)
     at = inner(begin)
-    # If the iterations with the old inverse do not converge, the iterations begin again at the prediction.
+    # If the iterations with the inverse of an earlier tangent do not converge, they begin again at the prediction.
     begin = begin._replace(iterations=at.iterations)
     at = jax.tree.map(lambda old, new: jnp.where(at.size > tolerance, new, old), at, begin)
     at = jax.lax.while_loop(unfinished, lambda at: inner(refreshed(at)), at)
-    # One more correction of q needs no new forces.
+    # The coordinates q are corrected once more, because this needs no new forces.
     return _Found(at.q - at.inverse @ at.r, at.size, at.iterations, at.inverse)
 
 

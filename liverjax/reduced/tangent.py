@@ -13,9 +13,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-#: LEFT: the corrections end if the relative residual is at most this. CORRECTIONS: maximum number of corrections.
+#: LEFT: the corrections end if the relative residual is at most this value. CORRECTIONS: maximum number of corrections.
 LEFT, CORRECTIONS = 1e-12, 20
-#: If the relative residual after the corrections is above this, K is assembled and factorised in double precision.
+#: If the relative residual after the corrections is above this value, K is assembled and factorised in double
+#: precision.
 TOO_FAR = 1e-10
 
 
@@ -28,7 +29,7 @@ class SinglePrecision(NamedTuple):
 
 
 class ReducedTangent(NamedTuple):
-    """The arrays B, A and R of the tangent (n, n) [N/m] (module docstring)."""
+    """The arrays B, A and R of the tangent (n, n) [N/m] (module docstring), for n modes and S points."""
 
     slopes: jax.Array  # B: gradients of the modes (9, S, n) [1/m]
     moduli: jax.Array  # A: moduli times weights (9, 9, S) [N m]
@@ -36,32 +37,32 @@ class ReducedTangent(NamedTuple):
 
 
 def in_single_precision(slopes: jax.Array) -> SinglePrecision:
-    """Return the gradients of the modes (9, S, n) in single precision."""
+    """Return the gradients of the n modes at the S points (9, S, n) [1/m] in single precision."""
     light = jax.lax.stop_gradient(slopes).astype(jnp.float32)
     return SinglePrecision(light, light.reshape(-1, light.shape[-1]).T)
 
 
 def tangent_times(K: ReducedTangent, x: jax.Array) -> jax.Array:
-    """Return the product K x (n,) [N] of the tangent and x (n,) [m]."""
+    """Return the product K x (n,) [N] of the tangent K and the n reduced coordinates x (n,) [m]."""
     stress = jnp.sum(K.moduli * (K.slopes @ x)[None], axis=1)
     return jnp.tensordot(stress, K.slopes, axes=2) + K.rest @ x
 
 
 def tangent_matrix(K: ReducedTangent) -> jax.Array:
-    """Return the assembled tangent K (n, n) [N/m]."""
+    """Return the tangent K of n modes as an assembled matrix (n, n) [N/m]."""
     AB = jnp.sum(K.moduli[..., None] * K.slopes[None], axis=1)
     return jnp.tensordot(K.slopes, AB, axes=((0, 1), (0, 1))) + K.rest
 
 
 def near_inverse(K: ReducedTangent, light: SinglePrecision) -> jax.Array:
-    """Return an approximate inverse (n, n) [m/N] of the tangent K. The matrix is assembled in single precision."""
+    """Return an approximate inverse (n, n) [m/N] of the tangent K of n modes. K is assembled in single precision."""
     AB = jnp.sum(K.moduli.astype(jnp.float32)[..., None] * light.slopes[None], axis=1)
     near = light.flat @ AB.reshape(-1, AB.shape[-1])
     return jnp.linalg.inv(near.astype(K.rest.dtype) + K.rest)
 
 
 def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -> jax.Array:
-    """Return the accurate solution x (n,) [m] of K x = b. The function may be differentiated."""
+    """Return the accurate solution x (n,) [m] of K x = b, with n unknowns. The function may be differentiated."""
 
     def solve(_: object, b: jax.Array) -> jax.Array:
         near, limit = near_inverse(K, light), jnp.linalg.norm(b)
@@ -69,7 +70,7 @@ def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -
         def going(at: tuple) -> jax.Array:
             _, r, before, count = at
             size = jnp.linalg.norm(r)
-            # The corrections end if one does not halve r: r is then roundoff, or the inverse is not accurate enough.
+            # The corrections end if the last one did not halve r. Then r is roundoff, or the inverse is not accurate.
             return (size > LEFT * limit) & (size < 0.5 * before) & (count < CORRECTIONS)
 
         def corrected(at: tuple) -> tuple:

@@ -54,8 +54,8 @@ def reduce_scene(
         point_tolerance: the reduced forces are converted to motions; the sampled points may neglect this fraction of
             the motions [1]. Default: `tolerance`.
         runs: number of full runs. Two thirds of these runs use the first rows, and a first reduced model is made from
-            these runs. The other runs use those of the remaining rows for which this model has the largest corrections,
-            relative to the displacements. Default: all rows.
+            these runs. The other runs use the remaining rows for which this model has the largest corrections, relative
+            to the displacements. Default: all rows.
 
     Raises:
         InputError: the scene has entries that reduced models do not support; a tolerance is not between 0 and 1; no run
@@ -122,8 +122,8 @@ def _model_of(scene: Scene, runs: _Runs, tolerance: float, most_modes: int, poin
 
 
 def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -> tuple[jax.Array, np.ndarray]:
-    """Return modes (m, V) [1] of the pressures P (R, T, V) [Pa], and the coordinates (R, T, m) [Pa] of P in these
-    modes. The number m of modes is at most half of `most`."""
+    """Return m modes (m, V) [1] of the pressures P (R, T, V) [Pa] in R runs, and the coordinates (R, T, m) [Pa] of P in
+    these modes. The number m of modes is at most half of `most`."""
     volumes = np.asarray(integrals(scene.mesh, jnp.ones_like(scene.mesh.weights)))
     modes = proper_modes(P.reshape(-1, P.shape[-1], 1), volumes, tolerance)[: max(1, most // PRESSURES), :, 0]
     return jnp.asarray(modes), (P * volumes) @ modes.T
@@ -141,8 +141,8 @@ def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction |
 def _coordinates_of_rows(
     model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Run the reduced model once for each of the R parameter sets. Return the reduced coordinates (R, T, n) [m], and
-    for each run whether it failed (R,)."""
+    """Run the reduced model once for each of R parameter sets. Return the n reduced coordinates (R, T, n) [m], and for
+    each run whether it failed (R,)."""
 
     def run(model: ReducedModel, values: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
         found = simulate_reduced(model, with_parameters(scene, values))
@@ -170,8 +170,8 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
 
 
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return modes (n, V, c): their combinations approximate the fields u (N, V, c) with a relative error of at most
-    `tolerance`.
+    """Return n modes (n, V, c). Linear combinations of these modes approximate the N fields u (N, V, c), which have c
+    components, with a relative error of at most `tolerance`.
 
     The error is a root mean square with the weights `volumes` (V,), the volumes of the nodes.
     """

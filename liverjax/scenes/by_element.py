@@ -18,7 +18,7 @@ from liverjax.tensors.subsets import subsets
 
 
 def by_element(scene: Scene) -> Scene:
-    """Return the scene without regions. A parameter that a region changes becomes an array (E,)."""
+    """Return the scene without regions. A parameter that a region changes gets one value per element."""
     mesh, law, prony, sponge = scene.mesh, scene.law, scene.viscosity, scene.porosity
     if scene.region:
         law = law_of_elements(law, scene.region, mesh.number_of_elements)
@@ -51,7 +51,7 @@ def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: i
 
 
 def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_elements: int) -> Prony:
-    """Return the Prony series of the body.
+    """Return the Prony series of the body, with the changes in its regions.
 
     If a region changes the series, ratios and times have one value per mode and element, (N, E) with N modes.
     """
@@ -78,7 +78,7 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
     """Return the porosity of the body. A parameter that a region changes has one value per element.
 
-    Its shape is (E,), or (1, E) if elements have several integration points.
+    The values of such a parameter have the shape (E,), or (1, E) if the elements have several integration points.
     """
     found: Content = {}
     for region in regions:

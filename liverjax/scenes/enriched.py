@@ -17,7 +17,7 @@ from liverjax.scenes.scene import Scene
 
 
 def enriched(scene: Scene) -> Scene:
-    """Return the scene with quadratic or cubic elements (`liverjax.mesh.promotion`). Numbers may be JAX tracers."""
+    """Return the scene with quadratic or cubic elements (`liverjax.mesh.promotion`). Its numbers may be JAX tracers."""
     return _quadratic_mesh(scene) if scene.mesh.order == 1 else _cubic(scene)
 
 
@@ -71,7 +71,7 @@ def _cubic(scene: Scene) -> Scene:
 
 
 def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """Return the density for all shape functions. For a new one, it is the mean density of the elements around it."""
+    """Return the density for all shape functions. A new function gets the mean density of its elements."""
     nodes = jnp.stack(mesh.element_nodes)
     own = jnp.broadcast_to(jnp.mean(density[mesh.tetrahedra], axis=1), nodes.shape)
     total, count = (jnp.zeros(mesh.number_of_nodes).at[nodes].add(each) for each in (own, 1.0))
@@ -79,7 +79,7 @@ def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _with_faces(mesh: TetMesh, load: Traction) -> Traction:
-    """Add the face number to each triangle of a load, because the shape function of the face has a part of the load."""
+    """Add the face number to each triangle of a load. A part of the load acts on the shape function of the face."""
     triangles = np.asarray(load.triangles)
     faces = promotion.face_numbers(mesh, triangles)
     return replace(load, triangles=node_numbers(np.column_stack([triangles, faces])))

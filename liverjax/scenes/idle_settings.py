@@ -43,6 +43,6 @@ def refuse_idle(content: Content) -> None:
             raise InputError(f"[{place}] {key} cannot be used with [solve] kind = 'harmonic': remove this key")
     if motion == "harmonic" and content.get("body", {}).get("mass") == "lumped":
         raise InputError(
-            "[body] mass = 'lumped' cannot be used with [solve] kind = 'harmonic', which has consistent masses: remove "
-            "mass, or call lj.harmonic(scene, mass='lumped')"
+            "[body] mass = 'lumped' cannot be used with [solve] kind = 'harmonic', which uses consistent masses: "
+            "remove mass, or call lj.harmonic(scene, mass='lumped')"
         )

@@ -31,8 +31,8 @@ from liverjax.scenes.scene import Scene
 from liverjax.tensors.subsets import subsets
 
 T = TypeVar("T")
-#: Error of a run, divided by the change of its result on the refined mesh. For second-order convergence, the error on
-#: the refined mesh is 1/4 of the error of the run.
+#: Error of a run, divided by the difference between its result and the result on the refined mesh. For second-order
+#: convergence, the error on the refined mesh is 1/4 of the error of the run.
 REFINED = 4 / 3
 
 
@@ -77,7 +77,8 @@ def can_be_refined(scene: Scene) -> bool:
 
 
 def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
-    """Return the scene with every element cut into eight of the same order, and the positions of the new nodes.
+    """Return (scene, within): the scene with every element cut into eight elements of the same order, and the positions
+    of the nodes of the refined mesh in the old mesh.
 
     Numbers of the scene may be unknown (inside jit, grad or vmap), but node numbers must be known.
 
@@ -128,7 +129,7 @@ def _mesh_and_within(old: TetMesh) -> tuple[TetMesh, Within]:
 
 
 def _with_nodes_between(old: TetMesh, mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Return n nodes (n,) of the old mesh and the new nodes between them, on the same faces or edges of the body."""
+    """Return the numbers `nodes`, and those of the new nodes between them on the same faces or edges of the body."""
     found = np.concatenate([nodes, np.setdiff1d(middles_of_places(old, nodes), nodes)])
     if mesh.order == 1:
         return found
@@ -161,7 +162,7 @@ def _law_of_parts(E: int, law: Law) -> Law:
 def _series(E: int, prony: Prony | None) -> Prony | None:
     """Return the Prony series for the refined mesh.
 
-    The values (N, E) of an element are repeated for its eight parts.
+    Values (N, E) of N modes for each element are repeated for the eight parts of the element.
     """
     if prony is None:
         return None

@@ -29,7 +29,9 @@ class Region:
         "names of parameters without `law.` (`mu`, `mu.0`, or `1.mu` of several laws) -> values; or another law",
         default=None,
     )
-    viscosity: Mapping[str, Numbers] | None = param("1", "`ratios` or `relaxation_times` or both -> (N,)", default=None)
+    viscosity: Mapping[str, Numbers] | None = param(
+        "1", "`ratios`, `relaxation_times` or both -> values (N,) of N modes", default=None
+    )
     porosity: Mapping[str, Numbers] | None = param(
         "1", "`bulk`, `limit_bulk`, `fluid_fraction`, `permeability` -> values", default=None
     )

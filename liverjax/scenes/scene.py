@@ -43,12 +43,12 @@ class Body:
     history: Numbers | None = param(
         "1", "factors (T,) that multiply gravity, or gravity itself (T, 3) [m/s^2]", default=None
     )
-    mass: str = static(default="lumped", about="mass for inertia: lumped at the nodes, or consistent, as the weight")
+    mass: str = static(default="lumped", about="mass for inertia: lumped, or consistent (as in the weight)")
 
 
 @struct
 class Solve:
-    """How the scene is solved.
+    """Settings of the solution of a scene.
 
     New values of time step, tolerances and frequencies use the same compiled program. A change of any other setting
     compiles a new program.
@@ -99,7 +99,7 @@ class Solve:
 
 @struct
 class Scene:
-    """Input of `simulate`. Entries that are missing are None or empty. They need no computing time."""
+    """Input of `simulate`. Missing entries are None or empty tuples, and need no computing time."""
 
     mesh: TetMesh = param("1", "the body")
     law: Law = param("1", "its hyperelastic law")

@@ -37,7 +37,7 @@ def check_before_run(scene: Scene) -> None:
 
 
 def check_time_and_mass(scene: Scene) -> None:
-    """Check that the scene has a time step and a mass if they are needed. Their values are not checked.
+    """Check that the scene has a time step and a mass if they are needed. The values are not checked.
 
     Raises:
         InputError: `dt` is missing, but viscosity, porosity, a history or dynamics needs it; or the mass is missing in
@@ -62,7 +62,9 @@ def check_time_and_mass(scene: Scene) -> None:
 
 
 def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
-    """Check that a run can begin with the objects in `scene.physics` (supports, obstacles, …). Not for use inside jit.
+    """Check that a run can begin with the objects in `scene.physics` (supports, obstacles, …).
+
+    Do not call this function inside jit.
 
     Args:
         scene: `Scene`.
@@ -79,7 +81,7 @@ def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
 
 
 def check_scene(scene: Scene) -> None:
-    """Check that a scene can be simulated, before anything is compiled. Not for use inside jit.
+    """Check that a scene can be simulated, before anything is compiled. Do not call this function inside jit.
 
     Raises:
         InputError: for example, a number is out of bounds, the mesh cannot be used, time step or mass is missing,

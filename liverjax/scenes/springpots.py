@@ -25,7 +25,7 @@ from liverjax.physics.viscosity import PARTS, Prony, check_part
 
 @struct
 class SpringpotSeries:
-    """K springpots: their complex modulus, divided by the modulus of the law. Only for harmonic motion."""
+    """Complex modulus of K springpots, divided by the modulus of the law. It can be used only in harmonic motion."""
 
     times: Any = param("s", "tau_k (K,): at omega = 1/tau_k a springpot is as stiff as the law", above=0.0)
     exponents: Any = param("1", "alpha_k (K,): 0 is a spring, 1 a dashpot", lower=0.0, upper=1.0)
@@ -42,7 +42,7 @@ class SpringpotSeries:
 
 
 def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) -> None:
-    """Check that the springpots define a modulus. Not for use inside jit.
+    """Check that the springpots define a modulus. Do not call this function inside jit.
 
     Raises:
         InputError: the lists differ in length, a value is out of bounds, `part` is unknown, the law does not have this
@@ -54,8 +54,8 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
     shapes = {np.shape(a) for a in (own.times, own.exponents, own.limits) if a is not None}
     if len(shapes) != 1 or len(np.shape(own.times)) != 1:
         raise InputError(
-            "the lists times, exponents and limits of [springpots] differ in length: give one number of each list per "
-            "springpot"
+            "times, exponents and limits of [springpots] must be lists of equal lengths: give one number of each list "
+            "per springpot"
         )
     check_part(own.part, law, "springpots")
 

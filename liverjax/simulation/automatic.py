@@ -3,9 +3,9 @@
 "auto" chooses a factorisation for a static body of at most 10,000 tetrahedra (a quadratic element counts as eight) in
 two cases. In the first case the bulk modulus is more than a thousand times the shear modulus. For at most 1,500
 tetrahedra, a ratio of a hundred is enough: in Newton's method the stiffness of such bodies has negative eigenvalues,
-and a factorisation can solve such systems. In the second case the worst element is a sliver. A body is never factorised
-if it has friction, nodes that move together, follower pressures, or pressures as unknowns. In all other cases "auto"
-chooses conjugate gradients. These limits were measured in `experiments/`.
+and a factorisation can solve such systems. In the second case the worst element is a sliver. "auto" never chooses a
+factorisation if the body has friction, nodes that move together, follower pressures, or pressures as unknowns. In all
+other cases "auto" chooses conjugate gradients. The limits come from tests in `experiments/`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,13 +20,16 @@ from liverjax.scenes.checks.choices import check_choices
 from liverjax.scenes.scene import Scene, with_parameters
 
 LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
-#: Maximum number of elements of a small body. It is factorised if its bulk modulus is more than `STIFFEST_OF_SMALL`
-#: times its shear modulus.
+#: A body with at most `SMALL` elements is small. "auto" chooses a factorisation for a small body if its bulk modulus is
+#: more than `STIFFEST_OF_SMALL` times its shear modulus.
 SMALL, STIFFEST_OF_SMALL = 1500, 1e2
 
 
 def chosen(scene: Scene) -> Scene:
-    """Replace each "auto" in `scene.solve` by a choice: first the form of volume changes, then the linear solver."""
+    """Replace each "auto" in `scene.solve` by a choice: first for `volumetric`, then for `linear_solver`.
+
+    If `newton_iterations` is 1, `newton` is set to "one_step".
+    """
     solve = _with_form(scene).solve
     if solve.newton_iterations == 1:
         solve = replace(solve, newton="one_step")
@@ -39,11 +42,12 @@ def with_solver(scene: Scene, rows: Iterable[Mapping[str, object]]) -> Scene:
     """Choose one linear solver for all parameter sets, because one compiled program runs all of them.
 
     Inside the compiled program the numbers are unknown. So "direct" is chosen here if any parameter set needs it.
-    Otherwise "auto" stays.
+    Otherwise `linear_solver` stays "auto".
 
     Args:
         scene: `Scene`.
-        rows: parameter sets, each with dotted names -> numbers (see `with_parameters`). Unknown numbers are ignored.
+        rows: parameter sets, each with dotted names -> numbers (see `with_parameters`). Numbers that are unknown
+            inside jit, grad or vmap are ignored.
     """
     direct = replace(scene, solve=replace(scene.solve, linear_solver="direct"))
     if scene.solve.linear_solver != "auto" or not _may_factorise(_with_form(scene)):
@@ -62,12 +66,12 @@ def _with_form(scene: Scene) -> Scene:
 
 
 def linear_solver(scene: Scene) -> str:
-    """Return the linear solver for a scene, "cg" or "direct". Inside jit, grad or vmap numbers are unknown: "cg"."""
+    """Return the linear solver for a scene: "direct" or "cg". It is "cg" if numbers are unknown (as in jit)."""
     return "direct" if _may_factorise(scene) and (_is_stiff(scene) or _is_thin(scene)) else "cg"
 
 
 def _may_factorise(scene: Scene) -> bool:
-    """Whether size and physics allow a factorisation. Moduli and shape are not considered."""
+    """Whether the number of elements and the physics allow a factorisation. Moduli and element shapes do not count."""
     solve = scene.solve
     if solve.volumetric == "mixed" or any(physics.ties for physics in scene.physics):
         return False
@@ -78,12 +82,12 @@ def _may_factorise(scene: Scene) -> bool:
 
 
 def _size(scene: Scene) -> int:
-    """Number of elements; a quadratic element counts as eight, since it has about eight times the unknowns."""
+    """Number of elements; a quadratic element counts as eight, since it has about eight times as many unknowns."""
     return scene.mesh.number_of_elements * (1 if scene.mesh.order == 1 else 8)
 
 
 def _is_stiff(scene: Scene) -> bool:
-    """Whether the bulk modulus is far above the shear modulus. Returns False inside jit, grad or vmap (unknown)."""
+    """Whether the bulk modulus is far above the shear modulus. Returns False if the moduli are unknown (as in jit)."""
     try:
         shear = scene.law.shear_modulus()
         bulk = scene.law.bulk_modulus() if scene.porosity is None else scene.porosity.limit_bulk
@@ -96,7 +100,7 @@ def _is_stiff(scene: Scene) -> bool:
 
 
 def _is_thin(scene: Scene) -> bool:
-    """Whether an element is a sliver. Returns False inside jit, grad or vmap (points unknown)."""
+    """Whether any element is a sliver. Returns False if the points are unknown (inside jit, grad or vmap)."""
     points, volumes = scene.mesh.points, scene.mesh.volumes
     if isinstance(points, jax.core.Tracer) or isinstance(volumes, jax.core.Tracer):
         return False
@@ -105,9 +109,10 @@ def _is_thin(scene: Scene) -> bool:
 
 
 def form_of_volumes(scene: Scene) -> str:
-    """Return the form of the volume changes: "mixed" for quadratic elements if possible, otherwise "element".
+    """Return the scene's setting `volumetric`, the form of the volume changes.
 
-    The choice does not depend on numbers, since a run and its derivatives must use the same form.
+    The setting "auto" becomes "mixed" for quadratic elements if possible, otherwise "element". This choice does not
+    depend on numbers, since a run and its derivatives must use the same form.
     """
     name = scene.solve.volumetric
     if name != "auto":
@@ -127,7 +132,8 @@ def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) ->
 
 
 def qualities(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> np.ndarray:
-    """Quality (E,) of elements: volume divided by that of a regular element with the same mean squared edge length."""
+    """Quality (E,) of elements: volume, divided by the volume of a regular tetrahedron with the same mean squared edge
+    length."""
     corners = points[tetrahedra]
     edges = np.stack([corners[:, a] - corners[:, b] for a in range(4) for b in range(a)], axis=1)
     length = np.sqrt(np.mean(np.sum(edges**2, axis=2), axis=1))

@@ -1,8 +1,8 @@
 """Many runs of one scene with different parameters, in one compiled program on all devices of the process.
 
-Each run of the batch has one parameter set. On a CPU each device does one run after another. Steps of several runs at
-once (vmap) would be slower on a CPU, because every loop would wait for the slowest run. On a GPU each device does all
-of its runs at once.
+Each run of the batch has one parameter set. On a CPU each device does one run after another. Several runs at once
+(vmap) would be slower on a CPU, because every loop would wait for the slowest run. On a GPU each device does all of its
+runs at once.
 """
 
 from typing import Any
@@ -54,9 +54,9 @@ def simulate_batch(
         devices: devices that share the runs; None: all devices of the process.
 
     Raises:
-        InputError: there are no parameters; the numbers of values differ; the scene does not have one of the names;
-            "vmap" is used with robust steps on a CPU. Also if `simulate` would raise InputError for a parameter set;
-            the message then begins with the number of this set.
+        InputError: there are no parameters; two parameters have different numbers of values; the scene does not have
+            one of the names; "vmap" is used with robust steps on a CPU; or `simulate` would raise InputError for a
+            parameter set (the message then begins with the number of this set).
     """
     devices = jax.local_devices() if devices is None else devices
     strategy = strategy_for(devices[0].platform) if strategy is None else strategy
@@ -116,7 +116,8 @@ def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[
     """Check the numbers of each parameter set and return the sets, or an empty list inside jit, grad or vmap.
 
     Raises:
-        InputError: `simulate` would raise InputError for a parameter set. The message begins with its number.
+        InputError: `simulate` would raise InputError for a parameter set. The message begins with the number of the
+            set.
     """
     if any(isinstance(value, jax.core.Tracer) for value in parameters.values()):
         return []

@@ -1,4 +1,4 @@
-"""Warnings about a run, computed after the run. The functions return a list of warnings, which may be empty."""
+"""Warnings about a run, computed after the run. Most functions return a list of warnings, which may be empty."""
 
 from functools import partial
 
@@ -32,16 +32,16 @@ from liverjax.simulation.automatic import qualities
 from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result
 
-#: No organ is longer than this [m]. If millimetres are read as centimetres, a liver is 2 m long.
+#: No organ is longer than this [m]. If millimetres are read as centimetres, a liver seems to be 2 m long.
 LONGEST = 1.0
-#: No organ and no sample is shorter than this [m]. If metres are read as millimetres, a liver is 0.2 mm long.
+#: No organ and no sample is shorter than this [m]. If metres are read as millimetres, a liver seems to be 0.2 mm long.
 SHORTEST = 1e-3
 #: A displacement that is not larger than this fraction of the body's size counts as zero.
 _ROUNDOFF = 1e-13
 #: Elements with a quality (see `qualities`) below this value are slivers: gradients there are 100 times less accurate.
 SLIVER = 0.01
-#: Bounds of the volume ratio J. About four fifths of a soft tissue is fluid, so below `LEAST_J` even the solid part has
-#: too little space. `MOST_J` is 1/`LEAST_J`.
+#: Bounds of the volume ratio J of an element. About four fifths of a soft tissue is fluid, so below `LEAST_J` not even
+#: the solid part would have enough space. `MOST_J` is 1/`LEAST_J`.
 LEAST_J, MOST_J = 0.2, 5.0
 
 
@@ -70,7 +70,7 @@ _SMALL = 0.02
 
 
 def mesh_sentence(scene: Scene, result: Result) -> str:
-    """Return a sentence about the mesh error of the positions at the last step, with a remedy if it is large."""
+    """Return a sentence about the mesh error of the positions at the last step, with a remedy if the error is large."""
     assert result.mesh_error is not None
     if np.asarray(result.status)[-1] not in (status.CONVERGED, status.ONE_STEP):
         return "the mesh error is unknown, because the last step failed"
@@ -101,7 +101,7 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
 
 
 def _pressure_errors(result: Result) -> tuple[str, str]:
-    """Return two additions to the sentence about the mesh error: what it omits, and the error of the pressures."""
+    """Return two additions to the result of `mesh_sentence`: which error it omits, and the error of the pressures."""
     if result.pressure is None or result.mesh_error is None:
         return "", ""
     if result.mesh_error.pressure is None:
@@ -150,7 +150,7 @@ _LOCKING = 100.0
 
 
 def of_locking(scene: Scene) -> list[str]:
-    """Warn if quadratic elements are too stiff (lock) although they would not be with volumetric = "mixed"."""
+    """Warn if quadratic elements are too stiff (lock). With volumetric = "mixed" they would not lock."""
     if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
         return []
     try:
@@ -171,7 +171,7 @@ _RESTS = 5.0
 
 
 def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
-    """Warn if a static run from a loaded shape ends before the stress has relaxed."""
+    """Warn if a static run that begins at a given loaded shape ends before the viscous stress has relaxed."""
     if scene.points_are != "loaded" or scene.viscosity is None or scene.solve.kind != "static":
         return []
     own, lasts = by_element(scene).viscosity, float(result.times[-1])
@@ -189,7 +189,8 @@ def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
 def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
     """Warn if the kinetic energy of a body under constant loads exceeds the work of these loads.
 
-    Newmark's method conserves energy only in small motions. If a step is as long as a period, large motions can grow.
+    Newmark's method conserves energy only in small motions. If a time step is as long as a period of the motion, large
+    motions can grow.
     """
     body, solve = scene.body, scene.solve
     if solve.kind != "dynamic" or solve.integrator != "newmark" or body is None or body.mass != "lumped":
@@ -210,13 +211,17 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
     k = int(np.argmax(moving > given + 1e-3 * np.abs(work).max()))
     return [
         f"from {float(np.asarray(result.times)[k]):.4g} s on, the kinetic energy of the body exceeds the work of its "
-        "loads. With Newmark's method, large motions grow if a step is as long as a period. Use a step of a twentieth "
-        "of the period, or integrator = 'euler'"
+        "loads. With Newmark's method, large motions grow if dt is as long as a period of the motion. Use a dt of at "
+        "most a twentieth of this period, or integrator = 'euler'"
     ]
 
 
 def _gives_no_energy(physics: Physics) -> bool:
-    """Whether an object of `scene.physics` without a history stores no energy at the beginning, and adds no energy."""
+    """Whether a physics object (support, obstacle, …) without a history is passive.
+
+    A passive object stores no energy at the beginning of the run. Later it gives the body only energy that it has taken
+    from the body.
+    """
     if isinstance(physics, Obstacle):
         return not isinstance(physics, PressedObstacle) and physics.by is None
     if isinstance(physics, RigidPlate):
@@ -224,7 +229,8 @@ def _gives_no_energy(physics: Physics) -> bool:
     return isinstance(physics, SlidingSupport | ElasticSupport | Membrane)
 
 
-#: No warning if the depth between contact points is below this fraction of the approach (see `missed_depth`).
+#: A warning is given if the depth of the obstacle between the contact points exceeds this fraction of its approach (see
+#: `missed_depth`).
 BETWEEN = 0.25
 
 
@@ -247,7 +253,7 @@ def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, m
     """Warn if the obstacle, displaced by `moved` (T + 1, 3) from step 0 on, passed the surface within a step."""
     ways, radius = np.linalg.norm(np.diff(moved, axis=0), axis=1), float(np.asarray(obstacle.radius))
     centres, axis = np.asarray(obstacle.position, float) + moved, np.asarray(obstacle.axis, float)
-    if obstacle.shape == "cylinder":  # a motion along its axis does not count
+    if obstacle.shape == "cylinder":  # a motion of a cylinder along its axis does not count
         ways = np.linalg.norm(np.diff(moved - np.outer(moved @ axis, axis), axis=0), axis=1)
     for k in np.flatnonzero(ways > radius) if radius > 0 else []:
         before = scene.mesh.points if k == 0 else result.positions[k - 1]
@@ -282,7 +288,7 @@ def _of_contacts(scene: Scene, result: Result) -> list[str]:
 
 
 def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
-    """Warn if a static run failed and only friction supports the body, since the body may slide."""
+    """Warn if a static run failed and only friction prevents sliding of the body, or of a separate piece of it."""
     rough = any(isinstance(physics, RoughObstacle) for physics in scene.physics)
     fine = (status.CONVERGED, status.ONE_STEP, status.STALLED)
     if not rough or scene.solve.kind != "static" or np.isin(result.statistics.status, fine).all():
@@ -295,17 +301,18 @@ def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
     if not loose:
         return []
     return [
-        f"the run failed, and only friction prevents sliding of {loose}: if friction is too small for the sideways "
-        "loads, no equilibrium exists; use a larger friction, [[fixed]], or kind = 'dynamic'"
+        f"the run failed, and only friction prevents sliding of {loose}: if the friction is too small for the sideways "
+        "loads, no equilibrium exists; use a larger friction coefficient, [[fixed]], or kind = 'dynamic'"
     ]
 
 
-#: The scheme counts as unstable if the pressure changes over one step, divided by those over two, exceed this value.
+#: The lagged scheme counts as unstable if the sum of all pressure changes over one step exceeds this multiple of the
+#: sum of all pressure changes over two steps.
 ALTERNATING = 3.0
 
 
 def _of_pressures(scene: Scene, result: Result) -> list[str]:
-    """Warn if pressures overshoot, if elements at drained nodes are too thick, or if "lagged" steps are unstable."""
+    """Warn if pressures overshoot, if elements at drained nodes are too thick, or if scheme = "lagged" is unstable."""
     if scene.porosity is None or result.pressure is None:
         return []
     P = np.asarray(result.pressure)
@@ -326,7 +333,10 @@ def _of_pressures(scene: Scene, result: Result) -> list[str]:
 
 
 def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
-    """Median height [m] of the elements `at` over the face whose corners are true in `faces` (E, 4)."""
+    """Median height [m] of the elements with numbers `at`. The height is measured from one face of each element.
+
+    In `faces` (E, 4), the corners of this face are true.
+    """
     corners = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)[at]]
     base = corners[faces[at]].reshape(-1, 3, 3)
     area = 0.5 * np.linalg.norm(np.cross(base[:, 1] - base[:, 0], base[:, 2] - base[:, 0]), axis=1)
@@ -334,7 +344,9 @@ def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
 
 
 def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
-    """Warn if the layer that drains in `seconds` is thinner than the elements there; `when` is the time in words.
+    """Warn if the layer that drains in `seconds` is thinner than the elements at the drained nodes.
+
+    `when` is the beginning of the message: the time in words.
 
     In a time t, a layer of the thickness sqrt(c t) drains, with the diffusivity c = kappa / (1/K_lim + 1/M) (Biot
     1941). kappa is the permeability, and 1/K_lim is the storage (see `liverjax.physics.porosity`). M = K0 + 4/3 mu,
@@ -429,9 +441,9 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
 
 
 def _of_volumes(scene: Scene, result: Result) -> list[str]:
-    """Warn about elements with a volume ratio J below `LEAST_J` or above `MOST_J` at any step."""
+    """Warn about elements whose volume ratio J is below `LEAST_J` or above `MOST_J` at any step."""
     said = []
-    # Positions may be in single precision; the mesh is in double precision.
+    # The positions may be in single precision, so they are converted to the precision of the mesh (double).
     positions = jnp.asarray(result.positions, scene.mesh.points.dtype)
     found = [np.asarray(a) for a in compiled(_extremes, scene.mesh, positions)(scene.mesh, positions)]
     kinds = ((np.less, LEAST_J, "shrank below"), (np.greater, MOST_J, "grew above"))

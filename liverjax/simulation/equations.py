@@ -1,4 +1,7 @@
-"""The equations of one load or time step: sums over the force terms of the scene's physics."""
+"""The equations of one load step or time step: the sum of all force terms is 0 in the free directions.
+
+Each physics object of the scene (elasticity, loads, contact, viscosity …) has at most one force term.
+"""
 
 from typing import Any, NamedTuple
 
@@ -24,7 +27,7 @@ from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient
 class State(NamedTuple):
     """The state between two steps."""
 
-    x: jax.Array  # (V, 3) [m]
+    x: jax.Array  # (V, 3) [m] positions
     memories: tuple  # internal variables of each physics object, in order; None if it has no such variables
 
 
@@ -44,7 +47,7 @@ class Equations(NamedTuple):
     state: State  # state at the beginning of the step
     k: Number  # number of the step, from 1
     free: Free
-    noise: Number  # [N] added to the force scale of the tolerance, so that an unloaded body converges despite roundoff
+    noise: Number  # [N] added to the sum of all force norms in the tolerance, so that an unloaded body converges
     roundoff: jax.Array  # [N] norm of the nodal forces due to roundoff of the positions
     moved: tuple[jax.Array, jax.Array] | None  # (V, 3) [m] prescribed displacements before and after the step
 
@@ -84,7 +87,7 @@ class Forces(NamedTuple):
 
     internal: jax.Array  # (V, 3) [N] forces from the stress in the elements
     nodal: list[jax.Array]  # (V, 3) [N] forces of each force term at nodes
-    pressure: jax.Array | None  # (V,) [Pa]
+    pressure: jax.Array | None  # (V,) [Pa] pressures at the nodes, or None
     x: jax.Array  # (V, 3) [m] positions
     F: Matrix  # deformation gradient
     isochoric: jax.Array | None = None  # (V, 3) [N] part of `internal` without the stress of unknown pressures
@@ -152,7 +155,7 @@ def _with_tied(physics: tuple[Physics, ...], step: Step) -> Step:
 def force_sizes(scene: Scene) -> Sizes:
     """Norms [N] of the nodal forces due to a unit strain along x, and due to rounding of the positions.
 
-    With these norms, a body without loads converges in spite of roundoff.
+    The tolerance uses these norms, so that the iterations for a body without loads converge in spite of roundoff.
     """
     mesh = scene.mesh
     # If pressures are unknowns, they do not follow from the positions. Then the bulk modulus does not amplify the
@@ -166,8 +169,8 @@ def force_sizes(scene: Scene) -> Sizes:
     def size(motion: jax.Array) -> jax.Array:
         return jnp.linalg.norm(mjed.linear_force(mesh, law, motion))
 
-    # One loop computes both norms. With two products with a linearised force, the compiled program would be three times
-    # as large.
+    # One loop computes both norms. Two separate products with the linearised force would make the compiled program
+    # three times as large.
     unit_strain, roundoff = jax.lax.map(size, jnp.stack([along, rounded]))
     return Sizes(*jax.lax.stop_gradient((unit_strain, roundoff + _roundoff_at_nodes(scene, rounded))))
 
@@ -209,9 +212,10 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
     eps = float(np.finfo(np.float64).eps)
     free, noise = step.free, 20 * eps * sizes.unit_strain
     if scene.solve.volumetric == "mixed":
-        # With mixed volumes, inertia forces have a weight of only about mu/K in the tolerance (`Mixed.counted`). In
-        # short time steps the roundoff of inertia exceeds this tolerance, so it is added. In single precision too, the
-        # roundoff of double precision is used, so that a run reports if it stops at a larger residual.
+        # With volumetric = "mixed", inertia forces count in the tolerance only with a weight of about shear modulus
+        # divided by bulk modulus (`Mixed.counted`). In short time steps the roundoff of inertia forces exceeds this
+        # tolerance, so this roundoff is added. Single precision also uses the roundoff of double precision, so that a
+        # run reports if it stops at a larger residual.
         noise = noise + ROUNDINGS * sizes.roundoff * (eps / float(jnp.finfo(state.x.dtype).eps))
     return Equations(
         scene=scene,
@@ -255,7 +259,9 @@ def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
 
 
 def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> jax.Array:
-    """Return the unknowns q of a step at positions x (V, 3): positions (3 V,), then pressures divided by `mixed.unit`.
+    """Return the unknowns q of a step at positions x (V, 3): positions (3 V,), then pressures if they are unknowns.
+
+    The unknown of a pressure is this pressure divided by `e.mixed.unit`.
 
     Args:
         pressure: pressures of the vertices (V,) [Pa] if they are unknowns; default: pressures at the beginning of the
@@ -311,7 +317,7 @@ def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
 
 
 def settled(e: Equations, q: jax.Array, s: Number | None = None) -> jax.Array:
-    """Replace the pressures in q by pressures that balance the volumes at fraction s of the step (default: 1)."""
+    """Replace the pressures in q by the solution of the pressure equation at fraction s of the step (default: 1)."""
     n, x = 3 * e.mesh.number_of_nodes, positions(e, q, jnp.ones((), q.dtype) if s is None else s)
     pressure = e.mixed.settled(e.mesh, determinant(deformation_gradient(e.mesh, x)))
     return jnp.concatenate([q[:n], pressure / e.mixed.unit])
@@ -338,8 +344,9 @@ def residual(
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
     """Out-of-balance forces (3 V,) [N] at fraction s of the step, sum of the norms of all forces [N], and pressures.
 
-    If pressures are unknowns, the weight of the isochoric forces in this sum is 1, and the weight of the other forces
-    is about mu/K, the shear modulus divided by the bulk modulus (see `Mixed.counted`).
+    If pressures are unknowns, the residual of the pressure equation, times `e.mixed.unit` [N], follows the forces. In
+    the sum of the norms, the weight of the isochoric forces is then 1, and the weight of the other forces is about the
+    shear modulus divided by the bulk modulus (see `Mixed.counted`).
     """
     f = forces(e, q, s, guess)
     at_work = jnp.linalg.norm(f.internal)
@@ -354,7 +361,7 @@ def residual(
 
 
 def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
-    """Energy [J] that a step minimises: the sum of the incremental potentials.
+    """Energy [J] of a step as a function of the unknowns q: the sum of the incremental potentials of all force terms.
 
     At `start` the gradient of the energy is the residual. If all forces have an energy, this is true at every q.
     """
@@ -376,8 +383,8 @@ def advanced(e: Equations, end: End, by_end_forces: jax.Array | None = None) -> 
 def reported_forces(e: Equations, total: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array | None]:
     """Return (f, a): f (V, 3) [N] is the sum of all forces, from which the reactions follow.
 
-    Unlike `total`, f contains the forces of `NodalForce.at_end` once (not doubled). a is minus the accelerations (V, 3)
-    [m/s^2] due to these forces, or None if there are no such forces.
+    Terms with `NodalForce.at_end` act only at the end of a step. Their forces are doubled in `total`, but not in f. The
+    array a (V, 3) [m/s^2] is minus the accelerations due to these forces, or None if there are no such forces.
 
     Args:
         total: sum of all forces (V, 3) [N] in the step's equations, at positions x (V, 3).

@@ -24,7 +24,7 @@ def number_kept(store: str | int, steps: int) -> int:
         store: "all", "sqrt", or a number above 0.
 
     Raises:
-        InputError: another value.
+        InputError: `store` has another value.
     """
     if store == "all":
         return steps
@@ -63,8 +63,8 @@ def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, carry, k)[1])
         return jax.lax.cond(real, step, lambda carry, _: (carry, nothing), carry, k)
 
-    # Only the state at the beginning of a segment is kept. All segments share one compiled loop, so the last one skips
-    # the steps after the end of the run.
+    # Only the state at the beginning of a segment is kept. All segments share one compiled loop of equal length, so the
+    # last segment skips the steps after the end of the run.
     @jax.checkpoint
     def segment(carry, at):
         return jax.lax.scan(unless_over, carry, at) if beyond else jax.lax.scan(step, carry, at)

@@ -33,7 +33,7 @@ class Gradient:
     """A number computed from a run, and the derivatives of this number."""
 
     value: jax.Array = param("1", "()")
-    gradient: dict = param("1", "name -> derivative, in the shape of the parameter")
+    gradient: dict = param("1", "name of a parameter -> derivative, with the shape of the parameter")
     status: jax.Array = param("1", "a code of `core.status`: GRADIENT_UNCONVERGED, ADJOINT_FAILED or CONVERGED")
 
 
@@ -58,7 +58,8 @@ def value_and_gradient(
             no memory for the steps, but costs one run per parameter.
 
     Raises:
-        InputError: `mode` or `store` is unknown; `at` is empty; the scene does not have a name; or as for `simulate`.
+        InputError: `mode` or `store` is unknown; `at` is empty; the scene does not have one of the names; or there is
+            one of the causes that `simulate` lists.
     """
     if mode not in MODES:
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
@@ -92,7 +93,8 @@ def _program_of_gradient(loss: Callable[[Result], jax.Array], store: str | int, 
     return jax.jit(both)
 
 
-#: Memory for the derivative of one step, without the tangents: measured count of numbers stored per integration point.
+#: Memory for the derivative of one step, without the tangents: the number of floating-point numbers that are stored for
+#: each integration point (measured).
 _WORK = 440
 
 
@@ -115,7 +117,7 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     if kept >= steps:
         return steps * (state + root) + work
     count, length, rest = gradient_checkpoints.lengths(steps, kept)
-    # The term with 3/2 is the memory for the result of the run. Not all arrays of the result exist at the same time.
+    # The term with 3/2 is the memory for the result of the run, whose arrays do not all exist at the same time.
     return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 3 * steps * root // 2 + work
 
 

@@ -3,25 +3,25 @@
 The richer space has quadratic functions for linear elements, and cubic functions for quadratic elements. It can
 represent the positions of a step exactly. In the richer space these positions are not in equilibrium: the
 out-of-balance forces are r. With the tangent stiffness K, the estimated change of the displacements is du = -K^-1 r.
-The reactions change by their derivative along du. A second run, in the richer space, is computed step by step together
-with the first run. The second run has separate internal variables of viscosity, fluid and inertia. In the richer space
-a surface touches an obstacle at other points than in the first run. With contact, the solves are therefore repeated
-until these contact points are found. With the contact points of the first solve only, the estimated error of the force
-on a flat punch was 25 %; the true error was 1 %.
+The estimated change of the reactions is their derivative in the direction du. A second run, in the richer space, is
+computed step by step together with the first run. The second run has separate internal variables of viscosity, fluid
+and inertia. In the richer space a surface touches an obstacle at other points than in the first run. With contact, the
+solves are therefore repeated until these contact points are found. After only one solve, the estimated error of the
+force on a flat punch was 25 %, although the true error was 1 %.
 
 The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 times the true error, at small
 and moderate strain. If du is added to the result, about a tenth of the error is left. For quadratic elements the cubic
-functions contain about two thirds of the error, so du is multiplied by 1.5. The estimate does not contain the errors of
-the body's shape and of the time steps.
+functions represent about two thirds of the error, so du is multiplied by 1.5. The estimate does not contain the errors
+of the body's shape and of the time steps.
 
 The pressures of a fluid are linear both in linear and in quadratic elements. With a fluid, the richer space therefore
 has the same elements on a finer mesh: every element is cut into eight (`liverjax.scenes.refined`). Then du is
 multiplied by 4/3, because an error of second order is a quarter as large on the finer mesh.
 
 In dynamics the errors of the steps accumulate. The richer run has consistent masses, so that the added functions have
-the same acceleration under gravity as the other functions. The inertia forces on all functions are those of the richer
-run. Each step of the richer run is linearised at its positions before the step plus the displacement of the first run
-in this step.
+the same acceleration under gravity as the other functions. The inertia forces follow from the accelerations of the
+richer run. Each step of the richer run is linearised at its positions before the step plus the displacement of the
+first run in this step.
 """
 
 from collections.abc import Callable
@@ -62,8 +62,8 @@ from liverjax.solvers.krylov import true_residual
 from liverjax.solvers.point_matrix import restricted
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
-#: Relative tolerance of the linear solve. With 1e-1, the estimate would be a fifth of the error for a slender beam of
-#: quadratic elements.
+#: Relative tolerance of the linear solve. With a tolerance of 1e-1, the estimate for a slender beam of quadratic
+#: elements would be only a fifth of the true error.
 _TOLERANCE = 1e-2
 #: The keys are the order of the elements. _WITH_PRESSURES: tolerance of the linear solve if pressures are unknowns.
 #: _FACTOR: factor that multiplies du.
@@ -77,10 +77,10 @@ _LOCKS = 10.0
 #: With contact or a flowing fluid, the linear solve of a step is repeated. _ROUNDS: maximum number of solves. _SETTLED:
 #: with contact, the solves end if the residual, divided by the sum of the norms of all forces, is below this value.
 _ROUNDS, _SETTLED = 24, 1e-3
-#: With a flowing fluid the solves end if this relative residual is below this value. One solve is not exact, because it
-#: only approximates the inverse of the pressure matrix (`liverjax.physics.darcy.nearly_solved`).
+#: With a flowing fluid, the solves end if the relative residual (as for `_SETTLED`) is below this value. One solve is
+#: not exact, because it only approximates the inverse of the pressure matrix (`liverjax.physics.darcy.nearly_solved`).
 _WITH_FLUID = 1e-5
-#: The change from such a solve is halved if it does not reduce the residual, at most this number of times.
+#: If the change from a repeated solve does not reduce the residual, it is halved, at most this number of times.
 _HALVINGS = 4
 
 
@@ -101,8 +101,8 @@ class MeshError:
         The sum of both is the corrected quantity. The error bar is `BAR` times the absolute value of the change.
 
         Args:
-            of: function (positions (T, V, 3), reactions (T, V, 3)) -> numbers, any pytree. The change is the derivative
-                of this function along the error.
+            of: function (positions (T, V, 3), reactions (T, V, 3)) -> the quantity, as a pytree of numbers. The change
+                is the derivative of this function in the direction of the estimated error.
             result: `Result` of the run.
         """
         return jax.jvp(of, (result.positions, result.reactions), (self.positions, self.reactions))
@@ -133,7 +133,7 @@ def mesh_error_of(
 
 @struct
 class Richer:
-    """A scene in the next richer space of functions."""
+    """A scene in a richer space of functions: with elements of the next order, or on a refined mesh."""
 
     scene: Scene = param("1", "the scene with richer elements, or on the refined mesh")
     within: Within | None = param(
@@ -160,7 +160,7 @@ class Richer:
 
 
 def richer(scene: Scene) -> Richer:
-    """Create the scene in the next richer space of functions, for the error estimate.
+    """Create the scene in a richer space of functions (elements of the next order, or a refined mesh).
 
     Raises:
         InputError: the scene uses the one-step scheme.
@@ -176,10 +176,12 @@ def richer(scene: Scene) -> Richer:
 def _with_richer_elements(scene: Scene) -> Scene:
     rich = enriched(scene)
     # Linear elements lock (are too stiff), so they are compared with elements that do not lock. If the bulk modulus is
-    # low, these are quadratic elements without pressures: pressures would be continuous where the material changes.
+    # low, quadratic elements without pressure unknowns do not lock. They are preferred, because nodal pressures would
+    # be continuous even where the material changes.
     of_linear = "auto" if _may_lock(scene) else "element"
     volumetric = of_linear if scene.mesh.order == 1 else scene.solve.volumetric
-    # Under an indenter, iterative solves for cubic elements with pressures do not converge, so "direct" is kept.
+    # Under an indenter, iterative solves for cubic elements with pressure unknowns do not converge, so the choice
+    # "direct" is kept.
     mixed = scene.mesh.order == 2 and scene.solve.volumetric == "mixed"
     linear = "direct" if mixed and scene.solve.linear_solver == "direct" else "cg"
     solve = replace(rich.solve, linear_solver=linear, robust="off", volumetric=volumetric)
@@ -215,7 +217,7 @@ def refuse(scene: Scene) -> None:
     """
     if scene.solve.newton == "one_step":
         raise InputError(
-            "solve.newton = 'one_step' has an additional error: use 'converged' to estimate the mesh error"
+            "[solve] newton = 'one_step' has an additional error: use newton = 'converged' to estimate the mesh error"
         )
 
 
@@ -244,14 +246,14 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
     begin = q
     if scene.solve.kind == "dynamic":
         # In dynamics errors accumulate. So the solve begins at the richer run's positions before the step, plus the
-        # displacement of the run in this step.
+        # displacement of the first run in this step.
         begin = q + unknowns(e, state.x) - unknowns(e, rich.padded(before))
     near, (dq, iterations, positive) = _found_near(scene, e, begin)
     f, along = jax.linearize(lambda q: forces(e, q, one), near)
     whole, _ = reported_forces(e, f.total + along(dq).total, positions(e, near + dq, one))
     reaction = whole - e.free.vectors(whole)
     dq = near + dq - q
-    # If du inverts elements, the richer run continues from the positions of the run.
+    # If the change dq inverts elements, the richer run continues from the positions of the first run.
     sound = jnp.all(volume_ratios(e.mesh, positions(e, q + dq, one)) > 0) & jnp.all(jnp.isfinite(dq))
     end = forces(e, jnp.where(sound, q + dq, q), one)
     found = sound & positive & (iterations < MOST_LINEAR_ITERATIONS)
@@ -278,7 +280,8 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
     one = jnp.ones((), q.dtype)
     tolerance = _TOLERANCE
     if e.volume is not None and e.volume.unknown:
-        # The solve starts at the pressures before the step, so its right-hand side is much larger than the mesh error.
+        # The solve starts at the pressures before the step, so its right-hand side is much larger than the residual
+        # that the mesh error causes.
         tolerance = _WITH_PRESSURES[scene.mesh.order]
 
     def solved(q: jax.Array) -> _Solved:

@@ -31,7 +31,7 @@ _DEGREE = 6
 def coupled(
     mesh: TetMesh, K: dict, own: Any, F: Matrix, pressures: block_matrix.BlockMatrix, slope: Any = 1.0
 ) -> block_matrix.BlockMatrix:
-    """Assemble the coupled matrix in 4 x 4 blocks, which is symmetric and indefinite.
+    """Assemble the coupled matrix of positions and pressures, with 4 x 4 blocks. It is symmetric and indefinite.
 
     The matrix is the derivative of the forces, and of the pressure equation with a minus sign, with respect to the
     positions x and the pressures P.
@@ -42,7 +42,8 @@ def coupled(
             be None.
         F: deformation gradient at the end of the step.
         pressures: matrix of the pressure equation.
-        slope: derivative (E,) of the volumetric strain, which is multiplied by the pressures, with respect to J.
+        slope: derivative (E,) of the volumetric strain with respect to the volume ratio J. The energy contains the
+            product of pressure and volumetric strain.
     """
     q = [scale(slope * mesh.volumes / 4, g) for g in volume_gradients(mesh, F)]
     bordered = {}
@@ -78,7 +79,7 @@ def pressure_change(
     balance: jax.Array,
     exactly: bool = False,
 ) -> jax.Array:
-    """Change of the pressures (V,) that reduces a balance of volumes (V,) to 0.
+    """Change of the pressures (V,) that reduces the residual `balance` (V,) of the pressure equation to 0.
 
     Without `flow` the pressure matrix is diagonal. With `flow` the pressure equation is solved approximately, or to its
     tolerance if `exactly` is true.
@@ -96,9 +97,10 @@ def pressure_change(
 def with_pressures(
     mesh: TetMesh, volume: Any, A: PointMatrix | block_matrix.BlockMatrix, both: Any
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """Changes, due to `both`, of the forces, as columns (V,), and of the pressure equation (V,) times `volume.unit`.
+    """Return the changes of the forces, as columns (V,), and of the residual of the pressure equation (V,).
 
     `both` contains the changes of the unknowns: positions as columns (V,), and pressures (V,) divided by `volume.unit`.
+    The residual of the pressure equation is multiplied by `volume.unit`.
     """
     motion, dp = both
     if isinstance(A, block_matrix.BlockMatrix):
@@ -134,7 +136,8 @@ def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> 
     """Stiffness [Pa/m^3] of each integration point against a volume change, if nothing flows between elements.
 
     C is the pressure matrix. `mask` (V,) is 0 where the pressure is given, else 1. The diagonal of C is divided among
-    the elements in proportion to their volumes. The sum over the elements is then not softer than the true matrix.
+    the elements in proportion to their volumes. The sum of these stiffnesses is then at least as stiff as the true
+    matrix.
     """
     share = integrals(mesh, jnp.ones_like(mesh.volumes)) * mask / C.diagonal[0][0]
     return interpolated(mesh, share) / mesh.weights

@@ -23,7 +23,7 @@ class ObstacleForces(NamedTuple):
 def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
     """Compute the forces on the obstacles of a scene, the depths of the surface in them, and their displacements.
 
-    All three are differentiable.
+    All three results are differentiable.
 
     Args:
         scene: the scene that was run.

@@ -32,7 +32,7 @@ class Result:
     reactions: jax.Array = param("N", "(T, V, 3), force of the supports on the body, 0 where nothing is prescribed")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
     pressure: jax.Array | None = param("Pa", "(T, V), fluid pressure of a porous body", default=None)
-    statistics: StepStatistics = param("1", "for each step: numbers of iterations and cuts, residual")
+    statistics: StepStatistics = param("1", "for each step: iterations, halved substeps, residual")
     mesh_error: MeshError | None = param("1", "estimated mesh error; None: not estimated", default=None)
 
     def check(self) -> "Result":
@@ -85,7 +85,7 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
     first = equations(scene, start, numbers[0], sizes)
-    # In runs of several steps, solves for derivatives use the coarse space of the first step.
+    # In a run of several steps, all solves for derivatives use the coarse space of the first step.
     kept, near = beginning(first, tangent_too=steps > 1)
     advance = _step_by_step(scene, sizes, report, near)
     return _result(scene, numbers, gradient_checkpoints.scan(advance, (start, kept), numbers, store))

@@ -60,7 +60,8 @@ def problem_of(e: Equations) -> Problem:
         tangent=partial(_tangent, e, "true"),
         solve=partial(tangent.solve, e),
         preconditioner=partial(tangent.preconditioner, e),
-        # If nodes move together on circles, the tangent is not the exact derivative: it is valid for small rotations.
+        # If nodes rotate together about an axis, the tangent is exact only for small rotations. So it cannot be used
+        # for derivatives.
         adjoint=partial(adjoint, e) if e.conservative and not e.free.tied else None,
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
@@ -73,7 +74,10 @@ def problem_of(e: Equations) -> Problem:
 
 
 def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangent.Tangent | None]:
-    """Return an empty `Kept` for a run that begins with `first`, and the first tangent (None unless `tangent_too`)."""
+    """Return an empty `Kept` for a run whose first step has the equations `first`, and the tangent at its beginning.
+
+    The tangent is None unless `tangent_too` is true.
+    """
     method, q = problem_of(first), unknowns(first, first.state.x)
     kept = step_cutting.nothing_kept(method, q)
     if not tangent_too:
@@ -83,7 +87,7 @@ def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangen
 
 
 def _flowing(e: Equations) -> Beside | None:
-    """Return the pressures of a flowing fluid as additional unknowns, or None if the scene has no such fluid."""
+    """Return a `Beside` with the pressures of a flowing fluid as additional unknowns; None without a flowing fluid."""
     volume: Any = e.volume
     if volume is None or volume.flow is None:
         return None
@@ -111,7 +115,10 @@ def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
 
 
 def _finite(e: Equations) -> Equations:
-    """Return the equations of the same body with a stable neo-Hookean law. Force terms at nodes stay the same."""
+    """Return the equations of the same body with a stable neo-Hookean law, whose energy is finite everywhere.
+
+    The force terms at nodes stay the same.
+    """
     law = e.scene.law
     mu = law.shear_modulus()
     own = [p.bulk_modulus() for p in e.physics if p.bulk_modulus() is not None]
@@ -126,7 +133,8 @@ def step(
 ) -> tuple[State, jax.Array, StepStatistics, Kept]:
     """Solve a step. Return the next state, the reactions (V, 3) [N], statistics, and the tangent for the next step.
 
-    `kept` contains the tangent of the last step. Solves for derivatives may use the coarse space of the tangent `near`.
+    `kept` contains the tangent of the last step. The linear solves for derivatives use the coarse space of the tangent
+    `near`, if it is given.
     """
     scene, x, solve = e.scene, e.state.x, e.scene.solve
     options = StepOptions(
@@ -135,7 +143,7 @@ def step(
         one_step=solve.newton == "one_step",
         differentiable=differentiable,
     )
-    # With inertia the first guess is a motion at constant velocity. A one-step solve starts at x (book chapter).
+    # With inertia, the first guess is a motion at constant velocity. A one-step solve (book chapter) starts at x.
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
     problem = problem_of(e)
@@ -223,7 +231,7 @@ def _with_flow(
     def step(c):
         x, P, r, dP, least, vain, k = c
         size = jnp.linalg.norm(r)
-        # The last refinement needs no more accuracy than the tolerance.
+        # In the last refinement, the linear solve is only as accurate as the tolerance requires.
         inner = jnp.clip(0.3 * tolerance * scale / size, _INNER, 0.5)
         x, P = x + tangent.solve(e, K, r, inner, max_iterations)[0], P + dP
         r, dP = left(x, P)

@@ -1,11 +1,11 @@
-"""The tangent of the forces of a scene, computed from hand-derived blocks, and linear solves with this tangent.
+"""The tangent of the forces of a scene, computed from hand-derived stiffness blocks, and linear solves with it.
 
-The physics of the scene determine the method. Conjugate gradients solve symmetric systems, after nodal pressures are
-eliminated. BiCGSTAB solves two other kinds of systems: systems with follower loads or friction, which are not
-symmetric, and systems with pressures as unknowns, which have a non-symmetric preconditioner. The preconditioner
-consists of the inverse diagonal blocks of the stiffness. A coarse space, with few unknowns for motions of long
-wavelength, is added if these motions would need many iterations. Columns (V,) are the x, y and z components of a nodal
-vector in separate arrays. A flat vector (3 V,) contains the columns one after the other.
+The physics of the scene determine the method of the linear solves. Conjugate gradients solve symmetric systems, after
+nodal pressures are eliminated. BiCGSTAB solves two other kinds of systems: systems with follower loads or friction,
+which are not symmetric, and systems with pressures as unknowns, which have a non-symmetric preconditioner. The
+preconditioner consists of the inverse diagonal blocks of the stiffness. A coarse space, with few unknowns for motions
+of long wavelength, is added if these motions would need many iterations. Columns (V,) are the x, y and z components of
+a nodal vector in separate arrays. A flat vector (3 V,) contains the columns one after the other.
 """
 
 from collections.abc import Callable, Sequence
@@ -63,7 +63,7 @@ def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
 
 
 def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: Kind = "true") -> dict[tuple[int, int], Matrix]:
-    """Stiffness K_ab [N/m] of corners 1 <= a <= b <= 3 at every integration point, at `pressure` (V,) [Pa] or None."""
+    """Stiffness K_ab [N/m] between corners a and b (1 <= a <= b <= 3) at every integration point."""
     return _of_kind(kind, partial(_own_blocks, e, pressure, F))
 
 
@@ -90,13 +90,13 @@ def _own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str) -> dict[tuple
 def element_blocks(
     e: Equations, pressure: jax.Array | None, F: Matrix, kind: Kind = "true"
 ) -> dict[tuple[int, int], Matrix]:
-    """Stiffness K_ab [N/m] of every linear element for the node pairs of `PAIRS`, at `pressure` (V,) [Pa] or None."""
+    """Stiffness K_ab [N/m] of every linear element for the node pairs (a, b) in `PAIRS`."""
     full = mjed.all_blocks(own_blocks(e, pressure, F, kind))
     return {(a, b): full[a][b] for a, b in PAIRS}
 
 
 def stiffness(e: Equations, pressure: jax.Array | None, x: jax.Array, kind: Kind = "true") -> BlockMatrix:
-    """Stiffness matrix of the elements and nodes at positions x (V, 3) [m], at `pressure` (V,) [Pa] or None."""
+    """Stiffness matrix of the elements and of the force terms at nodes, at positions x (V, 3) [m]."""
     K = element_blocks(e, pressure, deformation_gradient(e.mesh, x), kind)
     return block_matrix.force_matrix(e.mesh, K, node_blocks(e))
 
@@ -112,7 +112,7 @@ def node_blocks(e: Equations) -> Block | None:
 
 
 def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Between, ...]:
-    """Stiffness between nodes (springs, contact, …), and its reduction (`GivesWay`), of all force terms at nodes."""
+    """Stiffness between nodes (springs, contact …) of all force terms at nodes, and its rank-one changes `GivesWay`."""
 
     def of(kind: str) -> tuple[Between, ...]:
         found: list[Between | None] = []
@@ -173,8 +173,8 @@ def tangent(
 ) -> Tangent:
     """Derivative of the forces at positions x (V, 3) [m], at fraction s of the step. JAX treats it as a constant.
 
-    `pressure` (V,) [Pa] is the pressure at the nodes, or None. `near` is a flag and a tangent. If the flag is true, the
-    coarse space of this tangent is used. `kind` is a `Kind`.
+    `pressure`: pressures at the nodes (V,) [Pa], or None if there are none. `near`: a flag and a tangent; if the flag
+    is true, the coarse space of this tangent is used. `kind`: a `Kind`.
     """
     e, pressure, x, s = jax.lax.stop_gradient((e, pressure, x, s))
     name, taken = (kind, None) if isinstance(kind, str) else kind
@@ -203,8 +203,8 @@ def eliminates_pressures(e: Equations) -> bool:
 
     Far from a solution, pressures and their stiffness are as large as the bulk modulus. Iterations for positions and
     pressures together are scaled by the shear modulus and do not converge there. After the elimination the matrix of
-    the positions is positive. For linear elements the pressures are not eliminated, because their matrix has no simple
-    inverse.
+    the positions is positive definite. For linear elements the pressures are not eliminated, because the pressure
+    matrix has no simple inverse.
     """
     return e.mixed is not None and e.mesh.order > 1 and e.scene.solve.linear_solver != "direct"
 
@@ -275,7 +275,7 @@ def _assembled(
 
 
 def _vertex_inverses(e: Equations, free: Free, A: BlockMatrix, diagonal: Block) -> Inverses:
-    """Inverses of the diagonal blocks of a vertex matrix, and inverses for clusters of vertices."""
+    """Inverses of the diagonal blocks of the matrix A of the vertices, and inverses for clusters of vertices."""
     single = block_matrix.inverse_blocks(diagonal, free.mask, free.normals)
     groups = _groups_in_use(e, e.mesh.pattern.clusters)
     entries = clusters.of_rows(groups, e.mesh.pattern.edge_slots, A)
@@ -283,7 +283,7 @@ def _vertex_inverses(e: Equations, free: Free, A: BlockMatrix, diagonal: Block) 
 
 
 def _groups_in_use(e: Equations, groups: Any) -> Any:
-    """Return the clusters, or None with a factorisation or if nodes slide on oblique planes (no clusters are used)."""
+    """Return the clusters; None if a factorisation is used or nodes slide on oblique planes (no clusters are used)."""
     return None if e.free.normals is not None or e.scene.solve.linear_solver == "direct" else groups
 
 
@@ -461,7 +461,7 @@ def solve(
 def _one_of_both(
     e: Equations, K: Tangent, flag: jax.Array, b: jax.Array, limits: tuple[Number, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solve K dq = b, with pressures eliminated if `flag` is true. In the unused solve, b is 0 (no iterations)."""
+    """Solve K dq = b. Pressures are eliminated if `flag` is true. The unused solve has b = 0 and does no iterations."""
     n, A, motions = 3 * e.mesh.number_of_nodes, K.matrix, _motions(e, K)
     assert isinstance(A, PointMatrix)
 

@@ -77,7 +77,7 @@ def resting(scene: Scene) -> Scene:
 
         law = law.each(relaxed)
     held = tuple(Fixed(nodes=d.nodes, axes=d.axes) for d in scene.displaced)
-    # In a step of length 0, histories have their first value.
+    # There is one step with dt = 0, so each history has its first value.
     solve = replace(scene.solve, kind="static", steps=1, dt=0.0, newton="converged", robust="off")
     changed: Content = {"fixed": (*scene.fixed, *held), "physics": tuple(p.at_beginning() for p in scene.physics)}
     return replace(scene, law=law, viscosity=None, displaced=(), solve=solve, points_are="reference", **changed)
@@ -96,7 +96,7 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
 
     def held(z: jax.Array) -> jax.Array:
         e, q = _with_displacements(scene, given, z, sizes)
-        # Unknowns that are not free must be 0. These equations are added, so that the matrix has no empty rows.
+        # Unknowns that are not free must be 0. Equations for this are added, so that the matrix has no empty rows.
         return residual(e, q, one)[0] + (z - _free_part(first, z))
 
     options = _OPTIONS._replace(tolerance=jax.lax.stop_gradient(scene.solve.tolerance))

@@ -20,7 +20,7 @@ class Attached(NamedTuple):
 
 
 class GivesWay(NamedTuple):
-    """Rank-one change -h h^T / size of a stiffness due to an eliminated unknown (e.g. motion of an obstacle)."""
+    """Rank-one change -h h^T / size of the stiffness due to an eliminated unknown (e.g. the motion of an obstacle)."""
 
     h: jax.Array  # (V, 3) [N/m] forces on the nodes per unit of this unknown
     size: jax.Array  # () [N/m] stiffness of this unknown if the nodes do not move
@@ -29,12 +29,13 @@ class GivesWay(NamedTuple):
 class Masses(NamedTuple):
     """For each element: the consistent minus the lumped mass matrix, or this difference times k/dt^2.
 
-    The difference times k/dt^2 is a term of the effective stiffness of a time step (k: see `liverjax.physics.inertia`).
+    The difference times k/dt^2 is a term of the effective stiffness of a time step dt. The number k depends on the time
+    integration (see `liverjax.physics.inertia`). n is the number of nodes of an element.
     """
 
-    nodes: jax.Array  # (n, E)
+    nodes: jax.Array  # (n, E) node numbers
     signs: jax.Array  # (n, E) 1, or -1 for a shape function with reversed direction
-    matrix: jax.Array  # (n, n) symmetric
+    matrix: jax.Array  # (n, n) symmetric matrix, the same for all elements
     size: jax.Array  # (E,) [kg] or [N/m] factor of `matrix` in each element
 
 
@@ -43,7 +44,10 @@ Between = Attached | GivesWay | Masses
 
 
 def masses(mesh: TetMesh, matrix: np.ndarray, size: jax.Array) -> Masses:
-    """Return `Masses`: a matrix (n, n), the same for all elements, times one number `size` for each element (E,)."""
+    """Return `Masses` with the same `matrix` (n, n) for all elements, and one factor `size` (E,) for each element.
+
+    n is the number of nodes of an element.
+    """
     nodes = jnp.stack(mesh.element_nodes)
     signs = mesh.oriented(jnp.ones((len(nodes), 1, nodes.shape[1]), size.dtype))[:, 0]
     return Masses(nodes, signs, jnp.asarray(matrix, size.dtype), size)
@@ -70,7 +74,7 @@ def product(A: Between, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
 
 def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
     """Diagonal blocks of A at the nodes: 3 x 3 arrays (V,)."""
-    # If an element has the same node twice, the blocks between both entries are also on the diagonal.
+    # If an element contains the same node twice, the block between its two entries is also on the diagonal.
     same = A.nodes[:, None] == A.nodes[None]
     own = jnp.sum(jnp.where(same[:, None, :, None], A.blocks, 0.0), axis=2)  # (n, 3, 3, m)
     own = jnp.zeros((number_of_nodes, 3, 3), own.dtype).at[A.nodes].add(jnp.transpose(own, (0, 3, 1, 2)))
@@ -78,7 +82,7 @@ def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
 
 
 def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -> BlockMatrix:
-    """Add the blocks `attached` to the vertex matrix A, except blocks between vertices that are no neighbours."""
+    """Add the blocks `attached` to the matrix A of the vertices, except blocks of vertices that share no element."""
     if not attached:
         return A
     rows = jnp.stack([jnp.stack(row[:3]) for row in A.rows[:3]])
@@ -96,7 +100,10 @@ def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -
 
 
 def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
-    """Restrict A to motions that are linear along edges: the motion of a midside node is the mean of both ends."""
+    """Restrict A to motions that are linear along edges.
+
+    In such a motion, the displacement of a midside node is the mean of the displacements at both ends of its edge.
+    """
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     edge = jnp.clip(A.nodes - V, 0, low.shape[0] - 1)
     is_vertex = A.nodes < V
@@ -112,7 +119,7 @@ def symmetric_part(A: Attached) -> Attached:
 
 
 def definite(A: Attached) -> Attached:
-    """Set the negative eigenvalues of the symmetrised element matrices to 0."""
+    """Replace each element matrix by its symmetric part, with the negative eigenvalues set to 0."""
     n, m = A.nodes.shape
     K = jnp.moveaxis(A.blocks.reshape(3 * n, 3 * n, m), -1, 0)
     size, axes = jnp.linalg.eigh(0.5 * (K + jnp.swapaxes(K, 1, 2)))

@@ -1,9 +1,9 @@
 """Symmetric block matrices with one block for each pair of neighbouring nodes, assembled from element blocks.
 
-All rows are padded to one length. Every row stores the numbers of its neighbours, so a matrix-vector product needs no
-search for column indices. The block of each edge is assembled only once, for both nodes. Forces do not change under
-translation, so a diagonal block is minus the sum of the other blocks in its row. The caller adds other terms of the
-diagonal.
+All rows are padded to one length. The row of each node stores the numbers of its neighbours, so a matrix-vector product
+needs no search for column indices. The block of each edge is assembled only once, for both nodes. Forces do not change
+if the body is translated, so a diagonal block is minus the sum of the other blocks in its row. The calling function
+adds other terms to the diagonal.
 """
 
 from collections.abc import Iterable, Sequence
@@ -25,8 +25,8 @@ Block = tuple[tuple[Any, ...], ...]
 class BlockMatrix(NamedTuple):
     """A symmetric matrix (V m, V m) of m x m blocks for V nodes. Each entry of a block is an array over the nodes."""
 
-    rows: Block  # arrays (W, V): blocks between each node and its W neighbours
-    diagonal: Block  # arrays (V,)
+    rows: Block  # arrays (W, V): blocks between each node and its neighbours (at most W neighbours)
+    diagonal: Block  # arrays (V,): diagonal blocks
     nodes: jax.Array  # (W, V) node numbers of the neighbours
 
 
@@ -38,7 +38,7 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
     """
     pattern: Pattern = mesh.pattern
     m = len(blocks[PAIRS[0]])
-    # The blocks are stored. Otherwise XLA:CPU would compute every entry again in each scatter.
+    # The blocks are stored as arrays. Otherwise XLA:CPU would compute every entry again in each scatter operation.
     blocks = stored(blocks)
     number = pattern.edges.shape[1]
     swapped = {(a, b): mesh.tetrahedra[:, a] > mesh.tetrahedra[:, b] for a, b in PAIRS}
@@ -93,9 +93,9 @@ def added(a: Block, b: Block) -> Block:
 def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None = None) -> Block:
     """Invert the 3 x 3 diagonal blocks. In directions with `mask` (V, 3) equal to 0, rows are those of the unit matrix.
 
-    If a block is not positive definite, its mean absolute diagonal entry is inverted instead. `normals` (V, 3) are unit
-    vectors or 0. Nodes do not move along their normals. So the coupling of a block with the normal direction is
-    removed, and the entry along the normal becomes the mean of the block's diagonal (see `_across`).
+    If a block is not positive definite, the mean of the absolute values on its diagonal is inverted instead. `normals`
+    (V, 3) are unit vectors or 0. Nodes do not move along their normals. So the coupling of a block with the normal
+    direction is removed, and the entry along the normal becomes the mean of the block's diagonal (see `_across`).
     """
     if normals is not None:
         diagonal = _across(diagonal, normals)
@@ -136,7 +136,7 @@ def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ..
         near = [taken(column, A.nodes[slot]) for column in columns]
         return tuple(t + _row([e[slot] for e in row], near) for t, row in zip(total, A.rows, strict=True))
 
-    # In a loop over the neighbours, gathered values stay in the cache.
+    # With a loop over the neighbours, the gathered values stay in the cache of the processor.
     return jax.lax.fori_loop(0, A.nodes.shape[0], add, applied(A.diagonal, columns))
 
 
@@ -145,7 +145,7 @@ def _row(entries: Any, columns: Sequence[jax.Array]) -> jax.Array:
 
 
 def sums(a: Sequence[jax.Array], b: Iterable[jax.Array]) -> tuple[jax.Array, ...]:
-    """Sum of two vectors that are given by their columns (V,)."""
+    """Sum of two nodal vectors, each given by its columns (V,)."""
     return tuple(x + y for x, y in zip(a, b, strict=True))
 
 

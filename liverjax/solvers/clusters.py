@@ -1,8 +1,8 @@
-"""Dense inverse blocks for clusters of near nodes: a part of the preconditioner for meshes with thin cells.
+"""Dense inverse blocks for clusters of near nodes: a part of the preconditioner for meshes with thin elements.
 
-In a thin cell, nodes are coupled much more strongly through the thickness than along the cell. In one iteration of
-block-Jacobi, a motion spreads through the thickness by only one node. So each cluster of near nodes
-(`liverjax.mesh.adjacency.Clusters`) is treated as one block.
+In a thin element, nodes are coupled much more strongly through the thickness than along the element. In one iteration
+with a block-Jacobi preconditioner, a motion spreads through the thickness by only one node. So each cluster of near
+nodes (`liverjax.mesh.adjacency.Clusters`) is treated as one block.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,8 @@ _AT_ONCE = 2048
 class Inverses(NamedTuple):
     """Inverse blocks of single nodes (0 for nodes in clusters), and of G clusters of at most M nodes."""
 
-    nodes: Block  # 3 x 3 arrays (V,)
-    clusters: jax.Array | None = None  # (G, 3 M, 3 M)
+    nodes: Block  # inverse blocks of single nodes, 3 x 3 arrays (V,)
+    clusters: jax.Array | None = None  # (G, 3 M, 3 M) inverse blocks of clusters; None if there are no clusters
 
 
 def inverses(
@@ -63,7 +63,7 @@ def inverses(
 
 
 def smoothed(clusters: Clusters | None, A: Inverses, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Multiply the inverse blocks by a vector that is given by its columns (V,). Return columns (V,)."""
+    """Multiply a nodal vector, given by its columns (V,), by the inverse blocks. Return columns (V,)."""
     single = block_matrix.applied(A.nodes, columns)
     if clusters is None or A.clusters is None:
         return single
@@ -86,7 +86,7 @@ def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) ->
 def of_points(clusters: Clusters | None, order: int, A: PointMatrix) -> jax.Array | None:
     """Blocks (n, 3, 3) of the matrix between two shape functions a and b, for the n entries of `clusters.sources`.
 
-    A block is the sum of c_ak K_kl c_bl over the integration points of the element and over k and l. c_ak is the
+    A block is the sum of c_ak K_kl c_bl over the integration points of the element and over k, l = 1, 2, 3. c_ak is the
     derivative of function a with respect to the barycentric coordinate k, minus its derivative with respect to
     coordinate 0. K_kl are the blocks of A.
     """
@@ -95,7 +95,7 @@ def of_points(clusters: Clusters | None, order: int, A: PointMatrix) -> jax.Arra
     c = basis(order).c
     slopes = jnp.asarray(c[:, 1:] - c[:, :1], A.blocks[1, 1][0][0].dtype)  # (n, 3, Q)
     pairs = sorted(A.blocks)
-    # With the element as the first axis, the numbers of one element are close together in memory.
+    # The first axis counts the elements, so that the numbers of one element are close together in memory.
     K = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in pairs])
     K = jnp.moveaxis(K, -1, 0)  # (E, 6, 3, 3, Q)
 

@@ -1,4 +1,4 @@
-"""Solve linear systems by sparse factorisation, if they are too ill-conditioned for Krylov methods.
+"""Solve linear systems that are too ill-conditioned for Krylov methods, by sparse factorisation.
 
 The factorisation is SciPy's SuperLU. It runs on the CPU, outside the compiled program. Its time and memory grow faster
 than the number n of nodes (as n^1.5 to n^2), so it is suitable for bodies with a few thousand nodes.
@@ -29,7 +29,7 @@ def solve(
     normals: jax.Array | None = None,
     attached: tuple[Between, ...] = (),
 ) -> jax.Array:
-    """Solve A x = b (m, V) for a matrix of m x m blocks. Return x (m, V).
+    """Solve A x = b for a matrix A of m x m blocks and a right-hand side b (m, V). Return x (m, V).
 
     x is 0 where `free` (m, V) is 0, and NaN if A is singular. `normals` (V, 3) are unit vectors or 0: the motion of
     each node (the first three rows of x) has no component along its normal. The matrices `attached` are added to A.
@@ -51,8 +51,8 @@ def solve_points(
     """Solve the linear system of quadratic elements, with the same arguments as `solve`.
 
     The result is a flat vector: the positions (3 V,), then the pressures of the vertices if A has pressures. `free` and
-    `b` are pairs of arrays: for positions (3, V) and for pressures. An empty array for the pressures means that all
-    pressures are free, or that their part of `b` is 0.
+    `b` are pairs of arrays: for positions (3, V) and for pressures. If the second array of `free` is empty, all
+    pressures are free. If the second array of `b` is empty, the right-hand side of the pressures is 0.
     """
     blocks = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in sorted(A.blocks)])
     own = None if A.own is None else _filled(A.own, b[0][0])
@@ -75,7 +75,7 @@ def _filled(blocks: Block, like: jax.Array) -> jax.Array:
 
 def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
     """Matrix (size, size) with the 3 x 3 block n n^T of every node (unit normal n), in the order of the unknowns."""
-    import scipy.sparse  # slow to import (a fifth of the package's time), so it is imported only where it is used
+    import scipy.sparse  # its import takes a fifth of the package's import time, so it is imported only where needed
 
     number, own = len(normals), np.arange(len(normals))
     entries = [
@@ -189,12 +189,12 @@ def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: t
     A = A[keep][:, keep].tocsc()
     x = np.zeros_like(b)
     try:
-        # The sparsity pattern is symmetric, so an ordering that is good for A + A^T is nearly optimal.
+        # The sparsity pattern of A is symmetric, so an elimination order for A + A^T is also good for A.
         factor = scipy.sparse.linalg.splu(A, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         x[keep] = factor.solve(b[keep])
-        if len(size):  # Sherman, Morrison and Woodbury
+        if len(size):  # formula of Sherman, Morrison and Woodbury
             Z, H = factor.solve(H[keep]), H[keep]
             x[keep] += Z @ np.linalg.solve(np.diag(size) - H.T @ Z, H.T @ x[keep])
-    except (RuntimeError, ValueError, np.linalg.LinAlgError):  # singular, or not finite
+    except (RuntimeError, ValueError, np.linalg.LinAlgError):  # A is singular, or has entries that are not finite
         x[keep] = np.nan
     return x

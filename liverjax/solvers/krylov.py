@@ -29,10 +29,10 @@ def conjugate_gradients(
 
     Args:
         matvec, precondition: A and an approximation of its inverse.
-        tolerance: tolerance, relative to |b|, of the residual that the iterations update.
+        tolerance: the iterations end if the residual that they update is at most `tolerance` |b|.
         max_iterations: maximum number of iterations.
 
-    The solve also stops if it finds a direction without positive curvature. The statistics contain the true residual.
+    The iterations also stop at a direction without positive curvature. The statistics contain the true residual.
     """
     goal = tolerance * jnp.linalg.norm(b)
 
@@ -42,7 +42,7 @@ def conjugate_gradients(
 
     def step(c):
         x, r, p, rz_before, k, _ = c
-        z = precondition(r)  # the only call of the preconditioner, so that it is compiled once
+        z = precondition(r)  # the only call of the preconditioner, so that it is compiled only once
         rz = jnp.vdot(r, z)
         p = z + rz / rz_before * p
         Ap = matvec(p)
@@ -130,8 +130,8 @@ def stabilised_biconjugate_gradients(
 
 
 #: EARLIER: number of earlier solves that are kept to compute the starting vector of a solve. _NEW: an earlier
-#: right-hand side is skipped if newer ones represent it with a relative error below _NEW, because solutions are not
-#: more accurate.
+#: right-hand side is ignored if a combination of newer ones represents it with a relative error below _NEW. The
+#: solutions are not more accurate than this.
 EARLIER, _NEW = 6, 1e-7
 
 
@@ -170,11 +170,11 @@ class Earlier(NamedTuple):
 
 
 def no_earlier(load: jax.Array, solution: jax.Array) -> Earlier:
-    """Return an empty `Earlier` (zeros), with the sizes of a right-hand side `load` and of a `solution`."""
+    """Return an empty `Earlier` (zeros), for right-hand sides as long as `load` and solutions as long as `solution`."""
     return Earlier(*(jnp.zeros((EARLIER, len(each)), each.dtype) for each in (load, solution)))
 
 
-#: A pair: a vector, and earlier solves.
+#: A vector, together with earlier linear solves.
 WithEarlier = tuple[jax.Array, Earlier]
 
 
@@ -196,7 +196,7 @@ def symmetric_solve(
             the right-hand side. The right-hand side is b, or what remains of b after the elimination of unknowns.
         tolerance: tolerance of the solver.
     """
-    # All arrays are joined to one vector: JAX raises an error if a derivative lacks the cotangents of some arrays.
+    # All arrays are joined to one vector, because JAX raises an error if some of the arrays have no cotangents.
     joined, parted = ravel_pytree(both)
 
     def solve(_, vector):
@@ -224,8 +224,8 @@ def started(
 ) -> tuple[jax.Array, jax.Array]:
     """Solve A x = b from the starting vector `near`, or from 0 if the residual is smaller there.
 
-    `solver` is a function (b, tolerance) -> solution and its residual divided by |b|. `tolerance` is the upper bound of
-    |b - A x| / |b|. The result is the solution and its residual divided by |b|.
+    `solver` is a function (b, tolerance) -> solution, and its residual divided by |b|. `tolerance` is the upper bound
+    of |b - A x| / |b|. Returns the solution, and its residual divided by |b|.
     """
     left, size = b - matvec(near), jnp.linalg.norm(b)
     helps = jnp.linalg.norm(left) < size

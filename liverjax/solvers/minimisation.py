@@ -1,10 +1,11 @@
-"""Minimise the energy of a step, if elements are inverted at its beginning or if Newton's method along the load fails.
+"""Minimise the energy of a step, if elements are inverted at its beginning or if the usual Newton iterations fail.
 
-The true tangent is used if conjugate gradients find no negative curvature in it. Otherwise a tangent without negative
-eigenvalues is used (`liverjax.elements.projection`). A backtracking line search halves the step length until the energy
-decreases enough (Armijo's condition). Near the minimum the convergence is quadratic. If elements are inverted at the
-start, a minimisation with a stable neo-Hookean law of the same moduli first removes the inversions. The energy of this
-law is finite everywhere, so every law can start from inverted elements.
+The usual Newton iterations are those of `liverjax.solvers.step_cutting`. The minimisation uses the true tangent if
+conjugate gradients find no negative curvature in it. Otherwise it uses a tangent without negative eigenvalues
+(`liverjax.elements.projection`). A backtracking line search halves the step length until the energy decreases enough
+(Armijo's condition). Near the minimum the convergence is quadratic. If elements are inverted at the start, a
+minimisation with a stable neo-Hookean law of the same moduli first removes the inversions. The energy of this law is
+finite everywhere, so every law can start from inverted elements.
 
 If pressures are unknowns, the solution is a saddle point of the energy. With the optimal pressures for each set of
 positions, the solution is a minimum. So only positions are varied, and the pressures follow from the positions. In
@@ -26,18 +27,18 @@ from liverjax.solvers.problem import LINEAR_TOLERANCE, MOST_LINEAR_ITERATIONS, P
 #: Required decrease of the energy, divided by the decrease that its derivative predicts (Armijo; Nocedal and Wright
 #: 2006, 3.1).
 _FALL = 1e-4
-#: A relative difference of energies below this multiple of the precision is roundoff. Then the line search requires a
-#: smaller residual instead of a smaller energy.
+#: A relative difference of energies below this multiple of the machine precision counts as roundoff. Then the line
+#: search also accepts a smaller residual instead of a smaller energy.
 _ROUNDOFF = 5e3
-#: The true tangent is tried again after at most this number of iterations.
+#: After the true tangent has failed, it is tried again after at most this number of iterations.
 _PATIENCE = 8
 #: Maximum number of iterations, and maximum number of halvings of the step length in one iteration.
 _MOST_ITERATIONS, _MOST_SHORTENINGS = 300, 30
 #: A true tangent that is not symmetric, or has pressures, is used only if the relative residual is below this value.
 #: Far from the solution the tangent may be indefinite. BiCGSTAB does not detect this and would use all its iterations.
 _NEAR = 0.1
-#: Tolerance of the linear solves if pressures follow from positions: the ratio of bulk to shear modulus amplifies
-#: errors of the pressure equations.
+#: Maximum tolerance of the linear solves if pressures follow from positions. It is small, because the ratio of bulk to
+#: shear modulus amplifies errors of the pressure equations.
 _WITH_PRESSURES = 1e-6
 #: Tolerance of the minimisation that removes inversions with a surrogate law.
 _UNTANGLED = 1e-4
@@ -59,7 +60,7 @@ class _Descent(NamedTuple):
     r: jax.Array
     relative: jax.Array
     by: jax.Array
-    definite: jax.Array  # number of iterations with a definite tangent until the true one is tried
+    definite: jax.Array  # number of iterations with a definite tangent until the true tangent is tried
     patience: jax.Array  # the next value of `definite` if the true tangent fails again
     indefinite: jax.Array  # whether the last true tangent was not positive definite
     stuck: jax.Array
@@ -157,7 +158,11 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
 
 
 def _length(problem: Problem, c: _Descent, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
-    """Return the first step length t among 1, 1/2, 1/4, … for which q + t dq has less energy than q; 0 if no t does."""
+    """Return the first step length t among 1, 1/2, 1/4, … for which the energy at q + t dq is small enough, or 0.
+
+    If the energies at q and q + t dq differ only by roundoff, a smaller residual at q + t dq is also enough. The result
+    is 0 if no step length is found.
+    """
     one, size = jnp.ones((), c.q.dtype), jnp.linalg.norm(c.r)
 
     def good(t):

@@ -1,6 +1,7 @@
-"""Newton's method with a line search, and conjugate gradients or BiCGSTAB. The root is differentiated implicitly.
+"""Newton's method with a line search. The root is differentiated implicitly.
 
-The steps of a scene use `liverjax.solvers.step_cutting` instead, which can divide the load of a step into parts.
+Conjugate gradients or BiCGSTAB solve the linear systems. The steps of a scene use `liverjax.solvers.step_cutting`
+instead, which can divide the load of a step into parts.
 """
 
 from collections.abc import Callable
@@ -37,7 +38,7 @@ class NewtonOptions(NamedTuple):
     adjoint_tolerance: float = 1e-10  # tolerance of the solves for derivatives
     max_linear_iterations: int = 2000
     max_halvings: int = 10
-    symmetric: bool = True  # whether the derivative is symmetric; if not, BiCGSTAB solves the linear systems
+    symmetric: bool = True  # whether the tangent is symmetric; if not, BiCGSTAB solves the linear systems
 
 
 def newton_root(
@@ -54,7 +55,7 @@ def newton_root(
             parameters are exact (implicit function theorem with the true tangent).
         start: first guess, without derivatives.
         precondition: approximate inverse of the tangent, without derivatives.
-        scale: force [N]; the tolerance is relative to this force.
+        scale: a force [N]. The tolerance of the residual is relative to this force.
         options: tolerances and limits.
     """
 
@@ -71,7 +72,7 @@ def newton_root(
 
 
 class _Iterate(NamedTuple):
-    """State of the iteration: `q` has the smallest residual r so far, and `q + t dq` is the next trial."""
+    """State of the iteration: `q` is the iterate with the smallest |r|, and `q + t dq` is the next trial."""
 
     q: jax.Array
     r: jax.Array
@@ -86,7 +87,7 @@ class _Iterate(NamedTuple):
 def _halving_newton(residual, start, precondition, scale, options):
     """Run Newton's method. A step is halved if |r| does not decrease.
 
-    The compiled program contains residual and tangent only once, so the compilation is twice as fast.
+    Residual and tangent occur only once in the compiled program. This makes the compilation twice as fast.
     """
     goal = options.tolerance * scale
     method = conjugate_gradients if options.symmetric else stabilised_biconjugate_gradients
@@ -104,9 +105,9 @@ def _halving_newton(residual, start, precondition, scale, options):
         converged = norm(r) <= goal
         spent = (c.iterations > options.max_iterations) | (halvings > options.max_halvings)
         done = converged | spent | ~jnp.isfinite(norm(r))
-        # The tolerance of the solve is as small as the last Newton step needs, and at most the linear tolerance.
+        # The tolerance of the linear solve is `linear_tolerance`, or smaller if the last Newton step requires it.
         forcing = jnp.clip(0.1 * goal / norm(r), 1e-12, options.linear_tolerance)
-        # With a right-hand side of 0, the linear solver needs no iteration.
+        # If no new direction is needed, the right-hand side is 0, and the linear solver does no iteration.
         load = jnp.where(better & ~done, -r, jnp.zeros_like(r))
         dq, s = method(matvec, load, precondition, forcing, options.max_linear_iterations)
         return _Iterate(

@@ -1,9 +1,9 @@
 """Symmetric matrices of quadratic elements, stored as blocks at their integration points.
 
 A matrix-vector product needs no assembled matrix. At every integration point, an element behaves like a linear element
-with other corners (see `liverjax.mesh.shape_functions`). So its stiffness has 45 numbers per point. A product
-interpolates the motion to these corners, multiplies it by the blocks, and distributes the forces to the nodes. The
-second level of the preconditioner is an assembled matrix of linear elements on the vertices.
+with other corners (see `liverjax.mesh.shape_functions`). So the symmetric stiffness at a point has 45 different
+numbers. A product interpolates the motion to these corners, multiplies it by the blocks, and distributes the forces to
+the nodes. The second level of the preconditioner is an assembled matrix of linear elements on the vertices.
 """
 
 from collections.abc import Sequence
@@ -40,9 +40,9 @@ class PointMatrix(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """The two levels of the preconditioner."""
+    """The matrices of the two levels of the preconditioner."""
 
-    diagonal: Block  # 3 x 3 arrays (V,)
+    diagonal: Block  # diagonal blocks of the matrix, 3 x 3 arrays (V,)
     vertices: BlockMatrix  # the matrix for motions that are linear in every element
 
 
@@ -101,10 +101,10 @@ def levels(mesh: TetMesh, A: PointMatrix, bulk: Number | None = None) -> Levels:
 
 
 def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
-    """Diagonal blocks, 3 x 3 arrays (V,).
+    """Diagonal blocks of the matrix with the given blocks at the integration points: 3 x 3 arrays (V,).
 
     The block of node a is the sum of c_ak K_kl c_al over elements, integration points and k, l = 1, 2, 3. K_kl are the
-    blocks of A. c_ak is the derivative of shape function a with respect to the barycentric coordinate k, minus its
+    given blocks. c_ak is the derivative of shape function a with respect to the barycentric coordinate k, minus its
     derivative with respect to coordinate 0.
     """
     c = basis(mesh.order).c

@@ -1,7 +1,8 @@
 """A coarse space for the preconditioner: affine motions of patches of nodes (`liverjax.mesh.adjacency.patches`).
 
-Block-Jacobi removes errors of short wavelength. The coarse space solves directly for motions that vary slowly over the
-body. The sum of both is a two-level Schwarz preconditioner (Smith, Bjorstad and Gropp 1996).
+The block-Jacobi preconditioner removes errors of short wavelength. In the coarse space, the equations are solved
+directly for motions that vary slowly over the body. The sum of both is a two-level Schwarz preconditioner (Smith,
+Bjorstad and Gropp 1996).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,19 +23,19 @@ Columns = Sequence[jax.Array]
 class Coarse(NamedTuple):
     """Inverse of a matrix that is restricted to the coarse space of P patches, with m components per node."""
 
-    inverse: jax.Array  # (4 m P, 4 m P)
+    inverse: jax.Array  # (4 m P, 4 m P) inverse of the coarse matrix
     used: jax.Array  # False if the coarse space is not used
 
 
 def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coarse:
-    """Make the coarse space from the leading m x m entries of the blocks of A.
+    """Make the coarse space from the first m rows and columns of each block of A.
 
     The stored inverse is 0 if `used` is false, or if the coarse matrix is not positive definite.
 
     Args:
         mesh: `TetMesh`.
         A: the matrix.
-        mask: (V, m) 1 for free directions, else 0. m is 3 for forces and 1 for a pressure.
+        mask: (V, m) 1 for free directions, else 0. m is 3 for displacements and 1 for a pressure.
         used: whether the coarse space saves time (see `worthwhile`).
     """
     f, number = mesh.pattern.patch_functions, mesh.pattern.number_of_patches
@@ -91,7 +92,7 @@ def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Colu
         weighted = jnp.stack([fk * free * r for fk in f for free, r in zip(masks, columns, strict=True)], axis=-1)
         sums = given(jnp.zeros((number, 4 * m), weighted.dtype), patch, weighted)
         motion = (coarse.inverse @ sums.ravel()).reshape(number, 4, m)
-        # The sum is written out: on XLA:CPU a sum over an axis of length four takes more time than everything else.
+        # The sum over k is a Python loop: on XLA:CPU, a sum over an array axis of length 4 would take most of the time.
         return tuple(masks[i] * sum(f[k] * taken(motion[:, k, i], patch) for k in range(4)) for i in range(m))
 
     return apply
@@ -110,7 +111,10 @@ def corrected(
 
 
 def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, number: int) -> jax.Array:
-    """Coarse matrix Z^T A Z (4 m P, 4 m P) of P patches: sum over edges, plus its transpose and the diagonal blocks."""
+    """Coarse matrix Z^T A Z (4 m P, 4 m P) for P patches with the coarse motions Z, with m components per node.
+
+    The matrix is a sum over the edges, plus the transpose of this sum, plus a sum over the diagonal blocks of A.
+    """
     pattern, m = mesh.pattern, mask.shape[1]
     size = 4 * m * number
     low, high = pattern.edges

@@ -1,7 +1,7 @@
-"""Input and output of the solvers of a step: the equations, limits, the tangent that is used again, and statistics.
+"""Input and output of the solvers of a step: the equations, limits, the tangent of an earlier step, and statistics.
 
-q (n,) is the flat vector of unknowns. s is the fraction of the step's load: 0 at the beginning of the step, 1 at its
-end. r(q, s) is the residual.
+q (n,) is the flat vector of unknowns. s is the fraction of the step: the loads are those at its beginning for s = 0,
+and those at its end for s = 1. r(q, s) is the residual.
 """
 
 from collections.abc import Callable
@@ -41,31 +41,34 @@ class StepOptions(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """The tangent of an earlier step. The next step uses it as long as the iterations converge fast."""
+    """Data of one step for the next step: above all the tangent, which is used as long as iterations converge fast."""
 
     tangent: Any
     made: jax.Array  # False if there is no tangent yet
     pace: jax.Array  # linear iterations per digit of accuracy when the preconditioner was new
     worn: jax.Array  # whether the preconditioner now needs many more iterations
-    #: `surprise`: the last root minus its prediction. `trust`: factor (0 to 1) with which the surprise of the step
-    #: before was closest to this vector. The next guess is the prediction plus `trust` times `surprise`.
+    #: `surprise`: the last root minus its prediction. `trust`: the factor (0 to 1) that brings the surprise of the step
+    #: before closest to this vector. The next guess is the prediction plus `trust` times `surprise`.
     surprise: jax.Array
     trust: jax.Array
     beside: jax.Array | None = None  # the additional unknowns at the root (`Problem.beside`)
-    #: The last linear solves for derivatives: the next such solve begins with them. They are zeros without derivatives.
+    #: The last linear solves for derivatives. The next such solve begins with a combination of their solutions. They
+    #: are zeros if no derivatives are computed.
     adjoints: Earlier | tuple[()] = ()
 
 
 class Beside(NamedTuple):
-    """Additional unknowns, for example fluid pressures. `residual` solves for them at every q, beginning at a guess."""
+    """Additional unknowns, for example fluid pressures. `Problem.residual` solves for them at every q, from a guess."""
 
     before: jax.Array  # a guess at the beginning of the step
     #: Function (q, s, guess) -> values of the additional unknowns at q.
     solved: Callable[..., jax.Array]
-    #: Function (solution at a nearby q, factor that multiplies the tolerance) -> guess for `residual` and `solved`.
+    #: Function (additional unknowns at a nearby q, factor that multiplies the tolerance) -> guess for `residual` and
+    #: `solved`.
     guess: Callable[[jax.Array, Number], tuple]
-    #: Function (q, solution) -> r, and the residual of the equation of the additional unknowns. Both are differentiated
-    #: together, so that no inner solve is differentiated. If dr/dq is symmetric, this joint derivative is symmetric.
+    #: Function (q, additional unknowns) -> r, and the residual of the equation of the additional unknowns. Both are
+    #: differentiated together, so that no inner solve is differentiated. If dr/dq is symmetric, this joint derivative
+    #: is symmetric too.
     lack: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 
@@ -73,8 +76,8 @@ class Problem(NamedTuple):
     """Equations of a step, and functions that solve the linear systems of these equations."""
 
     #: Function (q, s) -> (r, force, by). r is the residual (n,), `force` is the norm of all forces for the relative
-    #: residual, and `by` is data for `tangent`. Derivatives with respect to numbers in this function are exact at the
-    #: root. If there are additional unknowns (`beside`), `by` contains their values, and a third argument is a guess.
+    #: residual, and `by` is data for `tangent`. At the root, derivatives of r with respect to `numbers` are exact.
+    #: If there are additional unknowns (`beside`), `by` contains their values, and a third argument is a guess.
     residual: Callable[..., tuple[jax.Array, jax.Array, Any]]
     #: Function (q, s, by, near) -> any pytree that represents dr/dq. This tangent is used again while iterations
     #: converge fast. `near` is None or a pair (flag, earlier tangent). The flag shows whether parts of the earlier
@@ -83,7 +86,7 @@ class Problem(NamedTuple):
     #: Function (tangent, b, tolerance, max_iterations) -> (x, iterations, positive): x solves dr/dq x = b, and
     #: `positive` shows whether dr/dq seems positive definite.
     solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array, jax.Array]]
-    #: Function tangent -> approximate inverse of dr/dq, for derivatives.
+    #: Function tangent -> approximate inverse of dr/dq, a function of vectors (n,). It is used for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
     #: Function for derivatives if dr/dq is symmetric: (tangent, b, tolerance, max_iterations, earlier solves) -> the
     #: solution with the exact dr/dq, the right-hand side, and the residual divided by the norm of the right-hand side.
@@ -93,14 +96,14 @@ class Problem(NamedTuple):
     adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
     #: Whether dr/dq is symmetric.
     symmetric: bool = True
-    #: Whether r depends on s.
+    #: Whether r may depend on s.
     moved: bool = True
-    #: The norm of r that the rounding of q causes.
+    #: Norm of the change of r that the rounding of q causes.
     roundoff: Any = 0.0
     beside: Beside | None = None
     #: Whether dr/dq can jump, for example where contact begins.
     kinks: bool = False
-    #: The energy that is minimised if Newton's method along the load fails; None: nothing is minimised.
+    #: The energy that is minimised if Newton's method fails; None: no energy is minimised.
     potential: "Potential | None" = None
     #: A pytree of all numbers on which r depends, except q and s. The root has derivatives with respect to these
     #: numbers.
@@ -108,7 +111,7 @@ class Problem(NamedTuple):
 
 
 class Potential(NamedTuple):
-    """Energy of a step. It is minimised if Newton's method along the load fails."""
+    """Energy of a step. It is minimised if Newton's method (`liverjax.solvers.step_cutting`) fails."""
 
     #: Function (q, start) -> energy. The gradient of the energy at `start` is r(start, 1). Forces without an energy
     #: keep their values at `start`.
@@ -128,5 +131,5 @@ class Potential(NamedTuple):
     settled: Callable[[jax.Array], jax.Array] | None = None
     #: Number of unknowns that are positions; None: all unknowns are positions.
     positions: int | None = None
-    #: Whether a solve with a definite tangent eliminates the pressures. Then no stricter tolerance is needed for it.
+    #: Whether a solve with a definite tangent eliminates the pressures. Such a solve needs no stricter tolerance.
     eliminates: bool = False

@@ -1,11 +1,11 @@
 """Newton's method along a load: the solution is followed from the last equilibrium, if necessary in substeps.
 
 The residual r(q, s) contains the loads and prescribed motions at the beginning of the step for s = 0, and at its end
-for s = 1. Out-of-balance forces at the beginning (inertia, a fluid) are reduced linearly: r - (1 - s) r(start, 0) is 0
-at the beginning of the step. A part of the load, from s to s + ds, is called a substep. Every substep begins with a
-linear solve, with the tangent at its beginning and the right-hand side -(r + dr/ds ds). So a prescribed motion enters
-through the tangent and not as a jump. If a substep fails, it is halved. Only the root at s = 1 is returned and
-differentiated.
+for s = 1. At the beginning of a step, forces may be out of balance (inertia, a fluid). So the equation that is solved
+is r - (1 - s) r(start, 0) = 0, which holds at the beginning. A part of the load, from s to s + ds, is called a substep.
+Every substep begins with a linear solve, with the tangent at its beginning and the right-hand side -(r + dr/ds ds). So
+a prescribed motion enters through the tangent and not as a jump. If a substep fails, it is halved. Only the root at
+s = 1 is returned and differentiated.
 """
 
 from functools import partial
@@ -38,7 +38,7 @@ _PRECISIONS, ROUNDINGS = 4096, 8
 #: this number of times per substep. The tangent is different beyond a kink.
 _LEAPS = 8
 
-#: A guess is not used if the volume ratio of an element is below this value: the guess may lead to a folded shape.
+#: A guess is not used if the volume ratio of any element is below this value. Such a guess may lead to a folded shape.
 _FLAT = 0.1
 
 #: Maximum tolerance of the linear solve if a step consists of only one solve.
@@ -60,7 +60,7 @@ class _Point(NamedTuple):
     size: jax.Array  # |r| at q
     aim: jax.Array  # norm of the right-hand side for the last direction dq
     kept: Kept
-    beside: jax.Array | None  # additional unknowns at q (`Problem.beside`), or None
+    beside: jax.Array | None  # additional unknowns at q (`Problem.beside`); None if there are none
     looser: jax.Array  # factor that multiplies the tolerance of the next solve for `beside`
     indefinite: jax.Array  # whether the tangent of the last solve was not positive definite
     stale: jax.Array  # whether dq comes from a tangent that was made at an earlier iterate
@@ -143,8 +143,8 @@ def solve(
         guessing = jnp.array(guess is not None)
         return _follow(problem, start, start if guess is None else guess, guessing, kept, options)
 
-    # There are two derivative rules: the search has no derivative, and the derivative of the root uses the tangent
-    # there. For the first rule, any function with a constant root is enough.
+    # There are two derivative rules: the search has no derivative, and the derivative of the root uses the tangent at
+    # the root. For the first rule, any function with a constant root is enough.
     if options.differentiable:
         found_by = jax.lax.custom_root(lambda q: q, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     else:
@@ -174,10 +174,10 @@ def _with_derivative(
     tolerance: Number,
     near: Any,
 ) -> tuple[jax.Array, jax.Array | None, Earlier | tuple[()]]:
-    """Return the root q and `beside` with implicit derivatives, and the solves with which the next derivative begins.
+    """Return the root q and `beside` with implicit derivatives, and the earlier linear solves for the next derivative.
 
     These solves must be carried from step to step. So they are treated as additional unknowns that are equal to `last`.
-    Forward mode carries them to the next step, and reverse mode to the previous step.
+    Forward mode carries the solves to the next step, and reverse mode carries them to the previous step.
     """
     one, n = jnp.ones((), q.dtype), len(q)
     both, lacking = q, None
@@ -232,7 +232,7 @@ def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Ar
 
 
 def _one_step(problem: Problem, start: jax.Array, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
-    """Do one linear solve from the beginning of the step (chapter, section 4.1.2), with the chosen stiffness."""
+    """Do one linear solve from the beginning of the step (book chapter, section 4.1.2), with the chosen stiffness."""
     if problem.potential is not None:
         problem = problem._replace(tangent=problem.potential.definite)
     zero, one = jnp.zeros((), start.dtype), jnp.ones((), start.dtype)
@@ -267,7 +267,7 @@ def _follow(
 def _robust(
     problem: Problem, potential: Potential, start: jax.Array, guess: jax.Array, kept: Kept, options: StepOptions
 ) -> tuple[jax.Array, jax.Array]:
-    """Follow the solution along the load. Minimise the energy if this fails or if elements are inverted at first.
+    """Follow the solution along the load. Minimise the energy if this fails or if elements are inverted at `start`.
 
     Without inertia, a start that differs from the reference shape is only a guess. If an element of the guess is nearly
     flat, or if the guess leads to no solution, the solution is followed from the reference shape.
@@ -341,8 +341,8 @@ class _Verdict(NamedTuple):
 
     accepted: jax.Array  # the trial iterate replaces the last accepted one
     better: jax.Array
-    converged: jax.Array  # at the end of a substep
-    arrived: jax.Array  # converged at the end of the last substep
+    converged: jax.Array  # whether the iterations of the substep have converged
+    arrived: jax.Array  # whether the last substep has converged, so that the step is finished
     remake: jax.Array
     failed: jax.Array
     lost: jax.Array  # the guess leads to no solution: the last equilibrium is tried next, and no cut is counted
@@ -364,7 +364,7 @@ def _judge(
     better = finite & ((size < c.size) | free | c.remake) & ~c.launch
     converged = better & (relative <= options.tolerance)
     arrived = converged & (s >= 1)
-    # If dq comes from an earlier tangent and does not reduce |r|, a new tangent is made first. The step is not halved.
+    # If dq comes from an earlier tangent and does not reduce |r|, a new tangent is made first. dq is not halved yet.
     remake = ~better & ~c.launch & c.stale
     halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
     small = (c.relative <= _PRECISIONS * float(jnp.finfo(size.dtype).eps)) | (c.size <= ROUNDINGS * problem.roundoff)
@@ -413,7 +413,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         load = load - jax.lax.cond(v.launch_now, lambda: ds * _along(problem, trial, s), lambda: jnp.zeros_like(r))
     slow = c.remake | (size > _CONTRACTION * c.aim)
     renew = (v.launch_now & (~c.guessing | ~c.kept.made)) | (v.go_on & ~v.launch_now & slow)
-    # The solve is only as accurate as is useful (Eisenstat and Walker 1996), and as the tolerance of the step needs.
+    # The linear solve is not more accurate than is useful (Eisenstat and Walker 1996) or than the tolerance requires.
     ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
     reach = 0.3 * jnp.where(renew, ratio**2, ratio)
     goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
@@ -452,15 +452,16 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     )
 
 
-#: Error of the solve for the additional unknowns, divided by the residual that is expected after the next iteration.
+#: Allowed error of the solve for the additional unknowns, divided by the residual that is expected after the next
+#: iteration.
 _BESIDE = 0.1
 
 
 def _looser(options: StepOptions, v: _Verdict, expected: jax.Array, before: jax.Array) -> jax.Array:
     """Return the factor that multiplies the tolerance of the next solve for the additional unknowns.
 
-    The factor is as large as the next residual allows. At the beginning of a substep this residual is unknown, so the
-    factor is 1.
+    The factor is proportional to the residual that is expected after the next iteration, and at least 1. If a substep
+    begins again, this residual is unknown, so the factor is 1.
     """
     wanted = jnp.maximum(1.0, _BESIDE * expected / options.tolerance)
     return jnp.where(v.failed | v.lost, 1.0, jnp.where(v.go_on, wanted, before)).astype(before.dtype)
@@ -474,12 +475,12 @@ def _along(problem: Problem, q: jax.Array, s: jax.Array) -> jax.Array:
 def _direction(
     problem: Problem, kept: Kept, at: Any, load: jax.Array, forcing: Number, when: tuple[Number, Number]
 ) -> tuple[jax.Array, jax.Array, Kept, jax.Array]:
-    """Solve dr/dq dq = load with the tolerance `forcing`.
+    """Solve dr/dq dq = load for dq, with the right-hand side `load` and the relative tolerance `forcing`.
 
     Return dq, the number of iterations, the new `kept`, and whether dr/dq seems positive definite.
 
-    `at` contains q, s and `by` (`Problem.residual`). `when` contains two values: whether a new tangent is made, and
-    whether a solution is needed.
+    `at` contains q, s and `by`, a result of `Problem.residual`. `when` contains two flags: whether a new tangent is
+    made, and whether a solution is needed (otherwise dq is 0).
     """
     near, (renew, wanted) = (kept.made & ~kept.worn, kept.tangent), when
     q, s, by = at

@@ -90,7 +90,7 @@ def right_cauchy_green(F: Matrix) -> Matrix:
 
 
 def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
-    """Return those of the invariants I1, I2 and J of F whose names are in `names`."""
+    """Return the invariants of F whose names are in `names` (possible names: I1, I2 and J)."""
     values = {}
     if "I1" in names or "I2" in names:
         values["I1"] = sum(dot(row, row) for row in F)
@@ -148,8 +148,9 @@ def stored(values: T) -> T:
 def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
     """Return the deformation gradient F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3.
 
-    x_a are the positions of the nodes of an element, and D_a the gradients of their shape functions. All D_a, with D_0,
-    add up to 0. The entries of F are (E,), or (Q, E) if elements have Q integration points (`TetMesh.edges`).
+    x_a are the positions of the nodes of an element, and D_a the gradients of their shape functions. The sum of all
+    D_a, including D_0, is 0. The entries of F are (E,), or (Q, E) if elements have Q integration points
+    (`TetMesh.edges`).
 
     Args:
         mesh: `TetMesh`.

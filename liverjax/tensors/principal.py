@@ -4,7 +4,7 @@ With the principal stretches lambda_m, the sum Xi(alpha) = sum_m lambda_m^alpha 
 C, although the eigenvectors of C are not. So the eigenvectors are constant in derivatives. In the axes of the
 eigenvectors, C = diag(c) + X. The value of X is zero, but X has derivatives. Then
 
-    tr (C + X)^q = sum f(c_i) + sum g[c_i] X_ii + 1/2 sum g[c_i, c_j] X_ij^2 + 1/3 sum g[c_i, c_j, c_k] X_ij X_jk X_ki
+    tr C^q = sum f(c_i) + sum g[c_i] X_ii + 1/2 sum g[c_i, c_j] X_ij^2 + 1/3 sum g[c_i, c_j, c_k] X_ij X_jk X_ki
 
 with q = alpha/2, f(c) = c^q, g = f' and the divided differences g[...] of g (Daleckii and Krein 1965). This expansion
 is exact up to the third derivative.
@@ -95,7 +95,7 @@ def stretches(F: Matrix) -> Stretches:
 
 
 def change(F: Matrix, orders: int) -> tuple:
-    """Return the six entries of C minus their values.
+    """Return the six entries of C = F^T F minus their values.
 
     The results are zeros, but they can be differentiated `orders` times with respect to F.
     """
@@ -157,7 +157,7 @@ _PAIRS_OF_NODES = ((0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1))  # indices i and j of
 def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -> jax.Array:
     """Return the sum over m of (J^(-1/3) lambda_m)^alpha, minus 3, computed with the expansion in the module docstring.
 
-    JAX can differentiate this function with respect to alpha, X and ln J.
+    JAX can differentiate this function with respect to alpha, X (argument `change`) and ln J.
 
     Divided differences of the same kind are computed as one array. So only a tenth of the operations must be compiled.
     """
@@ -185,7 +185,7 @@ def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -
 def divided_difference(p: Number, *logs: Number) -> jax.Array:
     """Return the divided difference of c^p at one, two or three nodes c = exp(log).
 
-    It is also accurate for nodes that are close to each other or equal.
+    The result is also accurate for nodes that are close to each other or equal.
     """
     if len(logs) == 1:
         return jnp.exp(p * logs[0])
@@ -208,7 +208,7 @@ def _divided_power(p: Any, y: list) -> Number:
 
     It is computed by the binomial series of the power, truncated at 0.11^16 = 5e-16.
     """
-    homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]  # complete homogeneous sums h_k of the nodes y
+    homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]  # complete homogeneous polynomials h_k of y
     for node in y:
         for k in range(1, 16):
             homogeneous[k] = homogeneous[k] + node * homogeneous[k - 1]

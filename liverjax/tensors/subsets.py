@@ -29,9 +29,7 @@ class Subsets(NamedTuple):
 
 
 def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
-    """Return the subsets. The first one contains the elements without a group, if there are any.
-
-    Then follow the groups.
+    """Return the subsets: first the elements without a group (if there are any), then the groups.
 
     Args:
         groups: element numbers (n,) of each group. No element is in two groups. Inside jit the numbers may be unknown.
@@ -48,9 +46,9 @@ def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
 
 
 def in_subset(s: Subsets, k: int, numbers: T) -> T:
-    """Return a pytree in which arrays (…, E) and (…, E, 3) have only the elements of subset k.
+    """Return a pytree in which arrays (…, E) and (…, E, 3) have values only for the elements of subset k.
 
-    Other arrays do not change.
+    E is the number of all elements. Other arrays do not change.
     """
     E, own = s.number_of_elements, s.elements[k][0]
 

@@ -15,8 +15,8 @@ _LEAST_PER_WAVE = 2.0
 
 
 def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]:
-    """Return warnings about the mesh, the volume constraint, the density and the excitation of a scene with harmonic
-    motion.
+    """Return warnings about mesh, volume constraint, density, excitation, ligaments and obstacles of a scene with
+    harmonic motion.
 
     Args:
         scene: `Scene` with known numbers (not inside jit, grad or vmap).

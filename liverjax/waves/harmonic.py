@@ -11,6 +11,7 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Number, Numbers, param, replace, struct
 from liverjax.mesh.promotion import on_middles
+from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import viscosity
 from liverjax.physics.contact.friction import RoughObstacle
 from liverjax.physics.contact.pressed import PressedObstacle
@@ -22,6 +23,7 @@ from liverjax.scenes.scene import HIGHEST_HZ, Scene
 from liverjax.scenes.springpots import check_springpots, series_at_rest, springpot_factors
 from liverjax.simulation.equations import Sizes, equations, initial_state
 from liverjax.simulation.run import prepared
+from liverjax.solvers.factors.memory import free_memory
 from liverjax.waves import sparse
 from liverjax.waves.operator import Operator, free_part, operator
 from liverjax.waves.rest import under_its_weight, without_history
@@ -46,7 +48,7 @@ class Harmonic:
     displacement: jax.Array = param("m", "u, complex (F, V, 3)")
     reactions: jax.Array = param("N", "complex (F, V, 3), forces on the body at constrained nodes")
     residual: jax.Array = param("1", "(F,) out-of-balance forces at free nodes, divided by the size of all forces")
-    pressure: jax.Array | None = param("Pa", "complex (F, V), fluid pressure in a porous scene", default=None)
+    pressure: jax.Array | None = param("Pa", "complex (F, V), fluid pressure in a porous body", default=None)
 
     def check(self) -> "Harmonic":
         """Return the result itself. Raise `RuntimeError` with advice if a frequency has no solution. Do not call this
@@ -76,16 +78,16 @@ def harmonic(
 
     Args:
         scene: `Scene`. The motion of `displaced` is an amplitude with phase 0.
-        frequencies_Hz: (F,), above 0; default: the frequencies of scene.solve.
+        frequencies_Hz: F frequencies (F,), above 0; default: the frequencies of scene.solve.
         factors: complex factors G*/G0 that multiply the relaxing part of the stress, (F,), or (F, E) with one value for
             each element. Default: 1 - sum g_k/(1 + i omega tau_k) with the ratios g_k and relaxation times tau_k of the
             scene's Prony series, or the factor of its springpots; 1 without viscosity. Nodal pressures (volumetric
             "mixed" or "nodal", or a porous body) do not relax.
         about: positions (V, 3) [m] about which the body vibrates: an equilibrium after a long time, for example from
             `simulate`. The stress in this state changes the stiffness; the fluid pressure is 0. Default: the state of
-            rest under gravity and pre-tension, from a static run. Without both, this run is not done and the reference
-            shape is used. If the components of gravity are JAX tracers (inside jit, grad or vmap), the run is always
-            done.
+            rest under gravity and pre-tension, from a static run. In a scene without gravity and pre-tension, this run
+            is not done and the reference shape is used. If the components of gravity are JAX tracers (inside jit, grad
+            or vmap), the run is always done.
         motion: complex amplitudes (V, 3) or (F, V, 3) [m] that replace the prescribed motion of the scene.
         mass: "consistent" (mass matrix of each element), or "lumped" as in transient runs.
 
@@ -93,8 +95,9 @@ def harmonic(
         `Harmonic`. The result is NaN at a frequency with a singular matrix.
 
     Raises:
-        InputError: the scene contains something that is not implemented for harmonic motion (pressures that follow the
-            surface, friction, rigid plates); shapes or values cannot be used; there is no state of rest under gravity.
+        InputError: the scene contains something that is not implemented for harmonic motion (for example a pressure
+            that follows the surface, friction, or a rigid plate); shapes or values cannot be used; there is no state of
+            rest under gravity.
     """
     weighed = scene
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
@@ -106,13 +109,15 @@ def harmonic(
     number, elements = len(omegas), mesh.number_of_elements
     factors = _factors(scene, omegas) if factors is None else jnp.asarray(factors, complex)
     if factors.shape not in ((number,), (number, elements)):
-        raise InputError(f"the argument factors has shape {factors.shape}: give ({number},) or ({number}, {elements})")
+        raise InputError(
+            f"the argument 'factors' has shape {factors.shape}: give ({number},) or ({number}, {elements})"
+        )
     if motion is None:
         motion = prescribed(mesh, tuple(replace(d, times=None, history=None) for d in scene.displaced), 0.0, 1.0)
     motion = jnp.asarray(motion, complex)
     if motion.shape not in (mesh.points.shape, (number, *mesh.points.shape)):
         raise InputError(
-            f"the argument motion has shape {motion.shape}: give {mesh.points.shape}, or one such array per frequency"
+            f"the argument 'motion' has shape {motion.shape}: give {mesh.points.shape}, or one such array per frequency"
         )
     _check_about(scene, about)
     motion = jnp.broadcast_to(motion, (number, *mesh.points.shape))
@@ -130,7 +135,7 @@ def _check_about(scene: Scene, about: jax.Array | None) -> None:
         )
     if jnp.shape(about) != scene.mesh.points.shape:
         raise InputError(
-            f"the argument about has shape {jnp.shape(about)}: give positions of shape {scene.mesh.points.shape}"
+            f"the argument 'about' has shape {jnp.shape(about)}: give positions of shape {scene.mesh.points.shape}"
         )
 
 
@@ -168,7 +173,7 @@ def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, ab
     out, unbalanced = jax.vmap(lambda *m: free_part(A, m))(f, balance)
     residual = _part(out, jnp.abs(f - out) + jnp.abs(load[0]))
     if unbalanced is not None and p is not None:
-        # The residual is divided by the change of volume at the nodes of the pressures, or by the fluid that enters.
+        # The residual of the volume balance is divided by the sizes of the volume changes and of the inflow.
         taken: Any = sparse.at_every(A, *at, (u, jnp.zeros_like(p)))[1]
         residual = jnp.maximum(residual, _part(unbalanced, jnp.abs(taken) + jnp.abs(load[1])))
     return Harmonic(
@@ -196,8 +201,8 @@ def _prescribed_and_loads(
 
 
 def _part(out: jax.Array, work: jax.Array) -> jax.Array:
-    """Return the relative residuals (F,): norms of the out-of-balance forces `out`, divided by the norms of all forces
-    `work`."""
+    """Return the relative residuals (F,) at F frequencies: norms of the out-of-balance forces `out`, divided by the
+    norms of all forces `work`."""
     sizes = [jnp.linalg.norm(a.reshape(len(a), -1), axis=1) for a in (out, work)]
     return sizes[0] / jnp.where(sizes[1] > 0, sizes[1], 1.0)
 
@@ -217,7 +222,7 @@ def _frequencies(frequencies_Hz: Any) -> jax.Array:
 
 
 def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
-    """Return the complex factors G*/G0 of the scene's viscosity, (F,), or (F, E) with one value for each element."""
+    """Return the complex factors G*/G0 of viscosity at F frequencies: (F,), or (F, E) with one value per element."""
     prony = scene.viscosity
     if prony is None:
         return jnp.ones(omegas.shape, complex)
@@ -232,15 +237,36 @@ def _drains(porosity: Porosity) -> bool:
     return porosity.drained is not None or any(inlet.nodes is not None for inlet in porosity.inlet)
 
 
+#: For elements of order 1, 2 and 3: number of nodes of an element, and the maximum memory while element matrices are
+#: computed, divided by the memory of these matrices (measured for order 1 and 2).
+_NODES, _TEMPORARY = (4, 10, 20), (4, 6, 6)
+
+
+def _check_memory(mesh: TetMesh) -> None:
+    """Raise InputError if the element matrices need more memory than the processor has left. Without this check, the
+    operating system would end the program without a message."""
+    if jax.default_backend() != "cpu":
+        return
+    bytes_of_one = 8 * (3 * _NODES[mesh.order - 1]) ** 2
+    needed, free = _TEMPORARY[mesh.order - 1] * bytes_of_one * mesh.number_of_elements, free_memory()
+    if needed > free:
+        raise InputError(
+            f"the element matrices of {mesh.number_of_elements} elements of order {mesh.order} need about "
+            f"{needed / 1e9:.3g} GB of memory, but only {free / 1e9:.3g} GB are free: use a coarser mesh, "
+            f"{'order = 1, ' if mesh.order > 1 else ''}or a machine with more memory"
+        )
+
+
 def _small(scene: Scene, mass: str) -> Scene:
     """Return the scene without time and gravity. Raise InputError if it contains something that is not implemented for
     harmonic motion."""
     if mass not in MASSES:
         raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
+    _check_memory(scene.mesh)
     if scene.points_are == "loaded":
         raise InputError(
             '[mesh] is = "loaded" cannot be used in harmonic motion: use the scene of lj.unloaded(scene), and give the '
-            "last positions of a run of this scene as the argument about"
+            "last positions of a run of this scene as the argument 'about'"
         )
     if any(isinstance(physics, RoughObstacle | PressedObstacle) for physics in scene.physics):
         raise InputError(
@@ -248,7 +274,9 @@ def _small(scene: Scene, mass: str) -> Scene:
             "transient run"
         )
     if follows(scene.traction):
-        raise InputError("a pressure that follows the body cannot be used in harmonic motion: give a traction as value")
+        raise InputError(
+            "a pressure that follows the body cannot be used in harmonic motion: give traction.value instead"
+        )
     solve = replace(scene.solve, **_STILL)
     traction = tuple(replace(t, times=None, history=None) for t in scene.traction)
     body = None if scene.body is None else replace(scene.body, gravity=jnp.zeros(3), times=None, history=None)

@@ -20,7 +20,8 @@ from liverjax.waves.rest import under_its_weight
 
 @struct
 class HarmonicError:
-    """Estimated errors of the amplitudes: amplitude on an infinitely fine mesh minus computed amplitude."""
+    """Estimated errors of the amplitudes at F frequencies: the amplitudes on an infinitely fine mesh minus the computed
+    amplitudes."""
 
     displacement: jax.Array = param("m", "complex (F, V, 3)")
     reactions: jax.Array = param("N", "complex (F, V, 3); add the errors over the nodes of each support")
@@ -36,7 +37,7 @@ def harmonic_mesh_error(
     about: jax.Array | None = None,
     motion: Number | None = None,
 ) -> jax.Array:
-    """Return the estimated mesh error of the displacements, complex (F, V, 3) [m].
+    """Return the estimated mesh error of the displacements at F frequencies, complex (F, V, 3) [m].
 
     The arguments are the same as for `harmonic_errors`, which also returns the errors of reactions and pressures.
     """
@@ -101,8 +102,8 @@ def _richer_elements(scene: Scene) -> Scene:
 
 
 def _on_nodes(mesh: TetMesh, rich: TetMesh, within: Within | None, forces: jax.Array) -> jax.Array:
-    """Return the forces (F, V, 3) [N] on the nodes of the original mesh that are equivalent to `forces` [N] on the
-    nodes of the mesh `rich`."""
+    """Return the forces (F, V, 3) [N] on the nodes of the original mesh, at F frequencies. They are equivalent to
+    `forces` [N] on the nodes of the mesh `rich`."""
     nodes = mesh.number_of_nodes
     if within is not None:
         return jax.vmap(lambda f: within.forces(f, nodes))(forces)

@@ -112,7 +112,7 @@ def _times_identity(value: jax.Array) -> Matrix:
 
 
 def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
-    """Return element matrices (n, 3, n, 3, E) [N/m] from blocks per unit volume at the integration points."""
+    """Return stiffness matrices (n, 3, n, 3, E) [N/m] of elements with n nodes, from `_blocks` per unit volume."""
     weighted = {(a + 1, b + 1): scale_matrix(mesh.weights, K) for (a, b), K in zip(_OWN, blocks, strict=True)}
     corners = jnp.stack([jnp.stack([_stacked(K) for K in row]) for row in mjed.all_blocks(weighted)])
     if mesh.order == 1:
@@ -122,7 +122,7 @@ def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
 
 
 def _both_ways(mesh: TetMesh, K: jax.Array) -> jax.Array:
-    """Multiply element matrices (n, …, n, …, E) by the signs of the shape functions, for rows and columns. Shape
+    """Multiply the rows and columns of element matrices (n, …, n, …, E) by the signs of their n shape functions. Shape
     functions of order 3 have a direction along their edge, so their sign depends on the element."""
     if mesh.order < 3:
         return K
@@ -151,8 +151,8 @@ Motion = tuple[jax.Array, jax.Array | None]
 
 
 def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion) -> Motion:
-    """Return the complex nodal forces (V, 3) [N] due to a motion, and the left-hand side of the volume balance (P,)
-    [m^3] (see `liverjax.waves.pressures`; None without pressures).
+    """Return the complex nodal forces (V, 3) [N] due to a motion, and the left-hand side (P,) [m^3] of the volume
+    balance for P unknown pressures (see `liverjax.waves.pressures`). This is None if no pressures are unknown.
 
     Args:
         A: `Operator`.

@@ -134,8 +134,8 @@ def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _pull(mesh: TetMesh, g: list) -> jax.Array:
-    """Return the nodal forces (n, 3, 4, E) [m^2] of unit pressures at the four vertices of each element. `g`:
-    derivatives of the volume ratio with respect to the positions of the four corners."""
+    """Return the forces (n, 3, 4, E) [m^2] on the n nodes of each element due to unit pressures at its four vertices.
+    `g`: derivatives of the volume ratio with respect to the positions of the four corners."""
     own = mesh.weights[None, None] * jnp.stack([jnp.stack(vector) for vector in g])  # (4, 3, E), or (4, 3, Q, E)
     if mesh.order == 1:
         return jnp.broadcast_to(own[:, :, None] / 4, (4, 3, 4, mesh.number_of_elements))

@@ -53,13 +53,13 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
     except RuntimeError as error:
         raise InputError(
             f"no state of rest under gravity or tension was found ({error}): fix the body, or give a state "
-            "with the argument about"
+            "of rest as the argument 'about'"
         ) from None
 
 
 def without_history(physics: Physics) -> Physics:
-    """Return the physics object (load, support, contact …) without its history. A support then has its stiffness
-    without factors, and an obstacle is at its position at time 0."""
+    """Return the physics object (support, obstacle, …) without its history. A support then has a constant stiffness,
+    and an obstacle stays at its position at time 0."""
     changed: Content = {name: None for name in ("times", "history") if getattr(physics, name, None) is not None}
     if isinstance(physics, Obstacle):
         changed |= {"by": None, "position": jnp.asarray(physics.position) + physics.displacement(0, 1, 0.0)}

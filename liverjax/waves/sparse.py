@@ -96,10 +96,10 @@ class _Order(NamedTuple):
     The unknowns are numbered node by node (x, y, z), and the pressures are last.
     """
 
-    pairs: np.ndarray  # (n n E,) index of the block for each pair of nodes of an element
-    blocks: "scipy.sparse.csr_array"  # (V, V): pairs of nodes with a common element
+    pairs: np.ndarray  # (n n E,) index of the matrix block for each pair of the n nodes of an element
+    blocks: "scipy.sparse.csr_array"  # (V, V): one matrix block for each pair of nodes with a common element
     free: np.ndarray  # indices of the free unknowns
-    entries: "scipy.sparse.csr_array | None"  # positions of the free entries in the blocks; None if others exist
+    entries: "scipy.sparse.csr_array | None"  # entries of free unknowns in the matrix blocks; None: see `_order`
     plan: list[multifrontal.Front]
 
 
@@ -132,7 +132,7 @@ def _free_unknowns(A: Any) -> np.ndarray:
 
 
 def _digest(A: Any) -> bytes:
-    """Return a digest of all arrays of A, which is the same for the same numbers."""
+    """Return a digest of all arrays of A. Equal arrays have equal digests."""
 
     def of_leaf(leaf: np.ndarray) -> bytes:
         return hashlib.blake2b(np.ascontiguousarray(leaf).data, digest_size=16).digest()
@@ -142,8 +142,10 @@ def _digest(A: Any) -> bytes:
 
 
 def _order(A: Any, free: np.ndarray) -> _Order:
-    """Return the order of elimination for this mesh. It is computed only if the mesh differs from the mesh of the last
-    call."""
+    """Return the order of elimination. It is computed only if the mesh or the free unknowns differ from the last call.
+
+    The field `entries` is None if the matrix has entries that do not come from the elements (`_elements_alone`).
+    """
     import scipy.sparse  # imported only where it is used, because it takes a fifth of the package's import time
 
     V, widths = len(A.points), [A.nodes, *(own.nodes for own in A.attached)]
@@ -175,7 +177,7 @@ def _elements_alone(A: Any) -> bool:
 
 
 def _entries_of_free(blocks: "scipy.sparse.csr_array", free: np.ndarray) -> "scipy.sparse.csr_array":
-    """Return the positions of the entries of free unknowns among the entries of all blocks."""
+    """Return a sparse matrix of the free unknowns. Its entries are indices into the entries of all matrix blocks."""
     import scipy.sparse
 
     every = np.arange(9 * blocks.nnz, dtype=np.min_scalar_type(9 * blocks.nnz)).reshape(-1, 3, 3)
@@ -290,7 +292,7 @@ def _pivoted(K: Any, b: np.ndarray) -> np.ndarray:
 
     try:
         return scipy.sparse.linalg.splu(K.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(b.astype(K.dtype))
-    except (RuntimeError, ValueError):  # singular, or not finite
+    except (RuntimeError, ValueError):  # the matrix is singular or not finite
         return np.full(len(b), np.nan)
 
 

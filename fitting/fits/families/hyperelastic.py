@@ -21,7 +21,7 @@ class Candidate(NamedTuple):
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Callable[[jax.Array, Any], jax.Array]  # (u, modulus scale [Pa]) -> parameters in the order of `names`
-    law: Callable[[jax.Array], Law]  # law with these values, without volumetric energy
+    law: Callable[[jax.Array], Law]  # parameters -> law without volumetric energy
     random: Callable[[np.random.Generator, int], np.ndarray]  # (generator, n) -> n random starting points (n, len(u))
     notes: tuple[str, ...] = ()  # notes about parameters that are not fitted
 
@@ -39,7 +39,8 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
         raise InputError(f"--terms {terms} cannot be used with {name}, only with ogden: remove --terms")
     if name == "all":
         singles = [c for n in laws.LAWS if n != "ogden" and incompressible_form(n) for c in candidates(n)]
-        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term is the law bogen
+        # By default, Ogden's law with one term is not added, because `singles` contains the equal law bogen.
+        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]
     typical = gradient_check.load(name)
     if laws.isochoric_part(typical) is None:
         usable = ", ".join(n for n in laws.LAWS if incompressible_form(n))
@@ -119,8 +120,8 @@ def _single(label: str, typical: Law) -> Candidate:
 
 
 def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
-    """Return the parameters (fields) of the law that are fitted, because their value is not 0, and notes on the
-    parameters that are not fitted.
+    """Return the parameters (fields) of the law that are fitted, and notes on the other parameters. A parameter is not
+    fitted if its value is 0 or missing.
 
     Raises:
         InputError: a parameter is a list, or no parameter is left to be fitted.
@@ -138,7 +139,8 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
     fitted = [f for f in given if f.name not in zero]
     if not fitted:
         raise InputError(
-            f"no parameter of law {label} has a value other than 0: give a value to each parameter that is to be fitted"
+            f"no parameter of law {label} has a value other than 0, so none can be fitted: give a value to each "
+            "parameter that is to be fitted"
         )
     notes = []
     if zero:

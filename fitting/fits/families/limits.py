@@ -11,7 +11,7 @@ from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.uncertainty import NO_REST, equilibrium_error
 
-#: A warning reports a difference above this many standard errors.
+#: The program warns if a difference exceeds this many standard errors.
 TOLD = 2.0
 #: Limit for the decrease of G' in the lowest half decade of the band, divided by its decrease in the next half decade.
 #: Above this limit, the material may relax much more at lower frequencies. One relaxation time well inside the band

@@ -40,7 +40,7 @@ class SpectrumFit(NamedTuple):
     model: Maxwell  # few Prony modes that represent the spectrum
     solution: Solution
     spread: Estimate  # parameters of these modes, with standard errors
-    own: Estimate  # equilibrium modulus and strengths
+    own: Estimate  # equilibrium modulus and strengths of the spectrum, with standard errors
     details: Content
     sentences: tuple[str, ...]
 
@@ -103,7 +103,8 @@ def spectrum_of(
 
     Args:
         tests: one or more tests.
-        near: Prony modes with about the same moduli as the tests. These modes give the unit of each strength.
+        near: Prony modes with about the same moduli as the tests. The strengths are scaled by the moduli of these
+            modes.
         noise: relative noise of each test.
     """
     low, high = together.resolved_by(tests)

@@ -68,7 +68,7 @@ def _dense_modes(case: Fractional, spans: Spans) -> Callable[[Array], Maxwell]:
 
 
 def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], jax.Array]:
-    """Return a JAX function from the variables u of the springpot model `name` to the residuals (m,) of the m fitted
+    """Return a JAX function from the variables u of the springpot model `name` to the residuals (m,) of the m measured
     values of a relaxation or creep test."""
     (case,) = (c for c in FRACTIONAL if c.name == name)
     maxwell, (at, measured, scales) = _dense_modes(case, spans_of([test])), together.reported_numbers(test)
@@ -101,14 +101,14 @@ def _starts_near(model: Maxwell, spans: Spans) -> list[np.ndarray]:
 
 
 def _around(u: np.ndarray, case: Fractional, rng: np.random.Generator) -> np.ndarray:
-    """Return random starting points (STARTS - 1, P) around the variables u (P,) of a springpot model. The points are
-    not centred at exponents near 0 or 1."""
+    """Return random starting points (STARTS - 1, P) around the variables u (P,) of a springpot model. If an exponent in
+    u is near 0 or 1, the points lie around a less extreme value."""
     near = np.where(np.array(case.free) % 2 == 1, np.clip(u, -MOST_LOGIT, MOST_LOGIT), u)
     return near + AROUND * rng.standard_normal((STARTS - 1, len(u)))
 
 
 class _Springpot(NamedTuple):
-    """One springpot model with the parameters at its minimum."""
+    """One springpot model with its fitted parameters."""
 
     case: Fractional
     kind: Kind
@@ -121,8 +121,8 @@ class _Springpot(NamedTuple):
 
 
 def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise: bool) -> _Springpot:
-    """Return a springpot model with the parameters, errors and warnings at its minimum. `over_noise`: whether the
-    residuals are divided by a known noise, so that no noise is estimated."""
+    """Return a springpot model with its parameters, errors and warnings at the minimum `solution`. `over_noise`:
+    whether the residuals are divided by a known noise, so that no noise is estimated."""
 
     def at(u, omega):
         return springpots.moduli(springpots.full(case, u), case.switches, omega / spans.reference)

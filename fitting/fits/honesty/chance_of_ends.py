@@ -13,7 +13,7 @@ from fitting.methods.noise.uneven_noise import grouped_sizes
 from fitting.readers import frequency_sweep
 from fitting.readers.rheometer import Sweep
 
-#: Probability that noise alone changes a parameter enough to be reported.
+#: Probability that noise alone causes a warning about the ends of the band.
 CHANCE = 0.05
 #: SMOOTH: if the points scatter about a smooth curve by less than this fraction of the residuals, an inadequate model
 #: causes the residuals. ENOUGH: minimum number of points for this comparison.
@@ -22,7 +22,7 @@ SMOOTH, ENOUGH = 0.5, 16
 
 def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]:
     """Return the standard deviation of the change of each parameter of `edges.values` due to noise alone, if a second
-    fit contains only the points `kept` (n,) of the n points. The result is of first order in the noise.
+    fit contains only the points `kept` (n,) of the n points. The result is a first-order estimate.
 
     Both fits contain the kept points. The variance of the change is therefore that of the difference between the two
     fits, not that of the new fit.

@@ -162,8 +162,8 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
         (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)
         starts = springpots.starting_points(part)[:, list(model.free)]
         starts[-1] = np.asarray(fit.solution.u)
-        # The unit of frequency in the variables u is the middle of the whole band. So the whole sweep is used, and the
-        # points that are left out get infinite scales, which means no weight.
+        # The variables u refer to a frequency in the middle of the whole band. So the whole sweep is used, and infinite
+        # scales exclude the points that are left out.
         scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
         found = springpots.best_minimum(model, sweep, starts, scales)
         assert fit.kind.values is not None
@@ -183,8 +183,8 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
 
 
 def _moved_most(fit: Fit) -> list[str]:
-    """Return a warning about both ends of the band. For each end, the warning names the three parameters that change
-    most."""
+    """Return a warning if parameters depend on the ends of the band. For each end, the warning names at most three
+    parameters, those with the largest changes."""
     known, told = values(fit), []
     for part, end in zip(PARTS, ("first", "last"), strict=True):
         beyond = decided_by(fit, part)

@@ -1,11 +1,11 @@
 """Interval of the equilibrium modulus, computed with the possibility that parts of the material relax only after the
 end of the test.
 
-The standard error is a linear estimate at the minimum, for the chosen modes. The data hardly distinguish a mode from
-the equilibrium modulus if its relaxation time is near the end of the test or longer. So the equilibrium modulus is
-fixed at several values, and all other parameters are fitted again (a profile likelihood). Relaxation times may be up to
-`BEYOND` times the longest time that the test resolves. If one more mode fits the data much more closely, the interval
-is computed with this mode.
+The standard error is a linear estimate at the minimum, for the chosen modes. If the relaxation time of a mode is near
+the end of the test or longer, the data hardly distinguish this mode from the equilibrium modulus. So the equilibrium
+modulus is fixed at several values, and all other parameters are fitted again (a profile likelihood). Relaxation times
+may be up to `BEYOND` times the longest time that the test resolves. If one more mode fits the data much more closely,
+the interval is computed with this mode.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,9 +27,9 @@ from liverjax.core.struct import Content
 
 #: Factor by which relaxation times may lie beyond the shortest and the longest time that the test resolves.
 BEYOND = 10.0
-#: One more mode is used if it lowers the sum of squares, divided by the variance of the noise, by more than this.
+#: One more mode is used if it lowers the sum of squares, divided by the variance of the noise, by more than this value.
 CLOSER = 10.0
-#: Starting values of the relaxation time of this additional mode, divided by the longest time that the test resolves.
+#: Starting values of the relaxation time of the additional mode, divided by the longest time that the test resolves.
 SLOW = (0.3, 1.0, 3.0)
 #: Starting value of the strength of the additional mode in a fluid, divided by the sum of all strengths (G0).
 SLOW_PART = 0.1
@@ -127,9 +127,10 @@ def _with_one_more(
     rest, strengths, times = model
     noise = max(1.0, 2 * float(found.cost) / max(1, len(found.residuals) - len(found.u) - 1))
     best = (rest, found)
-    # In a solid, the strength of the slow mode is a part of the equilibrium modulus. A fluid has no such modulus.
+    # In a solid, a part of the equilibrium modulus becomes the strength of the slow mode. A fluid has no equilibrium
+    # modulus.
     slow = rest or SLOW_PART * float(np.sum(strengths))
-    for part in (0.8, 0.5, 0.2, 0.0):  # this part of the equilibrium modulus is kept; the rest goes to the slow mode
+    for part in (0.8, 0.5, 0.2, 0.0):  # fraction of the equilibrium modulus that is not moved to the slow mode
         more = np.append(strengths, (1 - part) * slow)
         starts = np.stack([family.unknowns(more, np.append(times, k * longest)) for k in SLOW])
         trial = family.evaluate(part * rest, starts)
@@ -141,7 +142,7 @@ def _with_one_more(
 def _end(family: _Family, modulus: float, found: Solution, limit: float, step: float, whole: float) -> float:
     """Return the equilibrium modulus at which the sum of squares reaches its limit, on one side of the minimum. The
     sign of `step` [Pa], the first step away from the minimum, selects the side. The search also ends at 0 and above 10
-    times `whole`."""
+    times `whole` (G0)."""
     u, inside, outside = np.asarray(found.u), modulus, None
     while outside is None:
         trial = max(0.0, inside + step)

@@ -21,8 +21,8 @@ SHOWN = 2.0
 
 def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
     """Return the fit. A warning is added if G0 changes by more than `SHOWN` standard errors when steps of the load are
-    assumed instead of linear changes between rows. The changes of all parameters are added to the details of a fit of
-    Prony modes.
+    assumed instead of linear changes between rows. If `fit` is a fit of Prony modes, the changes of all parameters are
+    then added to its details.
 
     Args:
         fit: a fit of any model to this test.
@@ -43,7 +43,7 @@ def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
     told = (
         f"{_assumed_between_rows(test)} G0 is {values[0] + moved[0]:.4g} Pa instead of {values[0]:.4g} Pa"
         f"{' with Prony modes' if own is not fit else ''} (the total errors "
-        f"{'contain this' if known else 'do not contain this'}): {_remedy_of_jumps(test)}"
+        f"{'contain this' if known else 'do not contain this'} change): {_remedy_of_jumps(test)}"
     )
     details = fit.details | {OF_A_STEP: changes} if fit.parameters is None else fit.details
     return fit._replace(warnings=(*fit.warnings, told), details=details)

@@ -28,7 +28,8 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
     part and a warning are added. If this part has no upper bound, only a warning is added.
 
     The fit is also returned unchanged if the model is not a Prony series, if the fit did not converge, if the record
-    covers less than one decade of time, or if it contains a value at the instant of loading.
+    covers less than one decade of time, if it contains a value at the instant of loading, or if the decrease in its
+    first half decade is below `SHOWN` standard errors.
     """
     first, last = test.resolved
     if fit.parameters is not None or not fit.converged or test.answers_at_once or last < HALF_DECADE**2 * first:
@@ -44,8 +45,8 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
         told = (
             f"the {what} falls by {100 * fall / whole:.2g} % in the first half decade of the record, and by "
             f"{100 * max(next_fall, 0.0) / whole:.2g} % in the next half decade. It is unknown which part relaxed "
-            f"before {first:.3g} s, and G0 does not contain this part: begin the record earlier, or compare --model "
-            "auto"
+            f"before {first:.3g} s, and G0 does not contain this part: begin the record earlier, or compare with "
+            "--model auto"
         )
         return fit._replace(warnings=(*fit.warnings, told))
     missing = fall * ratio / (1 - ratio) - (whole - G[0])
@@ -54,7 +55,7 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
     told = (
         f"G0 may be {missing:.2g} Pa larger, if the modulus fell before {first:.3g} s in the same way as after it. The "
         "chosen modes do not contain this part (the total error contains it): begin the record earlier, or compare "
-        "--model auto"
+        "with --model auto"
     )
     return fit._replace(warnings=(*fit.warnings, told), details=fit.details | {MISSING: float(missing)})
 

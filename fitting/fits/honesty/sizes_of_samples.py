@@ -1,8 +1,8 @@
 """Errors of the parameters of several tests due to errors in the sizes of the samples.
 
 Torque divided by twist is G pi R^4 / (2 h) for the shear modulus G, so a wrong gap h or radius R multiplies all moduli
-of a test by a factor. In one test this factor changes G0 alone. If tests with different factors are fitted together,
-ratios and times change too.
+of a test by a factor. If only one test is fitted, this factor changes only G0. If tests with different factors are
+fitted together, ratios and relaxation times change too.
 """
 
 from functools import partial
@@ -28,7 +28,8 @@ def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, flo
     names = [n for n in own.names if not n.startswith("strengths[")]
     kept = [own.names.index(n) for n in names]
     by_size = _by_sizes(fit)[kept] * relative
-    # Different samples have independent factors. One sample that is mounted once has one factor for all its tests.
+    # Different samples have independent factors. One sample that is mounted once has one factor for all its tests. The
+    # larger of the two errors is used.
     both = np.maximum(np.linalg.norm(by_size, axis=1), np.abs(by_size.sum(axis=1)))
     shares = {"noise": own.standard_errors[kept], "geometry": both}
     found = {source: dict(zip(names, part.tolist(), strict=True)) for source, part in shares.items()}

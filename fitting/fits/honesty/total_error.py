@@ -15,7 +15,7 @@ from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.uncertainty import equilibrium_change
 
-#: Usual standard deviations [m]: GAP of the gap that the instrument displays, RADIUS of the radius of the plates.
+#: Usual standard deviations [m]: GAP for the gap that the instrument displays, RADIUS for the radius of the plates.
 GAP, RADIUS = 50e-6, 10e-6
 
 
@@ -23,7 +23,8 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
     """Return the relative error of all moduli due to the size of the sample between the plates. Torque divided by twist
     is G pi R^4 / (2 h) for the shear modulus G, the radius R and the gap h.
 
-    If a `gap_error` [m] is given, the standard errors contain it already, and it is not counted here.
+    If a `gap_error` [m] is given, the standard errors already contain the error of the gap, so only the error of the
+    radius is counted here.
     """
     gap = 0.0 if gap_error is not None else GAP / simulation.height
     return float(np.hypot(gap, 4 * RADIUS / simulation.radius))
@@ -36,9 +37,9 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     The share `band` is the larger change of a parameter if one end of the band is left out. This change counts only if
     it is larger than expected from noise (`edges.decided_by`). The square of the change due to noise is subtracted from
     the square of this change. If the change is very large (`edges.RUNS_AWAY`), the share is the size of the parameter.
-    The share `long_times` comes from the farther end of `long_times.equilibrium_interval`, as a standard deviation. The
-    share `short_times` is the part of G0 that `short_times` finds to be missing. The share `rise_of_load` is the change
-    if the load was a step at the first row that shows the new load.
+    The share `long_times` comes from the farther end of `long_times.equilibrium_interval`, converted to a standard
+    deviation. The share `short_times` is the part of G0 that `short_times` finds to be missing. The share
+    `rise_of_load` is the change if the load was a step at the first row that shows the new load.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}

@@ -1,5 +1,5 @@
-"""Errors in the columns of a stress-stretch curve. If the misfit has structure, this module tests whether the columns
-contain other quantities than stretch and nominal stress."""
+"""Errors in the columns of a stress-stretch curve. If the residuals keep their sign over many points, this module tests
+whether the columns contain other quantities than stretch and nominal stress."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -29,7 +29,8 @@ class _Cause(NamedTuple):
     values in the stress column from (nominal stress, true driven quantity, number).
 
     `number` is the fitted offset, the same for all curves. The optimiser uses it in dimensionless form: divided by the
-    stress scale of the first curve if it is a stress, otherwise by the range of the driven column of this curve.
+    stress scale of the first curve with a structured misfit if it is a stress, otherwise by the range of the driven
+    column of this curve.
     """
 
     words: str
@@ -56,7 +57,8 @@ def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> 
         fit: the best fit of the curves.
         every: whether all laws were tried, so that the warning does not advise to try other laws.
     """
-    # If the fit has reported a factor for each test already, this factor is not an error of the law.
+    # If a warning of the fit already reports a factor for each test, the stress of the law is multiplied by this
+    # factor.
     named = any(sentence.startswith(OWN_FACTORS) for sentence in fit.warnings)
     misfit = [(c, (_model(fit.law, c) * _nearest_factor(fit.law, c, named) - c.stress) / c.scale) for c in curves]
     runs = {c.label: runs_probability(r) for c, r in misfit}
@@ -108,14 +110,14 @@ def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
 
 class _Refit(NamedTuple):
     value: float  # Akaike's criterion, corrected for few points
-    chance: float  # smallest probability of the order of residuals, of all curves with a structured misfit
+    chance: float  # smallest p-value of the runs test of residuals, for all curves with a structured misfit
     number: float  # fitted number of the cause, in the unit of its column; 0 if no number is fitted
     law: Law
 
 
 def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | None) -> _Refit:
     """Fit the law again, starting from its fitted parameters, and return Akaike's criterion and other results. `cause`
-    is another meaning of the columns of the curves `odd`; None: the columns are what their names say."""
+    is another meaning of the columns of the curves `odd`. If it is None, the columns contain what their names say."""
     leaves, tree = jax.tree.flatten(law)
     every = np.array([float(leaf) for leaf in leaves])
     start = every[every != 0]

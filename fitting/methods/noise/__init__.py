@@ -1,1 +1,2 @@
-"""Models of noise that the residuals show: correlated noise of neighbouring points, and noise of different size."""
+"""Models of the noise in residuals: noise that is correlated between neighbouring points, noise whose size differs
+between points, and unknown factors of whole series."""

@@ -20,8 +20,8 @@ import scipy.spatial
 
 from liverjax.solvers.blas import one_blas_thread
 
-#: PARTS: values of a that are tried. LENGTHS: number of lengths that are tried, from a third of the distance between
-#: neighbours to the size of the body.
+#: PARTS: values of the correlated part a that are tried. LENGTHS: number of lengths that are tried, from a third of the
+#: distance between neighbours to the size of the body.
 PARTS, LENGTHS = (0.3, 0.6, 0.9, 0.99), 8
 #: Orders of the Matérn function: for smoothed noise, and for drifting noise.
 ORDERS = ("3/2", "1/2")
@@ -37,11 +37,11 @@ LEAST = 0.2
 #: Residuals are clipped at this many robust standard deviations, so that a single wrong point does not look like
 #: correlated noise.
 OUTLIER = 5.0
-#: An unknown is considered if the norm of its derivatives in the chosen groups, divided by their norm in all groups,
-#: exceeds this value.
+#: An unknown enters the likelihood if the norm of its derivatives in the chosen groups, divided by their norm in all
+#: groups, exceeds this value.
 SHOWN = 1e-9
-#: If a singular value of the scaled derivatives, divided by the largest one, is below this value, its direction is
-#: ignored.
+#: If a singular value of the scaled derivatives, divided by the largest one, is below this value, the direction of this
+#: singular value is ignored.
 LOST = 1e-6
 #: Number of rows of the covariance C that are computed at once.
 ROWS = 500
@@ -100,8 +100,8 @@ def _alike_noise(
     choices = itertools.product(ORDERS, lengths, PARTS)
     tried = [(*_probability_at(data, far, order, l, a), order, l, a) for order, l, a in choices]
     best, level, order, length, part = max(tried)
-    # The test is written as `not best > ...`, so that it is also right if both values are -inf. The level is not
-    # tested: it is small if the noise is smoother than the Matérn function.
+    # The test is written as `not best > ...`, so that it is also right if both values are -inf. The level `level` has
+    # no lower limit here, because it is also small if the noise is smoother than the Matérn function.
     if not np.isfinite(alone) or not best > alone + GAIN or np.sqrt(np.mean(r**2)) < LEAST:
         return None
     parts = [_of_unknowns(places[own], (order, length, part), inverse[:, own]) for own in groups]
@@ -149,8 +149,8 @@ def _to_neighbours(distance: np.ndarray) -> float:
 
 
 def _subset(places: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return at most `MOST` of the residuals `own` (m,): half of them near one point, the other half from the whole
-    body."""
+    """Return the indices of at most `MOST` of the m residuals `own` (m,): half of them near one point, the other half
+    from the whole body."""
     if len(own) <= MOST:
         return own
     rng = np.random.default_rng(0)
@@ -185,10 +185,11 @@ def _probability_at(data: list, far: list[np.ndarray], order: str, length: float
 
 
 def _of_unknowns(places: np.ndarray, shape: tuple[str, float, float], inverse: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the covariance J^+ C (J^+)^T (p, p) of one group and its number of independent residuals, n^2 / sum(C).
-    Only a few rows of C are computed at a time.
+    """Return the part J^+ C (J^+)^T (p, p) of the covariance of the p unknowns that comes from one group of n residuals
+    with the correlation matrix C. Also return the number of independent residuals of the group, n^2 / sum(C). Only a
+    few rows of C are computed at a time.
 
-    `shape`: order, length l and part a.
+    `shape`: order, correlation length and correlated part of the noise.
     """
     order, length, part = shape
     total, sum_of_C = (1 - part) * inverse @ inverse.T, (1 - part) * len(places)

@@ -7,8 +7,8 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-#: The residuals show factors if these raise the logarithm of the restricted likelihood by at least this value. Without
-#: factors, this happens in 1 of 140 cases.
+#: The residuals show that the series have different factors if such factors raise the logarithm of the restricted
+#: likelihood by at least this value. Without factors, this happens in 1 of 140 cases.
 _GAIN = 3.0
 #: At the end of a 95 % interval of the factors' standard deviation, the logarithm of the restricted likelihood is below
 #: its maximum by this value.
@@ -16,8 +16,8 @@ _FALL = 1.92
 #: Upper bound of the standard deviation of factors if the residuals do not show them. The value is typical of the
 #: errors of sample sizes.
 HIDDEN = 0.1
-#: Singular values of the matrix F (one column for each factor) below this fraction of its norm are roundoff: the
-#: unknowns can compensate these factors.
+#: F has one column for each factor. The part that the unknowns can compensate is removed from F. Then singular values
+#: below this fraction of the norm of F are roundoff: the unknowns can compensate these factors completely.
 _ROUNDOFF = 1e-8
 #: Lower bound for the part of the squared residuals that the factors do not explain. If repeated measurements are
 #: identical, this part is only roundoff.
@@ -27,19 +27,19 @@ _SAME = 1e-12
 class FactorNoise(NamedTuple):
     """Unknown factors of K series with n residuals in all, and their effect on P parameters."""
 
-    deviation: float  # most probable standard deviation of a factor [1], possibly 0; at most `HIDDEN` if not shown
+    deviation: float  # most probable standard deviation of a factor [1], may be 0; at most `HIDDEN` if not `shown`
     root: np.ndarray  # (P, n + K) square root of the covariance of the parameters
     shown: bool  # whether the residuals show factors: independent noise alone does not explain them
     hidden: float  # largest standard deviation of factors that the residuals do not exclude [1], at most `HIDDEN`
-    moves: np.ndarray  # (P,) standard deviations of the parameters due to factors of the size `hidden`
+    moves: np.ndarray  # (P,) errors of the parameters due to factors with the standard deviation `hidden`
 
 
 def factors_of_series(
     counts: list[int], J: np.ndarray, r: np.ndarray, fitted: np.ndarray, slope: np.ndarray
 ) -> FactorNoise | None:
     """Fit noise with the covariance s^2 (I + q^2 f_k f_k^T) to the residuals of each series k. Here s is the standard
-    deviation of the independent noise, q s that of the factors, and f_k are the fitted values. Returns None for a
-    single series or too few residuals.
+    deviation of the independent noise, q s the standard deviation of the factors, and f_k are the fitted values.
+    Returns None for a single series or too few residuals.
 
     There are few factors, so their standard deviation is uncertain. If the residuals show factors, their standard
     deviation is enlarged by Student's t with K - 1 degrees of freedom. If noise alone may explain the factors, their

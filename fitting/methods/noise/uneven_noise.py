@@ -28,11 +28,11 @@ def uneven_root(J: np.ndarray, r: np.ndarray, slope: np.ndarray) -> np.ndarray:
 
 
 def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the square root (P, n) of the covariance of P parameters for noise proportional to `size` (n,). It is 0 if
-    equal noise has a higher restricted likelihood.
+    """Return the square root (P, n) of the covariance of P parameters for noise proportional to `size` (n,). The result
+    is 0 if noise of equal size at all points has a higher restricted likelihood.
 
-    This is needed because `uneven_root` cannot determine the noise of a point with a leverage near 1, since the fit
-    passes through this point.
+    This function is needed because `uneven_root` cannot determine the noise of a point with a leverage near 1, since
+    the fit passes through this point.
     """
     (n, p), largest, none = J.shape, np.abs(size).max(initial=0.0), np.zeros((len(slope), len(r)))
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(r)) and p and n > p + 1 and largest > 0):
@@ -55,7 +55,7 @@ def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tupl
 
 
 #: If equal noise in two groups of residuals is less probable than _CHANCE, their noise has different size. The test is
-#: made only if the smallest singular value of the scaled J, divided by the largest one, is at least _CONDITION.
+#: made only if the smallest singular value of the scaled Jacobian, divided by the largest one, is at least _CONDITION.
 _CHANCE, _CONDITION = 1e-3, 1e-8
 
 

@@ -7,8 +7,8 @@ import numpy as np
 
 
 def r_hat(draws: np.ndarray) -> float:
-    """Return the larger value of bulk R-hat and tail R-hat of one parameter with draws (chains, N). R-hat is near 1 if
-    the chains agree."""
+    """Return the larger value of bulk R-hat and tail R-hat of one parameter. `draws` (chains, N): N values of the
+    parameter in each chain. R-hat is near 1 if the chains agree."""
     half = draws.shape[1] // 2
     split = np.concatenate([draws[:, :half], draws[:, -half:]])
     folded = np.abs(split - np.median(split))

@@ -17,7 +17,8 @@ import scipy.special
 
 #: Number of independent runs, and smallest number of particles in each.
 CHAINS, FEWEST = 4, 500
-#: In each step, the power rises as far as possible while at least this fraction of the particles stays effective.
+#: In each step, the power of the likelihood rises until the effective sample size is this fraction of the number of
+#: particles.
 EFFECTIVE = 0.5
 #: The moves of a step end if the correlation with the positions before the step is below FORGOTTEN, or in the last step
 #: below FORGOTTEN_LAST. MOST: maximum number of moves in a step.
@@ -28,7 +29,7 @@ LONG = 0.1
 
 
 class Density(NamedTuple):
-    """A posterior density. Its functions take the parameters u (W, P) of W points."""
+    """A posterior density. The argument u (W, P) of its functions contains the P parameters of W points."""
 
     log_likelihood: Callable[[np.ndarray], np.ndarray]  # u -> logarithms (W,), up to a constant
     log_prior: Callable[[np.ndarray], np.ndarray]  # u -> logarithms (W,); -inf where the prior is 0
@@ -95,8 +96,8 @@ def _finite_only(values: np.ndarray) -> np.ndarray:
 
 
 def _rise(likelihood: np.ndarray, left: float) -> float:
-    """Return the largest increase of the power, at most `left`, at which the fraction `EFFECTIVE` of the particles
-    stays effective. The increase is found by bisection."""
+    """Return the largest increase of the power of the likelihood, at most `left`, at which the effective sample size is
+    at least the fraction `EFFECTIVE` of the number of particles. The increase is found by bisection."""
 
     def effective(rise: float) -> float:
         w = np.exp(rise * (likelihood - likelihood.max()))
@@ -137,8 +138,8 @@ def _moved(
 def _half_moved(
     density: Density, now: _Particles, power: float, halves: tuple[slice, slice], rng: np.random.Generator
 ) -> float:
-    """Move the first half of the particles in place, using differences between particles of the second half. Return the
-    accepted fraction of the moves.
+    """Move the particles `halves[0]` in place, using differences between the particles `halves[1]`. Return the accepted
+    fraction of the moves.
 
     The differences do not depend on the moved particles, so the moves do not change the density.
     """

@@ -61,8 +61,8 @@ def _of_frequency(path: str, column: Column, unit: str) -> float:
 
 
 def fault_of(column: Column, written: float, value: float, smallest: float, largest: float) -> tuple[str, str] | None:
-    """Return the fault of a value (in SI) and the remedy, or None if the value is good. The message quotes the value
-    as written in the file."""
+    """Return the fault of a value (in SI) and the remedy, or None if the value is good. The fault quotes the value as
+    written in the file."""
     if not np.isfinite(value):
         if np.isnan(written):
             return f"{column.name} is empty", "fill this cell, or remove the line"
@@ -82,11 +82,11 @@ def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
     """Divide moduli of tension or bending by 3, in place. Return a note if there are such moduli."""
     moduli = [q for q in columns if q.split("_")[0] in MODULI]
     tensile = [q for q in moduli if is_tensile(columns[q][0])]
-    if tensile:  # in "tensile_storage_modulus, loss_modulus", both columns are of tension
+    if tensile:  # if only one heading names tension, both columns are of tension
         sheared = [columns[q][0].name for q in moduli if q not in tensile and names_shear(columns[q][0])]
         if sheared:
             raise InputError(
-                f"column {columns[tensile[0]][0].name} is of tension or bending and {sheared[0]} of shear: name both "
+                f"column {columns[tensile[0]][0].name} is of tension or bending, but {sheared[0]} of shear: name both "
                 "in the same way"
             )
         tensile = moduli

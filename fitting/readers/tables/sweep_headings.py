@@ -6,7 +6,7 @@ import re
 from fitting.readers.units import ANGLE_UNITS, FREQUENCY_UNITS, MODULUS_UNITS, TANGENT_UNITS, VISCOSITY_UNITS
 
 DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
-#: Words that do not change the meaning: kinds of the same quantity, and symbols after a name.
+#: Words in a heading that do not change its quantity, for example "mean", or a symbol after the name.
 IDLE_WORDS = {"standard", "mean", "value", "g'", "g''", "g*", "e'", "e''", "e*", "delta", "omega", "f", "w"}
 #: Quantities, and the words with which their headings begin. Words in `UNCERTAIN` count only with a known unit or
 #: without a unit.

@@ -43,7 +43,7 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
         found = trios_json.tables(text)
         if found is None:
             raise InputError(
-                f"{path} is JSON, but not an export of TRIOS, because the entry Results is missing: give CSV or text"
+                f"{path} is JSON, but not an export of TRIOS (a whole file with the entry Results): give CSV or text"
             )
         return found
     return _with_whole_headings(text)
@@ -54,7 +54,8 @@ _OPEN = re.compile(r'(?:^|[,;\t])\s*"[^"]*$')
 
 
 def _with_whole_headings(text: str) -> str:
-    """Join the two lines of each quoted heading that contains a line break. Numbers of later lines stay the same."""
+    """Join the two lines of each quoted heading that contains a line break. The line numbers of later lines stay the
+    same."""
     lines = text.splitlines()
     for k in range(min(len(lines), _HEAD) - 1):
         if _OPEN.search(lines[k]) and re.match(r'[^"]*("\s*([,;\t]|$)|$)', lines[k + 1]):
@@ -171,7 +172,8 @@ def means_nothing(cells: Iterable[str]) -> bool:
     return not any(re.match(r"[-+]?[.,]?\d|nan|[-+]?inf", cell.strip('" ').lower()) for cell in cells)
 
 
-#: Labels of rows with means of other rows, for example "Mean (n = 3)"; with their deviations; and with other summaries.
+#: Patterns of the labels of summary rows. _MEAN: means of other rows, for example "Mean (n = 3)". _DEVIATION: standard
+#: deviations or errors of other rows. _OTHER: other summaries.
 _MEAN = r"mean|average|avg|mw|mittelwert|mittel|moyenne|media|promedio|gemiddelde"
 _DEVIATION = (
     r"s\.?d|std|st\.? ?dev|std\.? ?dev|stdev\.?[sp]?|stdabw\.?|std\.?[- ]?abw\.?|standardabweichung"

@@ -138,7 +138,7 @@ def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[s
     columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
     time = columns["time"]
     if not len(time):
-        raise InputError(f"{path}: every row has an empty cell or one that is not finite; give numbers")
+        raise InputError(f"{path}: every row has a cell that is empty or not finite; give numbers")
     if len(time) > 2 and np.all(np.diff(time) < 0):
         raise InputError(
             f"{path}: the times decrease from {time[0]:g} s to {time[-1]:g} s; reverse the order of the rows"
@@ -192,7 +192,7 @@ def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[st
     return columns, notes
 
 
-#: A note is given if the relative deviation of the force from linear elasticity exceeds this [1].
+#: A note is given if the relative deviation of the force from linear elasticity exceeds this value [1].
 BENT = 0.02
 
 
@@ -237,7 +237,7 @@ def _told_of_tables(below: list[str]) -> list[str]:
     more = sum(map(_begins_a_table, below))
     if not more:
         return []
-    return [f"the file holds {more + 1} tables of a test: the first is read; give each table a separate file"]
+    return [f"the file holds {more + 1} tables of a test, and only the first is read: give one file for each table"]
 
 
 def _begins_a_table(line: str) -> bool:
@@ -268,7 +268,7 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
                 if word in ("e(t)", "d(t)") and name[0].islower():
                     break  # in small letters, e(t) is a strain and d(t) a displacement
                 if word == "t" and not (name[0] == "t" and (unit or rest) and _known_column("time", unit or rest)):
-                    break  # T is a temperature
+                    break  # a capital T is a temperature
                 found.setdefault(quantity, (k, unit or rest or None))
                 break
     return _all_tensile(found, cells)

@@ -30,7 +30,8 @@ WRONG = 10.0
 
 
 def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
-    """Return all warnings. The arguments are the same as for `fitting.reports.waves.report.write`."""
+    """Return all warnings about a fit to waves. The arguments are the same as for
+    `fitting.reports.waves.report.write`."""
     told, each = _sign(organ, found), found.whole if found.parts is None else found.parts
     told += _of_scales(organ, found)
     any_coarse = False
@@ -77,11 +78,11 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
     # residuals is only an estimate.
     if drawn is not None and drawn.chi2 / drawn.components > 1 + ROUGH + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(
-            f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation, so its standard deviations are too "
-            f"small. Possible causes: {'coarse voxels (mesh_bias), ' if any_coarse else ''}edges sharper than the map, "
-            "noise that is larger in a part of the organ, a ratio of the moduli at several frequencies that is not the "
-            "same everywhere, or a body that does not move like a viscous solid. Compare the map with regions and with "
-            "one frequency alone"
+            f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation, so the standard deviations of "
+            f"the map are too small. Possible causes: {'coarse voxels (mesh_bias), ' if any_coarse else ''}edges that "
+            "are sharper than in the map, noise that is larger in a part of the organ, a ratio of the moduli at "
+            "several frequencies that is not the same everywhere, or a body that does not move like a viscous solid. "
+            "Compare the map with the moduli of regions, and with the map from one frequency alone"
         )
     return told
 
@@ -132,7 +133,7 @@ def _of_long_waves(hertz: float, found: Found, f: int) -> list[str]:
     """
     each, told = found.whole if found.parts is None else found.parts, []
     for r, (G, e) in enumerate(zip(np.abs(each.modulus[f]), each.standard_errors[f].real, strict=True)):
-        told_already = found.parts is not None and e >= G  # another warning reports this region
+        told_already = found.parts is not None and e >= G  # another warning is given for this region
         if told_already or not (np.isfinite(e) and e > SKEW * G):
             continue
         half = 2 * e / G**2
@@ -184,7 +185,7 @@ def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: boo
     if ratio < TOO_NEAR and each.components >= FEW:
         told.append(
             f"{hertz:g} Hz: chi2 is {ratio:.3g} per equation. The motion scatters {np.sqrt(ratio):.2g} times as much "
-            "as the stated noise, and the standard errors are too large; give a smaller --noise, or none"
+            "as the stated noise, and the standard errors are too large; give a smaller --noise, or remove this option"
         )
     if ratio > WRONG:
         told.append(
@@ -194,8 +195,9 @@ def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: boo
         )
     elif ratio > TOO_FAR and not alike:
         told.append(
-            f"{hertz:g} Hz: chi2 is {ratio:.3g} per equation with uniform {uniform}, so the organ is less uniform, or "
-            "the noise is larger. The standard errors are multiplied by the square root of this chi2"
+            f"{hertz:g} Hz: chi2 is {ratio:.3g} per equation with uniform {uniform}, so the organ is less uniform than "
+            "this, or the noise is larger than assumed. The standard errors are multiplied by the square root of this "
+            "chi2"
         )
     return told
 
@@ -247,7 +249,7 @@ def _of_scales(organ: Organ, found: Found) -> list[str]:
             told.append(
                 f"from {omega[a] / (2 * np.pi):g} to {omega[b] / (2 * np.pi):g} Hz |G*| changes as the frequency to "
                 f"the power of {slope:.2g}, but this power is 0 to 1 in all materials: check that the frequencies are "
-                "in the order of the fields"
+                "in the order of the displacement fields"
             )
     return told
 
@@ -256,7 +258,8 @@ def _sign(organ: Organ, found: Found) -> list[str]:
     """Return a warning if every loss modulus that the data determine is negative. No passive material has a negative
     loss modulus.
 
-    If regions are given, the moduli of the regions are checked: one modulus for several materials may have any loss.
+    If regions are given, only the moduli of the regions are checked, because the loss modulus of an organ of several
+    materials, fitted as one region, may be negative.
     """
     wrong, each = [], found.whole if found.parts is None else found.parts
     for f, (hertz, G, error) in enumerate(

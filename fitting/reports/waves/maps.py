@@ -69,7 +69,7 @@ def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
     size = 1e3 * organ.field.spacing * np.array(organ.field.mask.shape)
     across = [a for a in range(3) if a != axis]
     fig, axes = pyplot().subplots(1, 4, figsize=(13, 4.2), layout="constrained")
-    top = np.nanquantile(panels[0][1], 0.995)  # so that a single voxel does not set the colour scale
+    top = np.nanquantile(panels[0][1], 0.995)  # a quantile, so that a single voxel does not determine the colour scale
     for ax, (title, values, colours) in zip(axes, panels, strict=True):
         limits = {"vmin": 0.0, "vmax": top} if "storage" in title else {"vmin": 0.0}
         shown = np.take(values, k, axis).T

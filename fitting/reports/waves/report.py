@@ -19,8 +19,8 @@ from liverjax.core.versions import versions
 
 #: Minimum number of frequencies for which sweeps are written.
 FEWEST = 3
-#: A node of the map counts as different from the mean of the organ if it differs by more than this many standard
-#: deviations.
+#: A node of the map counts as different from the uniform organ if the logarithms of the two moduli differ by more than
+#: this many standard deviations.
 TOLD = 3.0
 #: A warning is given if the mean relative error of the springpot model, over the frequencies, exceeds this value.
 MISSED = 0.03
@@ -99,8 +99,8 @@ def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) 
 
 
 def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
-    """Fit each sweep with the springpot model that `models.best_of_models` chooses. Return the results (None if there
-    are no sweeps) and warnings.
+    """Fit the moduli of each sweep with the springpot model that `models.best_of_models` chooses. Return the results
+    (None if there are no sweeps) and warnings.
     """
     if not sweeps:
         return None, []
@@ -164,7 +164,8 @@ def _by_label(organ: Organ, found: Found) -> Content | None:
 
 
 def _direct(organ: Organ, found: Found, usual: np.ndarray) -> Content:
-    """Return medians of the direct inversion over the whole organ and each region; None where no voxel has a value."""
+    """Return the median moduli of the direct inversion in the whole organ and in each region. A median is None if no
+    voxel has a value."""
     labels = organ.field.labels
     places = {"whole": organ.field.mask}
     if found.labels is not None and labels is not None:

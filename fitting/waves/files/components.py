@@ -11,7 +11,7 @@ import numpy as np
 
 from fitting.waves.wave_field import WaveField
 
-#: Minimum number of voxels with all six neighbours.
+#: Minimum number of voxels with all six neighbours; with fewer, the order of the components is not checked.
 FEWEST = 100
 #: Another order or sign of the components is regarded as better if the mean square divergence is below this fraction of
 #: its value for the given order.
@@ -20,7 +20,7 @@ SMALLER = 0.8
 
 def other_order(field: WaveField) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
     """Return for each axis the component and the sign with which the divergence is smallest. Return None if the given
-    order is nearly as good."""
+    order is nearly as good, or if there are too few voxels."""
     slopes = _central_differences(field)
     if slopes.shape[2] < FEWEST:
         return None

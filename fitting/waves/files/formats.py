@@ -40,7 +40,7 @@ WAVES = ("displacement", "real", "imag", "phases", "wrapped")
 PLACE = "(place)"
 #: Name of the entry for an error message if a file states two different voxel sizes.
 CONFLICT = "(conflict)"
-#: Name for notes on arrays that are not used, but whose names are similar to a known name.
+#: Name of the entry for notes on arrays that are not used, but have names similar to a known name.
 NEARLY = "(nearly)"
 HDF5 = (".h5", ".hdf5")
 
@@ -107,7 +107,7 @@ def _numpy(path: Path) -> Content:
             return {"displacement": np.load(path, allow_pickle=False)}
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file} | _nearly_known(file)
-    except ValueError:  # NumPy's message is about pickled objects, even for a text file
+    except ValueError:  # even for a text file, NumPy's message would be about pickled objects
         raise InputError(
             f"{path}: the file has no arrays of numbers; write the file with numpy.save or numpy.savez"
         ) from None
@@ -256,7 +256,7 @@ def _voxel_table(path: Path) -> Content:
         perhaps = (
             f", or rename column {unknown[0]} to frequency if this column contains the frequencies" if unknown else ""
         )
-        raise InputError(f"{path}: a voxel has two rows of the same frequency; remove one of them{perhaps}")
+        raise InputError(f"{path}: a voxel has two rows for the same frequency; remove one of them{perhaps}")
     U = np.full((1 if hertz is None else len(hertz), *shape, 3), np.nan + 0j)
     for c, axis in enumerate("xyz"):
         U[(of, *at.T, np.full(len(at), c))] = column[f"u_re_{axis}"] + 1j * column[f"u_im_{axis}"]
@@ -271,7 +271,8 @@ def _voxel_table(path: Path) -> Content:
             if len(changed):
                 number = lines[1 + changed[0]][0]
                 raise InputError(
-                    f"{path}: row {number}: {name} differs from another frequency; give each voxel only one {name}"
+                    f"{path}: row {number}: {name} differs from its value at another frequency; give each voxel "
+                    f"only one {name}"
                 )
             found |= {key: values}
     return found

@@ -13,7 +13,8 @@ COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 class ArrudaBoyce(Law):
     """W = mu sum_k c_k / N^(k-1) (Ibar1^k - 3^k) + U(J), k = 1 … 5.
 
-    Book chapter, Table 1 with corrected numerators; Arruda and Boyce 1993. mu = n k_B Theta, N = `chain_length`.
+    Book chapter, Table 1 with corrected numerators; Arruda and Boyce 1993. c_k are the `COEFFICIENTS`, and N is
+    `chain_length`. mu = n k_B Theta, with n chains per volume, Boltzmann's constant k_B and the temperature Theta.
     """
 
     mu: Number = param("Pa", "n k_B Theta", above=0.0, typical=730.0)
@@ -23,7 +24,7 @@ class ArrudaBoyce(Law):
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
-        """Energy, the sum of the series. The factor (Ibar1 - 3) is factored out to avoid cancellation at rest."""
+        """Energy: the sum of the series, written as a multiple of (Ibar1 - 3) to avoid cancellation at rest."""
         total = 0.0
         for k, c in enumerate(COEFFICIENTS, start=1):
             # (I^k - 3^k) = (I - 3) sum_m I^m 3^(k-1-m), by Horner's rule.

@@ -13,11 +13,11 @@ from liverjax.laws.base import Law
 class Bogen(Law):
     """W = mu/alpha (Xi(alpha) - 3) + U(J).
 
-    Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. Book chapter, Table 1 (with - 3 instead of - 1); Bogen 1987. This law
-    is one term of Ogden's law.
+    Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha, with the principal stretches lambda_m. Book chapter, Table 1 (with - 3
+    instead of - 1); Bogen 1987. This law is one term of Ogden's law.
     """
 
-    mu: Number = param("Pa", "mu; a stable law needs mu and alpha with the same sign", typical=400.0)
+    mu: Number = param("Pa", "mu; the law is stable only if mu and alpha have the same sign", typical=400.0)
     alpha: Number = param("1", "exponent", nonzero=True, typical=4.0)
     bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")

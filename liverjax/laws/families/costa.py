@@ -20,7 +20,7 @@ class Costa(Law):
     Q = b_ff E_ff^2 + b_ss E_ss^2 + b_nn E_nn^2 + 2 (b_fs E_fs^2 + b_fn E_fn^2 + b_sn E_sn^2). Costa, Holmes and
     McCulloch 2001. The book chapter names this law (section 4.1.2 i, for heart muscle) but prints no formula for it. E
     is Green's strain in the axes fibre, sheet (made orthogonal to the fibre) and normal. The exponential energy is not
-    isochoric, so it increases the bulk modulus.
+    isochoric, so the bulk modulus of the law is larger than that of U(J).
     """
 
     c: Number = param("Pa", "scale", above=0.0, typical=200.0)
@@ -48,7 +48,7 @@ class Costa(Law):
         return 0.5 * self.c * jnp.expm1(self._exponent(E))
 
     def green_derivatives(self, E):
-        """Stress S_AB = s b_AB E_AB with s = c exp Q, and moduli s b_AB (half for shears) + (2/s) S (x) S."""
+        """Stress S_AB = s b_AB E_AB with s = c exp Q, and moduli: s b_AB (half of it for shears) plus (2/s) S (x) S."""
         s = self.c * jnp.exp(self._exponent(E))
         b = self._weights()
         S = symmetric(tuple(s * w * E[i][j] for w, (i, j) in zip(b, SIX, strict=True)))

@@ -12,7 +12,7 @@ from liverjax.laws.base import Law
 class NeoHookean(Law):
     """W = mu/2 (Ibar1 - 3) + U(J).
 
-    Book chapter, Table 1 (C1 = mu/2). Here the invariant is isochoric, because tetrahedra are compressible.
+    Book chapter, Table 1 (C1 = mu/2). Here Ibar1 is used instead of I1, because the tetrahedra can change volume.
     """
 
     mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)

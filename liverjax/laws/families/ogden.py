@@ -1,6 +1,7 @@
 """Ogden: powers of the principal stretches.
 
-Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. The methods get X = Xi - 3, computed without cancellation at rest.
+Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha, with the principal stretches lambda_m. The arguments X of the methods are
+Xi - 3, computed without cancellation at rest.
 """
 
 from collections.abc import Sequence

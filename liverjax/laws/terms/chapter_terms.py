@@ -71,7 +71,7 @@ class _At(NamedTuple):
     B: Matrix  # I1 Id - C
     cof: Matrix
     J: jax.Array
-    groups: list  # for each group of products: terms, phi', phi''
+    groups: list  # for each group of products: terms, and the derivatives phi' and phi'' of its function
 
 
 def _state_at(law: Energies, F: Matrix) -> _At:
@@ -113,7 +113,7 @@ def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, jax.A
 
 
 class Layout(NamedTuple):
-    """Which values are stored in memory. The default is the fastest choice (experiments/chapter)."""
+    """Options: which values are stored in memory. The default is the fastest choice (experiments/chapter)."""
 
     #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes. None means that the values are computed
     #: when they are used.
@@ -170,7 +170,7 @@ def _six_terms(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Number], regu
     for n, (terms, phi1, phi2) in enumerate(s.groups):
         for t, FSDi, FSDj, SDj in zip(terms, i.FS[n], j.FS[n], j.S[n], strict=True):
             G = scale_matrix(t.h2 * t.g, outer(i.cof, j.cof))
-            if regularised:  # eps/3 keeps the trace unchanged (the chapter prints eps)
+            if regularised:  # with eps/3 the trace of G does not change (the chapter prints eps)
                 eps = jnp.clip(1 - s.J, 0, 1)
                 trace = scale_matrix(t.h2 * t.g * eps / 3 * dot(i.cof, j.cof), IDENTITY)
                 G = add_matrices(scale_matrix(1 - eps, G), trace)

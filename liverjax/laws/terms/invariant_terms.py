@@ -56,7 +56,7 @@ class Scalars(NamedTuple):
 class State(NamedTuple):
     """Values at one deformation gradient that both force and stiffness need."""
 
-    laws: tuple  # summands of the law; their energies of stretches and of Green's strain are added
+    laws: tuple  # summands of the law, whose energies of stretches and of Green's strain are added
     F: Matrix
     C: Matrix | None
     cof: Matrix

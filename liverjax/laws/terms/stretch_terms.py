@@ -140,8 +140,8 @@ def _square(upper: tuple) -> list[list]:
     return [[entries[min(a, b), max(a, b)] for b in range(6)] for a in range(6)]
 
 
-# A function with a custom derivative rule must not be linear in an argument. Otherwise JAX ignores this rule if only
-# this argument is differentiated (forward over reverse mode).
+# A function with a custom derivative rule must not be linear in an argument. Otherwise JAX ignores the rule if the
+# function is differentiated only with respect to this argument (forward over reverse mode).
 
 
 def stress_at_constant(law: Energies, F: Matrix) -> Matrix:
@@ -214,7 +214,7 @@ def _vanishes(t: Number) -> bool:
 
 
 def _expanded_energy(law: Energies, logs: Vector, axes: Matrix, log_J0: Number, Y: tuple) -> jax.Array:
-    """Return w at C = diag(lambda^2) + N^T Y N, with a change Y of C, in the frozen principal axes N."""
+    """Return w for C changed by Y. In the frozen principal axes N, the changed C is diag(lambda^2) + N^T Y N."""
     X = six_of(rotated(symmetric(Y), transpose(axes)))
     relative = [x * jnp.exp(-logs[i] - logs[j]) for x, (i, j) in zip(X, SIX, strict=True)]
     one_plus = symmetric(tuple(r + (1.0 if i == j else 0.0) for r, (i, j) in zip(relative, SIX, strict=True)))

@@ -18,8 +18,8 @@ from liverjax.core.errors import InputError
 if TYPE_CHECKING:
     import meshio
 
-#: Pattern of Abaqus' element types, with the number of nodes -> meshio's names of the cells. Elements of other types
-#: (lines, quadrilaterals, …) are ignored.
+#: Pattern of Abaqus' element types -> {number of nodes: meshio's name of the cells}. The pattern finds the number of
+#: nodes in the name of the type. Elements of other types (lines, quadrilaterals, …) are ignored.
 _CELLS = {
     r"(?:[AD]?C3D|SC|COH3D)(\d+)[A-Z]*": {
         4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 15: "wedge15", 20: "hexahedron20",
@@ -96,7 +96,7 @@ def _cards(path: Path, outer: tuple[Path, ...]) -> Iterator[_Card]:
         if line.startswith("**") or not line.strip():
             continue
         if begun and not line.startswith("*") and "=" not in line and not re.search("[A-Za-z]", line):
-            begun = begun.rstrip(",")  # a data line follows a comma that is not needed
+            begun = begun.rstrip(",")  # a data line follows, so the comma at the end of the keyword line is not needed
             yield from () if card is None else _with_included(card, outer)
             card, begun = _card(begun), ""
         if begun or line.startswith("*"):
@@ -124,7 +124,7 @@ def _with_included(card: _Card, outer: tuple[Path, ...]) -> Iterator[_Card]:
     moved |= card.keyword == "NODE" and card.parameters.get("SYSTEM", "R").upper() != "R"  # not Cartesian coordinates
     if moved or card.keyword in _MAKING:
         raise _Wrong(
-            f"*{card.keyword} changes or makes the mesh; export the finished mesh, with all nodes and elements"
+            f"*{card.keyword} moves or creates nodes or elements; export the finished mesh, with all nodes and elements"
         )
     yield card
 
@@ -136,13 +136,13 @@ def _of_one_part(cards: list[_Card]) -> list[_Card]:
         return cards
     if len(parts) > 1 or len(_cards_of(cards, "INSTANCE")) > 1:
         raise _Wrong("the file has several parts or instances; export one part with one mesh")
-    inside, depth = [], 0  # an instance may contain the nodes and elements, if the part is empty
+    inside, depth = [], 0  # if the part is empty, its instance may contain the nodes and elements
     for card in cards:
         depth -= card.keyword in ("END PART", "END INSTANCE")
         inside.append(depth > 0)
         depth += card.keyword in ("PART", "INSTANCE")
     marked = [card._replace(inside=own) for card, own in zip(cards, inside, strict=True)]
-    # A set of removed nodes or elements stays, as an empty set.
+    # Cards outside the part keep their sets of nodes or elements, as empty sets.
     kept = [card for card in marked if card.inside or card.keyword not in ("NODE", "ELEMENT")]
     return kept + [
         card._replace(lines=[]) for card in marked if not card.inside and card.keyword in ("NODE", "ELEMENT")
@@ -181,7 +181,7 @@ def _kind_of_cells(card: _Card) -> tuple[str, int] | None:
         for pattern, names in _CELLS.items():
             match = re.fullmatch(pattern, kind)
             if match and int(match[1]) not in names:
-                raise _Wrong(f"it contains elements of type {kind}; export tetrahedra of 4 or 10 nodes")
+                raise _Wrong(f"the file contains elements of type {kind}; export tetrahedra of 4 or 10 nodes")
             if match:
                 return names[int(match[1])], int(match[1])
     return None
@@ -195,7 +195,9 @@ def _read_block(card: _Card, nodes: dict[int, int]) -> _Block:
         rows = numbers.reshape(-1, 1 + size)
         places = [nodes[label] for label in rows[:, 1:].ravel().tolist()]
     except ValueError:
-        raise _Wrong(f"lines of *ELEMENT, TYPE={card.parameters['TYPE']} are not complete; export the mesh") from None
+        raise _Wrong(
+            f"lines of *ELEMENT, TYPE={card.parameters['TYPE']} are not complete; export the mesh again"
+        ) from None
     except KeyError as error:
         raise _Wrong(f"*ELEMENT contains node {error.args[0]}, but *NODE does not; export the mesh again") from None
     return _Block(kind, rows[:, 0].tolist(), np.array(places, int).reshape(-1, size))
@@ -204,7 +206,7 @@ def _read_block(card: _Card, nodes: dict[int, int]) -> _Block:
 def _sets(
     cards: list[_Card], key: str, by_card: dict[int, list[int]], of_elements: dict[str, set[int]]
 ) -> dict[str, set[int]]:
-    """Return the numbers of the members of all sets. Abaqus does not distinguish capital letters in names of sets.
+    """Return {name of a set: numbers of its members}. In names of sets, Abaqus ignores the case of letters.
 
     Args:
         cards: cards of the file.
@@ -227,7 +229,7 @@ def _sets(
             numbers, others = _listed(cards[k], of_elements) if cards[k].keyword == key else (by_card.get(k, ()), ())
             together.update(numbers)
             for other in others:
-                last = other.rpartition(".")[2]  # the name of the part may precede the name of the set
+                last = other.rpartition(".")[2]  # the name of the part may stand before the name of the set
                 places = ((own[0], other), (True, other), (True, last))
                 at = next((place for place in places if place in found), None)
                 if at is None:
@@ -255,7 +257,7 @@ def _listed(card: _Card, of_elements: dict[str, set[int]]) -> tuple[set[int], li
             numbers |= _range_of(card, cells) if cells and of_part else set()
             continue
         for cell in cells:
-            last = cell.rpartition(".")[2]  # a number may follow the name of its part
+            last = cell.rpartition(".")[2]  # the name of the part may stand before the number
             if last.isdigit() and (of_part or last != cell):
                 numbers.add(int(last))
             elif not last.isdigit():

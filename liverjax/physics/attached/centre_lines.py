@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 #: Distance between rings along the surface, divided by the mean radius of the tubes.
 _BAND = 2.0
-#: Minimum number of points of a ring. A ring with fewer points is ignored, since it does not go around a tube.
+#: Minimum number of points of a ring. A ring with fewer points is ignored, since it probably does not go around a
+#: tube.
 _LEAST = 5
 
 
@@ -120,9 +121,10 @@ def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarra
 
 
 def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> float:
-    """Return the distance [m] between rings: `_BAND` times the mean radius, or more if an edge would cross two rings.
+    """Return the distance [m] between rings: `_BAND` times the mean radius.
 
-    The mean radius is estimated: area of the surface, divided by its length (the maximum of `away`) and by 2 pi.
+    If an edge of a triangle would cross two rings at this distance, the result is larger. The mean radius is estimated:
+    area of the surface, divided by its length (the maximum of `away`) and by 2 pi.
     """
     a, b, c = (points[triangles[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()

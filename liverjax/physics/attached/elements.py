@@ -38,7 +38,7 @@ class Elements(NodalForce):
     def away(self) -> jax.Array | None:
         """Return vectors (d, 3, Q, m) to subtract from the d tangent vectors, at Q points of m elements.
 
-        They are needed if an end of the elements is not a node. Returns None if all ends are nodes.
+        These vectors are needed if one end of an element is not a node. Returns None if all ends are nodes.
         """
         return None
 

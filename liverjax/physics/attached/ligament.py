@@ -30,7 +30,7 @@ class Ligament(Physics):
 
     nodes: Indices = param("1", "node numbers (n, m)", lower=0)
     weights: Array = param(
-        "1", "weights (n, m) of these nodes in the vector along the fibre; their sum is 0, or 1 if it ends outside"
+        "1", "weights (n, m): the vector along a fibre is the sum of weights times positions (minus `to`)"
     )
     to: Numbers | None = param("m", "end of all fibres outside the body (3,); None: both ends inside", default=None)
     stiffness: Number = param("N/m", "total stiffness of all fibres", above=0.0)
@@ -47,7 +47,8 @@ class Ligament(Physics):
         """Read [[ligament]]: a set of nodes and a point outside the body, or two points of the body."""
         if ("points" in table) == ("to" in table):
             raise InputError(
-                f"{name} needs either to = [x, y, z] with where or set, or points = [[x, y, z], [x, y, z]]"
+                f"{name} needs either to = [x, y, z] with where or set, or points = [[x, y, z], [x, y, z]]: give one "
+                "of them"
             )
         if "stiffness" not in table:
             raise InputError(f"{name} needs stiffness in N/m: give a number")
@@ -69,7 +70,9 @@ class Ligament(Physics):
         """Raise InputError for wrong node numbers, a wrong rest length or tension, or fibres of length 0."""
         numbers = np.asarray(self.nodes)
         if numbers.ndim != 2:
-            raise InputError(f"{name}.nodes has shape {numbers.shape}: give the nodes of each fibre in a column (n, m)")
+            raise InputError(
+                f"{name}.nodes has shape {numbers.shape}: give an array (n, m) with the nodes of a fibre in each column"
+            )
         selection.check_nodes(numbers.ravel(), mesh.number_of_nodes, f"{name}.nodes")
         bounds.check_shape(f"{name}.weights", self.weights, numbers.shape)
         bounds.check_shape(f"{name}.to", self.to, (3,))
@@ -181,7 +184,7 @@ class Fibres(Elements):
         return jnp.broadcast_to(jnp.asarray(self.to)[None, :, None, None], (1, 3, 1, len(self.rest)))
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Return the energy [J] of each fibre: half of stiffness times elongation squared; 0 if it is slack."""
+        """Return the energy [J] of each fibre: half of stiffness times elongation squared, or 0 for a slack fibre."""
         length, rest = jnp.sqrt(C[0]), self.rest[None]
         # A fibre at its rest length counts as taut. The function `maximum` would give half of the derivative there.
         longer = jnp.where(length >= (1 - _ROUNDED) * rest, length - rest, 0.0)

@@ -70,9 +70,9 @@ class Membrane(Physics):
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def freeze(self, memory: None, step: Step) -> "Stretched":
-        """Return the force term.
+        """Return the force term of the membrane for one step.
 
-        It uses the isochoric part of the law, or the whole law if there is no isochoric part.
+        The force term uses the isochoric part of the law, or the whole law if there is no isochoric part.
         """
         isochoric = self.law.isochoric_part()
         law, solved = (self.law, jnp.ones(0)) if isochoric is None else (isochoric, None)
@@ -113,7 +113,7 @@ class Stretched(Elements):
     def _edges(self, mesh: TetMesh) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return the entries r11, r12 and r22, each (m,) [m], of a Cholesky factor for each of the m triangles.
 
-        It is the factor of the metric of two edges of the triangle in the reference shape.
+        It is the Cholesky factor of the 2 x 2 matrix of scalar products of two edges in the reference shape.
         """
         corners = jnp.moveaxis(mesh.points[self.triangles[:, :3]], 0, -1)
         first, second = corners[1] - corners[0], corners[2] - corners[0]

@@ -1,8 +1,8 @@
 """A vessel: bars along a centre line. The bars stiffen the tetrahedra that they cross. They have no bending stiffness.
 
 The line is cut into pieces at the faces of the tetrahedra. A piece has no additional unknowns: its points move with the
-shape functions of its element. The cross-section is a ring, or a disc if `wall` is None. The law acts in uniaxial
-tension along the piece, at constant volume. The tissue of the body is not removed where the wall lies.
+linear or quadratic shape functions of its element. The cross-section is a ring, or a disc if `wall` is None. The law
+acts in uniaxial tension along the piece, at constant volume. The tissue of the body is not removed where the wall lies.
 """
 
 from collections.abc import Mapping
@@ -51,7 +51,7 @@ class Vessel(Physics):
         """Read [[vessel]]: a law, and either the points of a centre line with radii, or the file of a surface."""
         if ("line" in table) == ("surface" in table) or "law" not in table:
             raise InputError(
-                f"{name} needs line = [[x, y, z], …] with radius in m, or surface = 'tube.stl', and [vessel.law]"
+                f"{name} needs line = [[x, y, z], …] with radius in m or surface = 'tube.stl', and also [vessel.law]"
             )
         if "where" in table or "set" in table:
             raise InputError(
@@ -97,9 +97,9 @@ class Vessel(Physics):
         layers.check(self.law, name)
 
     def freeze(self, memory: None, step: Step) -> "Bars":
-        """Return the force term.
+        """Return the force term of the vessel for one step.
 
-        It uses the isochoric part of the law, or the whole law if there is no isochoric part.
+        The force term uses the isochoric part of the law, or the whole law if there is no isochoric part.
         """
         law = self.law.isochoric_part() or self.law
         return Bars(element=self.element, enters=self.enters, leaves=self.leaves, section_area=self.area(), law=law)

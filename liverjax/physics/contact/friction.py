@@ -124,14 +124,14 @@ class Rubbing(Touching):
         return jnp.stack(d.normal), jnp.multiply(self.friction, jnp.maximum(-d.value, 0.0))
 
     def _trial(self, at: jax.Array, s: Number, n: jax.Array) -> jax.Array:
-        """Return the slip (3, Q, m) [m] if all contact points stick, projected onto planes with normals n (3, Q, m)."""
+        """Return the slip (3, Q, m) [m] that results if all points stick, in the planes with normals n (3, Q, m)."""
         trial = self.slip + at - self.now(s)[:, None, None] - self.past
         return trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
 
     def _guessed(self, mesh: TetMesh, at: jax.Array, s: Number) -> jax.Array:
         """Return whether points just touch the obstacle (1, 1, Q, m).
 
-        In the tangent they count as pressed and sticking.
+        In the tangent, such points count as pressed and sticking.
         """
         d = distances(self.obstacle, at, self.now(s))
         return (just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0))[None, None]

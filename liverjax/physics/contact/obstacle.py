@@ -2,13 +2,14 @@
 
 Contact is tested at some points of every surface triangle (three points in linear and quadratic meshes). At a point
 inside the obstacle, a force per reference area (the pressure) acts along the obstacle's normal. The pressure is
-`stiffness` times the depth of the point. Nothing acts at points outside, so the surface does not stick to the obstacle.
-There is no friction (see `liverjax.physics.contact.friction`). The energy per area is half of pressure times depth. The
-gradient and the second derivative of the energy are exact.
+`stiffness` times the depth of the point. No force acts at points outside, so the surface does not stick to the
+obstacle. There is no friction (see `liverjax.physics.contact.friction`). The energy per area is half of pressure times
+depth. The gradient and the second derivative of the energy are exact.
 
-With this penalty method the surface enters the obstacle by the depth pressure / stiffness. By default the stiffness is
-`HARDNESS` times the modulus of the body, divided by the size of a triangle. If the pressure is as large as this
-modulus, the depth is a hundredth of the triangle's size. `lj.obstacle_forces` returns the force and the maximum depth.
+With this penalty method the surface enters the obstacle. The depth is the pressure divided by `stiffness`. By default
+the stiffness is `HARDNESS` times the modulus of the body, divided by the size of a triangle. If the pressure is as
+large as this modulus, the depth is a hundredth of the triangle's size. `lj.obstacle_forces` returns the force and the
+maximum depth.
 
 Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalty, exact tangent).
 """
@@ -35,8 +36,8 @@ from liverjax.physics.contact.passage import in_body
 from liverjax.physics.contact.shapes import SHAPES, Distance, distance
 from liverjax.solvers.attached import Attached
 
-#: Stiffness of the contact, divided by that of a layer of the body's material. The layer is as thick as a triangle is
-#: wide.
+#: Stiffness of the contact, divided by the stiffness of a layer of the body's material. The layer is as thick as a
+#: triangle is wide.
 HARDNESS = 100.0
 #: A point counts as touching if its distance, divided by the size of a triangle, is at most this value.
 _TOUCHING = 1e-9
@@ -78,7 +79,7 @@ class Obstacle(Physics):
     def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
         """Read [[obstacle]]: shape, position and dimensions. By default the whole surface may touch the obstacle."""
         if "shape" not in table:
-            raise InputError(f"{name} has no shape: give {', '.join(SHAPES)}")
+            raise InputError(f"{name} has no shape: use one of {', '.join(SHAPES)}")
         shape = as_word(table["shape"], f"{name} shape")
         if shape not in SHAPES:
             raise InputError(f"{name} shape = {shape!r} is not known: {hint(shape, SHAPES)}")
@@ -135,8 +136,8 @@ class Obstacle(Physics):
         size, deepest = float(np.ptp(np.asarray(mesh.points), axis=0).max()), float(_depth_at_beginning(self, mesh))
         if deepest > 1e-9 * size:
             raise InputError(
-                f"{name} position = {np.asarray(self.position).tolist()}: at the beginning, the obstacle is "
-                f"{deepest:.3g} m inside the body; move the obstacle out of the body"
+                f"{name} position = {np.asarray(self.position).tolist()}: at the beginning, the obstacle overlaps "
+                f"the body by {deepest:.3g} m; move the obstacle out of the body"
             )
         centre = np.asarray(self.position, float) + np.asarray(self.displacement(0, 1, 0.0))
         axis = np.asarray(self.axis, float)
@@ -163,7 +164,8 @@ class Obstacle(Physics):
         """
         if self.stiffness is not None:
             return self
-        # Material under a contact can move sideways. So with a large bulk modulus, the contact would be too stiff.
+        # Material under a contact can move sideways, so a large bulk modulus hardly stiffens it. Without the limit 3
+        # mu, the contact would be much stiffer than the material.
         shear = law.shear_modulus()
         modulus = jnp.max(jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear))
         return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
@@ -204,7 +206,7 @@ class Touching(NodalForce):
     kinked: ClassVar[bool] = True
 
     def now(self, s: Number) -> jax.Array:
-        """Return the displacement (3,) [m] of the obstacle at fraction s of the step, without influence of the body."""
+        """Return the prescribed displacement (3,) [m] of the obstacle at fraction s of the step."""
         return self.moved[0] + s * (self.moved[1] - self.moved[0])
 
     def place(self, x: jax.Array, s: Number) -> jax.Array:
@@ -225,7 +227,10 @@ class Touching(NodalForce):
         return 0.5 * jnp.sum(weighted_stiffness(self.obstacle, mesh) * depth**2)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Return the second derivative of the energy: parts along the normal, and due to the change of the normal."""
+        """Return the second derivative of the energy.
+
+        One part acts along the normal. The other part is due to the change of the normal.
+        """
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
         # A surface that just touches counts as pressed. Otherwise a body on a plane would have no support in the first
@@ -242,7 +247,7 @@ class Touching(NodalForce):
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
         """Return the stiffness along the normal.
 
-        The part due to the change of the normal is omitted, since its eigenvalues are never positive.
+        The part due to the change of the normal is omitted, since the eigenvalues of this part are never positive.
         """
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         k = k * just_touching(self.obstacle, mesh, d).astype(x.dtype)
@@ -257,7 +262,7 @@ def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
     """
     d = _distances(obstacle, mesh, x, moved)
     depth = depths(d, touching_distance(obstacle, mesh))
-    push = weighted_stiffness(obstacle, mesh) * depth  # (Q, m), negative
+    push = weighted_stiffness(obstacle, mesh) * depth  # (Q, m) [N] contact force at each point, times -1
     return shared_out(obstacle, mesh, x, jnp.stack([push * n for n in d.normal]))
 
 
@@ -363,7 +368,8 @@ def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Arr
 
     The obstacle is displaced by `moved` (3,), and the body is at positions x (V, 3). The depth is the maximum depth on
     a fine grid, minus that at the contact points. The approach is the maximum depth of the displaced obstacle in the
-    undeformed body. If this depth is 0, the approach is a tenth of the radius.
+    undeformed body. If the displaced obstacle would not touch the undeformed body, the approach is a tenth of the
+    radius.
     """
 
     def depth(y: jax.Array) -> float:

@@ -1,7 +1,8 @@
 """Check whether a sphere or a cylinder passes through the surface of the body within a step.
 
-Contact is found only by the distance between the surface of the body and the obstacle. So no contact is found for a
-sphere deep inside the body. If the centre of a sphere is inside the body, the contact forces have the wrong direction.
+Contact forces depend only on the distance between the surface of the body and the obstacle. So there is no contact
+force on a sphere deep inside the body. If the centre of a sphere is inside the body, the contact forces have the wrong
+direction.
 """
 
 import numpy as np
@@ -18,8 +19,8 @@ def in_body(
 ) -> np.ndarray:
     """Return, for each position of an obstacle, whether the obstacle is in the body (n,).
 
-    A sphere is in the body if its centre is. A cylinder is in the body if a part of its axis is. Other shapes give
-    False.
+    A sphere is in the body if its centre is in the body. A cylinder is in the body if a part of its axis is in the
+    body. For other shapes, the result is False.
 
     Args:
         shape: shape of the obstacle.
@@ -64,8 +65,8 @@ def passed_in_step(
     """Return how an obstacle entered or passed the body in a step: "has its centre in", "went through", or "".
 
     The obstacle went through if a position on its path is inside the body both at the beginning and at the end of the
-    step. Otherwise there is no such position: the body recovers behind an obstacle that leaves it, and moves away in
-    front of an obstacle that pushes it.
+    step. An obstacle that only leaves or pushes the body has no such position: the body recovers behind the first, and
+    moves away in front of the second.
 
     Args:
         positions: nodal positions (2, V, 3) [m] at the beginning and at the end of the step.

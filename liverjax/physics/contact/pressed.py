@@ -58,7 +58,7 @@ class PressedObstacle(Obstacle):
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError as `Obstacle.check`, and for a missing force, a prescribed motion or negative factors."""
+        """Raise InputError as `Obstacle.check` does, and for a missing force, a given motion or negative factors."""
         super().check(mesh, name)
         history.check_times(self.times, self.history, name, (1,))
         if self.history is not None and np.any(np.asarray(self.history) < 0):
@@ -190,8 +190,8 @@ class Pressing(Touching):
         """Return the displacement () [m] along the force at which contact and force balance; NaN if none is found."""
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))
-        # Newton steps that begin at the solution do not change its value, but they give its derivatives: one step the
-        # first derivative, two steps the second.
+        # Newton steps that begin at the solution do not change its value, but they give its derivatives: one step gives
+        # the first derivative, two steps also give the second derivative.
         for _ in range(2):
             held, slope, _ = self._resistance(at, found)
             found = found + (load - held) / jnp.where(slope > 0, slope, 1.0)
@@ -213,7 +213,8 @@ class Pressing(Touching):
     def _found(self, at: jax.Array, load: jax.Array) -> jax.Array:
         """Find the displacement () [m] of the obstacle by Newton's method; NaN if none is found.
 
-        The contact force grows with the displacement. A step of Newton's method is at most twice the depth.
+        The contact force grows with the displacement. A step of Newton's method is at most twice the maximum depth, or
+        twice the lower bound `least` of this depth if that is larger.
         """
         own = jax.lax.stop_gradient(self)
         first = own._resistance(at, own.before)[0]

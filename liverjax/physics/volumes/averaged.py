@@ -2,11 +2,11 @@
 
 The volumetric energy is the sum of V_a U(J_a) over the nodes, with the volumetric energy density U of the law. J_a is
 the mean volume ratio J of the elements around node a, weighted by their volumes. V_a is a quarter of the sum of these
-volumes. A mesh has about five times fewer nodes than elements. So there are five times fewer volume constraints if the
-bulk modulus is large. The pressure at a node is p_a = U'(J_a), and the pressure in an element is the mean over its
-nodes. The stiffness is the stiffness at constant pressures plus G^T D^-1 G. G is the derivative of the nodal volumes
-with respect to the positions, and D is diagonal with the entries V_a/U''. A step of a porous body without flow leads to
-the same system of equations.
+volumes. A mesh has about five times fewer nodes than elements. So there are about five times fewer volume constraints,
+which prevents locking if the bulk modulus is large. The pressure at a node is p_a = U'(J_a), and the pressure in an
+element is the mean over its nodes. The stiffness is the stiffness at constant pressures plus G^T D^-1 G. G is the
+derivative of the nodal volumes with respect to the positions, and D is diagonal with the entries V_a/U''. A step of a
+porous body without flow leads to the same system of equations.
 
 If the elements around a node have different volumetric energies, the mean of these energies is used, weighted by
 volume.
@@ -64,13 +64,13 @@ def energy(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
 
 
 def averaged_pressure(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
-    """Return the pressures U' (V,) [Pa] at the nodes. They are positive in tension."""
+    """Return the pressures dU/dJ (V,) [Pa] at the nodes. They are positive in tension."""
     U = volumetric_part(law)
     return U.energy_derivatives(_invariants(U, _mean(mesh, J)[0]))[0]["J"]
 
 
 def compliance(mesh: TetMesh, law: Law, J: jax.Array, positive: bool) -> BlockMatrix:
-    """Return the pressure matrix D = V_a/U'' [m^3/Pa], or its absolute value if `positive` is true."""
+    """Return the diagonal matrix D of entries V_a/U'' [m^3/Pa], or of their absolute values if `positive` is true."""
     U = volumetric_part(law)
     mean, volumes = _mean(mesh, J)
     slope = U.energy_derivatives(_invariants(U, mean))[1]["J", "J"]

@@ -1,16 +1,16 @@
-"""Pressures as unknowns, against volumetric locking: Taylor-Hood (P2/P1) for quadratic elements, P1/P1 for linear ones.
+"""Pressures as unknowns against volumetric locking: Taylor-Hood (P2/P1) for quadratic elements, P1/P1 for linear ones.
 
 The volumetric energy is U(J) = K g(J)^2 / 2, with the bulk modulus K and the volumetric strain g of the volume ratio J.
 With pressures p the energy per volume is
 
     W_isochoric + gamma g^2 / 2 + p g - p^2 / (2 (K - gamma)),
 
-with p linear in every element and continuous. For the optimal p, this energy is U with g averaged by the shape
-functions of p. So volume changes are limited only on average, not at every point. The part gamma of the bulk modulus
-stays in the terms of the displacements, so that their matrix is positive definite. gamma is min(mu, K/2) with the shear
-modulus mu, and a quarter of this in linear elements. The finer the mesh, the less the solution depends on gamma.
-Pressures and positions are unknowns of the same system. If the pressures were eliminated, Newton's method would not
-converge for large K.
+with p linear in every element and continuous. For the p at which this energy is stationary, the energy is U with g
+averaged by the shape functions of p. So volume changes are limited only on average, not at every point. The part gamma
+of the bulk modulus stays in the terms of the displacements, so that their matrix is positive definite. gamma is min(mu,
+K/2) with the shear modulus mu, and a quarter of this in linear elements. The finer the mesh, the less the solution
+depends on gamma. Pressures and positions are unknowns of the same system. If the pressures were eliminated, Newton's
+method would not converge for large K.
 
 In linear elements, the positions do not determine all pressures: some pressures that alternate from node to node cause
 no force. For large K these pressures would grow without bound. So linear elements have a stabilisation term, - (p -
@@ -71,8 +71,8 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
     d = J - 1
     if kind == "quadratic":
         return d
-    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-1)^n d^(n-2) / n, n = 3 …). Near J = 1, the first form has
-    # roundoff.
+    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-1)^n d^(n-2) / n, n = 3 …). Near J = 1, the first form loses
+    # digits by roundoff.
     near = jnp.clip(d, -0.1, 0.1)
     series = 1 + sum((-1) ** n * near ** (n - 2) / n for n in range(3, 18))
     safe = jnp.where(jnp.abs(d) < 0.1, 1.0, d)
@@ -100,7 +100,7 @@ class MixedVolume(Physics):
         return jnp.zeros(start.mesh.number_of_vertices, start.x.dtype)
 
     def freeze(self, memory: jax.Array, step: Step) -> "Mixed":
-        """Return the force term. It stores the moduli, and the pressures at the beginning of the step."""
+        """Return the force term of a step. It stores the moduli, and the pressures at the beginning of the step."""
         U = volumetric_part(self.law)
         mu, bulk = self.law.shear_modulus(), self.law.bulk_modulus()
         part = _PART[step.mesh.order] * jnp.minimum(mu, bulk / 2)
@@ -127,11 +127,12 @@ class Mixed(VolumeStress):
     rest: Number = param("Pa", "K - gamma, part of K in the pressure terms")
     shear: Number = param("Pa", "shear modulus")
     before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
-    unit: jax.Array = param("N/m^3", "pressure for an unknown of 1 m; with this unit, all residuals are forces")
+    unit: jax.Array = param("N/m^3", "unknowns are pressures divided by this unit; then all residuals are forces")
     counted: jax.Array = param(
         "1",
-        "mu/K, the fraction of all forces on which the tolerance is based. Isochoric forces count in full. In a "
-        "confined body the pressures cause nearly all forces, but small volume changes determine the pressures",
+        "weight (about mu/K) of other than isochoric forces in the sum on which the tolerance is based; isochoric "
+        "forces have the weight 1. In a confined body the pressures cause nearly all forces, but small volume changes "
+        "determine the pressures",
     )
     kind: str = static(about="kind of the volumetric energy")
 
@@ -153,7 +154,7 @@ class Mixed(VolumeStress):
         return scale_matrix((self.part * g + interpolated(mesh, pressure)) * g1, cofactor(F))
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Return the energy [J] with the optimal pressures p at volume ratios J: integral of gamma g^2/2 + p g/2."""
+        """Return the energy [J] at volume ratios J and pressures p of `settled`: integral of gamma g^2/2 + p g/2."""
         g = strain(self.kind, J)
         return jnp.sum(mesh.weights * (0.5 * self.part * g * g)) + 0.5 * jnp.vdot(
             self.settled(mesh, J), integrals(mesh, g)

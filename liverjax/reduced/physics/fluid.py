@@ -9,11 +9,12 @@ reduced model:
     S_kl = sum_p w_p J_before / K_lim sum_a N_a psi_ka psi_la,
     D_kl = sum_p w_p kappa / J_before (cof F_before grad psi_k) . (cof F_before grad psi_l),
 
-with the time step dt, the weight w_p of a point, the volume ratio J and the deformation gradient F at the end of the
-step. Values with the index `before` belong to the beginning of the step. K_lim is the bulk modulus of the storage,
-kappa the permeability, and N_a the shape function of vertex a. Storage is lumped at the vertices, as in the full model.
-Since A is positive definite, p can be eliminated. The remaining forces on the body are conservative. With all modes and
-all points, these are the equations of the full model.
+with the change of volume c, the time step dt, the weight w_p of a point, the volume ratio J and the deformation
+gradient F at the end of the step. Values with the index `before` belong to the beginning of the step. K_lim is the bulk
+modulus of the storage, kappa the permeability, and N_a the shape function of vertex a. Storage is lumped at the
+vertices, as in the full model. In the lagged scheme, c is the change of volume in the previous step. Since A is
+positive definite, p can be eliminated. The forces on the body after this elimination are conservative. With all modes
+and all points, these are the equations of the full model.
 """
 
 from typing import NamedTuple
@@ -55,7 +56,7 @@ class ReducedSponge(NamedTuple):
     """Data of the porous body that are the same in all steps."""
 
     porosity: Porosity  # with parameters at the points
-    lumped: Lumped | None  # None if the mesh has more than 4 vertices per point; then each point stores its fluid
+    lumped: Lumped | None  # None if the mesh has more than 4 vertices per point; then points store the fluid
 
 
 class Flowing(NamedTuple):
@@ -63,7 +64,7 @@ class Flowing(NamedTuple):
 
     porosity: Porosity  # with parameters at the points
     inverse: jax.Array  # inverse of A (m, m) [Pa/m^3]
-    stored: jax.Array  # (m,) [m^3] S p_before, minus the last step's change of volume in the lagged scheme
+    stored: jax.Array  # (m,) [m^3] S p_before; in the lagged scheme, minus the last change of volume
     averages: jax.Array  # modes at the points, times their weights (S, m) [m^3]
     J: jax.Array  # volume ratios at the beginning of the step (S,)
 
@@ -81,7 +82,7 @@ def reduced_sponge(model: ReducedModel, scene: Scene) -> ReducedSponge:
 
 
 def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
-    """Return the porosity with one value of each parameter per point (S,), instead of one per element."""
+    """Return the porosity with one value of each parameter for each of the S points (S,), not for each element."""
     assert scene.porosity is not None
     own = porosity_of_elements(scene.porosity, scene.region, scene.mesh)
     elements = model.points % scene.mesh.number_of_elements
@@ -115,8 +116,8 @@ def flowing(model: ReducedModel, sponge: ReducedSponge, memory: ReducedFluid, dt
 
 
 def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: Number) -> tuple[jax.Array, jax.Array]:
-    """Return vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5]. Their scalar products are the matrices S and dt D (module
-    docstring) for a step that begins with the deformation gradients F (9, S)."""
+    """Return vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5] for m pressure modes and S points. Their scalar products
+    are the matrices S and dt D (module docstring), for a step that begins with the deformation gradients F (9, S)."""
     modes, w = model.pressures, model.weights
     assert modes is not None
     matrix = as_matrix(F)
@@ -129,7 +130,8 @@ def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: 
 
 
 def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array) -> jax.Array:
-    """Return the storage matrix (m, m) [m^3/Pa] at volume ratios J (S,), computed as a sum over vertices."""
+    """Return the storage matrix (m, m) [m^3/Pa] of m pressure modes as a sum over vertices. `J` (S,): volume ratios at
+    the S points."""
     modes, lumped = model.pressures, sponge.lumped
     assert modes is not None and lumped is not None
     capacity = model.weights * jnp.maximum(J, darcy.LEAST_J) / sponge.porosity.limit_bulk
@@ -138,24 +140,24 @@ def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array
 
 
 def _squares(a: jax.Array) -> jax.Array:
-    """Return the scalar products (m, m) of the vectors a (m, k, S)."""
+    """Return the scalar products (m, m) of m vectors, which are the arrays (k, S) in `a` (m, k, S)."""
     flat = a.reshape(a.shape[0], -1)
     return flat @ flat.T
 
 
 def pressure_coordinates(own: Flowing, J: jax.Array) -> jax.Array:
-    """Return the coordinates p (m,) [Pa] of the pressure at the end of a step, for volume ratios J (S,) at the end of
-    the step."""
+    """Return the coordinates p (m,) [Pa] of m pressure modes at the end of a step, for the volume ratios J (S,) at the
+    S points at this time."""
     if own.porosity.scheme == "lagged":
         return own.inverse @ own.stored
     return own.inverse @ (own.stored - (J - own.J) @ own.averages)
 
 
 def volume_stress(model: ReducedModel, porosity: Porosity, p: jax.Array, F: jax.Array) -> jax.Array:
-    """Return the volumetric part (sigma_Heq(J) - P) cof F (9, S) [Pa] of the first Piola-Kirchhoff stress.
+    """Return the volumetric part (sigma_Heq(J) - P) cof F (9, S) [Pa] of the first Piola-Kirchhoff stress at S points.
 
-    sigma_Heq is the volumetric stress of the drained body. `p` (m,) [Pa]: coordinates of the pressure P; `F` (9, S):
-    deformation gradients.
+    sigma_Heq is the volumetric stress of the drained body. `p` (m,) [Pa]: coordinates of the pressure P in m modes; `F`
+    (9, S): deformation gradients.
     """
     matrix = as_matrix(F)
     stress = _scalars(model, porosity, p, matrix).first["J"]
@@ -170,18 +172,18 @@ def _scalars(model: ReducedModel, porosity: Porosity, p: jax.Array, F: Matrix) -
 
 
 def volume_blocks(model: ReducedModel, own: Flowing, F: Matrix, pairs: tuple[tuple[int, int], ...]) -> list[Matrix]:
-    """Return the derivative of `volume_stress` with respect to F at constant pressures, as one block for each pair of
-    axes in `pairs`.
+    """Return the derivative of `volume_stress` with respect to F at constant pressures, as one 3 x 3 block for each
+    pair of axes in `pairs`.
 
-    `invariant_terms.blocks`, the function for the stiffness between nodes, computes these blocks, with unit vectors
-    instead of the gradients of shape functions.
+    The blocks are computed by `invariant_terms.blocks`, the function for the stiffness between nodes. Here its
+    arguments are unit vectors instead of the gradients of shape functions.
     """
     scalars = _scalars(model, own.porosity, pressure_coordinates(own, determinant(F)), F)
     return invariant_terms.blocks(invariant_terms.state_of(scalars, F), list(IDENTITY), pairs)
 
 
 def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.Array:
-    """Return the stiffness (n, n) [N/m] due to the change of the pressures with the reduced coordinates of the
+    """Return the stiffness (n, n) [N/m] due to the change of the pressures with the n reduced coordinates of the
     motion."""
     n = model.number_of_modes
     if own.porosity.scheme == "lagged":
@@ -192,6 +194,6 @@ def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.
 
 
 def advanced_fluid(own: Flowing, F: jax.Array) -> ReducedFluid:
-    """Return the state of the fluid at the end of a step, where the deformation gradients are F (9, S)."""
+    """Return the state of the fluid at the end of a step. `F` (9, S): deformation gradients at the S points then."""
     lagged = own.porosity.scheme == "lagged"
     return ReducedFluid(pressure_coordinates(own, determinant(as_matrix(F))), F, own.J if lagged else None)

@@ -106,7 +106,7 @@ def coupled_solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
     """Return a function for one step: (load (f,) [N], `ErrorBefore`) -> errors of motion (f,) [m] and pressure (v,)
-    [Pa] at the end of the step.
+    [Pa] at the end of the step. The body has f free degrees of freedom and v unknown pressures.
 
     Args:
         K: matrix of stiffness and inertia of the solid (f, f) [N/m], without the porous part.

@@ -1,8 +1,8 @@
 """Supports in reduced models: springs between the body and a wall, and nodes that slide in a plane normal to x, y or z.
 
-The forces of the springs are linear in the displacements. So their forces on the modes are exactly a matrix (n, n)
-times the reduced coordinates. In all training runs the sliding nodes stay in their planes, so they also stay there in
-all modes.
+The forces of the springs are linear in the displacements. So the reduced forces of the springs are exactly a stiffness
+matrix (n, n) times the n reduced coordinates. In all training runs the sliding nodes stay in their planes, so they also
+stay there in all modes.
 """
 
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def refuse_other_physics(scene: Scene) -> None:
-    """Raise InputError if `scene.physics` contains other objects than these supports.
+    """Raise InputError if `scene.physics` contains objects other than the supports of the module docstring.
 
     Raises:
         InputError: the scene has membranes, ligaments, vessels, obstacles, springs with a history, or sliding nodes in
@@ -74,7 +74,7 @@ def forces_of_springs(scene: Scene, u: jax.Array) -> jax.Array:
 
 
 def reduced_springs(modes: jax.Array, scene: Scene) -> jax.Array | None:
-    """Return the reduced stiffness (n, n) [N/m] of all springs for the modes (n, V, 3).
+    """Return the reduced stiffness (n, n) [N/m] of all springs for n modes (n, V, 3).
 
     Return None if the scene has no springs.
     """

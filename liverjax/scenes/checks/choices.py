@@ -1,4 +1,4 @@
-"""Check that the choices (words) of a scene are known and compatible. Its numbers are not checked here."""
+"""Check that the choices (words) of a scene are known and compatible. Numbers are not checked here."""
 
 import numpy as np
 
@@ -24,7 +24,9 @@ CHOICES = {
 
 
 def check_choices(scene: Scene) -> None:
-    """Check that the choices are known and compatible. Numbers are not checked, and may be unknown inside jit.
+    """Check that the choices of a scene are known and compatible.
+
+    Numbers are not checked. Their values may be unknown inside jit.
 
     Raises:
         InputError: a choice is unknown, or cannot be combined with another one; a load or a motion is given twice, not
@@ -45,7 +47,7 @@ def check_choices(scene: Scene) -> None:
     if scene.solve.reduced and scene.solve.kind == "harmonic":
         raise InputError("[solve] reduced cannot be used with kind = 'harmonic': remove reduced")
     if scene.springpots is not None and scene.solve.kind != "harmonic":
-        raise InputError("[springpots] needs kind = 'harmonic': use [viscosity], a Prony series, in a transient run")
+        raise InputError("[springpots] needs kind = 'harmonic': for a static or dynamic run, use [viscosity] instead")
     if scene.solve.kind == "harmonic":
         _refuse_what_moves_in_time(scene)
     _loaded(scene)
@@ -105,5 +107,6 @@ def _own_volumes(scene: Scene) -> None:
             )
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":
         raise InputError(
-            f"{name} allows no relaxation of volumes: use part = 'isochoric' in [viscosity] or [springpots]"
+            f"{name} needs a volumetric stress that does not relax: use part = 'isochoric' in [viscosity] or "
+            "[springpots]"
         )

@@ -15,7 +15,7 @@ _NO_MOTION = 1e-12
 
 
 def check_moved_where_fixed(scene: Scene) -> None:
-    """Raise InputError if a node is fixed and moved (not by 0) along the same axis.
+    """Raise InputError if a node is fixed along an axis, and also has a displacement other than 0 along this axis.
 
     Arrays inside jit are not checked.
     """
@@ -90,15 +90,15 @@ def check_normals(scene: Scene) -> None:
                 )
             if 0 < mask[node, across].sum() < across.sum():
                 raise InputError(
-                    f"{name} and a fixed axis both constrain node {node}, in directions that are not at right angles: "
+                    f"{name} and another condition constrain node {node} in directions that are not at right angles: "
                     "select different nodes"
                 )
 
 
 def check_prescribed_once(scene: Scene) -> None:
-    """Raise InputError if a node is moved along an axis along which it is already fixed or moved.
+    """Raise InputError if two conditions prescribe a node along the same axis. Two `fixed` conditions are allowed.
 
-    Not for use inside jit.
+    Do not call this function inside jit.
     """
     taken: dict[tuple[int, str], str] = {}
     for kind in ("fixed", "displaced"):
@@ -113,7 +113,9 @@ def check_prescribed_once(scene: Scene) -> None:
 
 
 def check_motion_in_planes(scene: Scene) -> None:
-    """Check that prescribed motions do not move nodes out of their sliding planes. Not for use inside jit.
+    """Check that prescribed motions do not move nodes out of their sliding planes.
+
+    Do not call this function inside jit.
 
     Raises:
         InputError: a motion moves a node out of its plane. The message begins with the name of the motion.

@@ -1,4 +1,4 @@
-"""Warn about histories of loads and motions that a run does not follow: peaks between steps, and late beginnings."""
+"""Warn about histories of loads and motions that a run does not follow: peaks between two steps, or late beginnings."""
 
 import numpy as np
 
@@ -42,13 +42,13 @@ def cautions_of_histories(scene: Scene, ends: np.ndarray) -> list[str]:
         lost, everything = (np.trapezoid(a, every, axis=0).max() for a in (apart, whole))
         if lost > MISSED * everything:
             said.append(
-                f"the history of {name} bends within steps, but the run uses only the values at the ends of steps, so "
-                f"the error is {100 * lost / everything:.2g} % of the integral over time: use a smaller dt"
+                f"the history of {name} is not linear within steps, but the run uses only the values at the ends of "
+                f"steps, so the error is {100 * lost / everything:.2g} % of the integral over time: use a smaller dt"
             )
     return said
 
 
 def _at_times(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (n, k) of a table with k columns at n other times, by linear interpolation."""
+    """Return the values (n, k) of a table with k columns at the n times `at`, by linear interpolation."""
     columns = values.reshape(len(times), -1).T
     return np.stack([np.interp(at, times, column) for column in columns], axis=1)

@@ -12,8 +12,8 @@ from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.springpots import SpringpotSeries
 
-#: Types of the entries of a scene. A scene has at most one entry of each type in PARTS, and any number of those in
-#: SEVERAL.
+#: Types of the entries of a scene. A scene has at most one entry of each type in PARTS, and any number of entries of
+#: each type in SEVERAL.
 PARTS = {
     "mesh": TetMesh,
     "law": laws.Law,

@@ -34,13 +34,14 @@ def _check_traction(load: Traction, name: str) -> None:
     history.check_times(load.times, load.history, name)
     if np.ndim(load.history) == 2:
         if load.value is not None or load.pressure is not None:
-            raise InputError(f"{name} has a value and a history of values: remove one of them")
+            raise InputError(f"{name} has a value or pressure, and also a history of vectors: remove one of them")
         return
     if (load.value is None) == (load.pressure is None):
         raise InputError(f"{name} needs either value (3,) or pressure, in Pa: give one of them")
     key, shape = ("pressure", ()) if load.value is None else ("value", (3,))
     if np.shape(getattr(load, key)) != shape:
-        raise InputError(f"{name} {key} has shape {np.shape(getattr(load, key))}: give shape {shape}")
+        wanted = f"shape {shape}" if shape else "one number"
+        raise InputError(f"{name} {key} has shape {np.shape(getattr(load, key))}: give {wanted}")
 
 
 def _check_motion(motion: Displaced, name: str) -> None:

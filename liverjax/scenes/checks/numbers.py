@@ -12,9 +12,10 @@ from liverjax.scenes.springpots import check_springpots
 
 
 def check_bounds(scene: Scene) -> None:
-    """Check that numbers are within their bounds, and that directions do not have length 0. The check compiles nothing.
+    """Check that numbers are within their bounds, and that vectors of directions do not have length 0.
 
-    Numbers inside jit, grad or vmap are not checked. The mesh is not checked here, but by `check_mesh`.
+    The check compiles nothing. Numbers inside jit, grad or vmap are not checked. The mesh is not checked here, but by
+    `check_mesh`.
 
     Raises:
         InputError: a number is outside its bounds, or a direction has length 0. For a number outside its bounds, the
@@ -34,7 +35,9 @@ def check_bounds(scene: Scene) -> None:
 
 
 def check_numbers(scene: Scene) -> None:
-    """Check that all numbers can be used, also in combination. The mesh is not checked. Not for use inside jit.
+    """Check that all numbers can be used, also in combination. The mesh is not checked.
+
+    Do not call this function inside jit.
 
     Raises:
         InputError: a number is out of bounds, or numbers of law, viscosity or porosity contradict each other.

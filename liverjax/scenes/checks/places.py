@@ -82,6 +82,6 @@ def _inlets_that_act(sponge: Porosity) -> None:
         corners = set() if inlet.triangles is None else set(np.ravel(inlet.triangles).tolist())
         if inlet.nodes is None and any(corners <= place for place in given):
             raise InputError(
-                f"porosity.inlet.{k} is a flux through a surface with drained or given pressures, so this flux has no "
-                "effect: select another surface"
+                f"porosity.inlet.{k} is a flux through a surface whose nodes are drained or have a given pressure, so "
+                "this flux has no effect: select another surface"
             )

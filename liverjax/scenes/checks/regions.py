@@ -29,7 +29,7 @@ def check_region_numbers(scene: Scene) -> None:
 
 
 def check_region_elements(scene: Scene) -> None:
-    """Check the elements of all regions. Not for use inside jit.
+    """Check the elements of all regions. Do not call this function inside jit.
 
     Raises:
         InputError: a region has no elements, has unknown elements or changes nothing; an element has two laws.
@@ -75,7 +75,9 @@ def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> No
     for key, value in own.items():
         if np.shape(value) != (modes,):
             n = np.size(value)
-            raise InputError(f"{name}: viscosity.{key} has {n} numbers, but the scene has {modes} modes; give {modes}")
+            raise InputError(
+                f"{name}: viscosity.{key} has {n} numbers, but the scene has {modes} modes; give {modes} numbers"
+            )
     if any(isinstance(value, jax.core.Tracer) for value in (*own.values(), prony.ratios)):
         return
     changed: Content = {key: np.asarray(value, float) for key, value in own.items()}

@@ -12,7 +12,7 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
-    """Return the number of nodal directions that each object in `scene.physics` fixes at the beginning of the run.
+    """Return how many nodal displacement components each object in `scene.physics` fixes at the beginning of the run.
 
     The keys are the names of the objects, for example support.0. If `only` is given, only these names are included.
     """
@@ -21,9 +21,9 @@ def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
 
 
 def check_hold(scene: Scene, before: dict[str, int]) -> None:
-    """Check that a static body with changed numbers is still supported against rigid motions.
+    """Check that a static body is still supported against rigid motions after numbers of its scene were changed.
 
-    The check is needed only if an object in `scene.physics` now fixes fewer nodal directions than `before`.
+    The check is done only if an object in `scene.physics` now fixes fewer displacement components than `before`.
 
     Args:
         scene: `Scene` with the changed numbers.
@@ -45,7 +45,9 @@ def check_held(scene: Scene) -> None:
         split = (
             f"merge the {doubled} nodes that coincide with another node (if the mesh should be connected there), or "
         )
-        remedy = f"{split if doubled else ''}add [[fixed]] or kind = 'dynamic'"
+        static = scene.solve.kind == "static"  # otherwise the state without loads is sought, which is static too
+        or_motion = " or kind = 'dynamic'" if static else ""
+        remedy = f"{split if doubled else ''}add [[fixed]]{or_motion}"
         raise InputError(f"the supports do not prevent every rigid motion of {loose}: {remedy}")
 
 

@@ -1,10 +1,10 @@
 """Nested dissection of a mesh (George 1973, SIAM J. Numer. Anal. 10, 345): an order to eliminate groups of nodes.
 
-The elements are divided into two parts repeatedly. The nodes that both parts share are eliminated after the others. The
-work grows with the cube of the number of shared nodes. Planes normal to nine directions are tried, and the plane with
-the least estimated work is used. In a mesh without layers, the elements on the two sides of a plane share many nodes.
-In such a mesh it is better to use the smallest set of nodes that separates both sides. This set is the minimum cut of a
-graph (Ford and Fulkerson 1956, Can. J. Math. 8, 399).
+The elements are divided into two parts, and each part is divided again in the same way. The nodes that both parts share
+are eliminated after the others. The work of their elimination grows with the cube of their number. Planes normal to
+nine directions are tried, and the plane with the least estimated work is used. In a mesh without layers, the elements
+on the two sides of a plane share many nodes. In such a mesh it is better to use the smallest set of nodes that
+separates both sides. This set is the minimum cut of a graph (Ford and Fulkerson 1956, Can. J. Math. 8, 399).
 """
 
 from typing import Any, NamedTuple
@@ -14,11 +14,11 @@ import numpy as np
 #: LEAF: a group of at most this number of nodes is not divided. MANY: for a group of more nodes than this, diagonal
 #: planes and minimum cuts are also tried.
 LEAF, MANY = 40, 400
-#: LEAST: minimum fraction of the elements on each side of a plane. BESIDE: a minimum cut stays among this fraction of
-#: the elements on each side of the plane.
+#: LEAST: minimum fraction of the elements on each side of a plane. BESIDE: a minimum cut lies near its plane; on each
+#: side, it passes only through the elements nearest to the plane, which are this fraction of all elements.
 LEAST, BESIDE = 0.25, 0.07
-#: A minimum cut is used if its estimated work is below this fraction of the work of the plane. Planes are preferred
-#: because they leave parts with straighter boundaries.
+#: A minimum cut is used if its estimated work is below this fraction of the estimated work of the plane. Planes are
+#: preferred because they leave parts with straighter boundaries.
 BETTER = 0.9
 #: Normal vectors of the planes.
 DIRECTIONS = np.array(
@@ -29,9 +29,9 @@ DIRECTIONS = np.array(
 class _Part(NamedTuple):
     """A part with n elements, the k nodes that are eliminated inside it, and its m nodes that are eliminated later."""
 
-    elements: np.ndarray  # (n,)
-    nodes: np.ndarray  # (k,), in ascending order
-    border: np.ndarray  # (m,)
+    elements: np.ndarray  # (n,) element numbers
+    nodes: np.ndarray  # (k,) nodes that are eliminated inside the part, in ascending order
+    border: np.ndarray  # (m,) nodes that are eliminated later
 
 
 class _Cut(NamedTuple):
@@ -47,7 +47,7 @@ class _Cut(NamedTuple):
 
 def work(own: Any, border: Any) -> Any:
     """Number of multiplications to eliminate `own` unknowns that are coupled with `border` other unknowns."""
-    return own * (own * own / 3 + own * border + border * border)  # `**` would be slow
+    return own * (own * own / 3 + own * border + border * border)  # the operator ** would be slower
 
 
 def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, list[int]]]:
@@ -111,7 +111,10 @@ def _best_cut(elements: np.ndarray, centres: np.ndarray, part: _Part, V: int) ->
 
 
 def _first_and_last(nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray]) -> None:
-    """Write the first and last element of each node into `span`. `nodes` (n, E): nodes of E ordered elements."""
+    """Write the first and the last element of each node into `span`.
+
+    `nodes` (n, E): the n nodes of each of E elements, in the order of the elements.
+    """
     number = np.repeat(np.arange(nodes.shape[1]), len(nodes))
     every = nodes.T.ravel()
     span[0][every[::-1]] = number[::-1]
@@ -142,7 +145,7 @@ def _smallest_cuts(
 
     Args:
         near: nodes (n, h) of the h elements from low to high - 1, in the order of the elements; n nodes each.
-        nodes: (k,) nodes, in ascending order, through which a cut may pass. Other nodes do not connect the parts.
+        nodes: (k,) nodes, in ascending order, through which a cut may pass. Other nodes do not connect the two sides.
         span: first and last element of each node in this order.
         ends: low and high. Elements before low are on the first side. Elements from high on are on the second.
     """
@@ -159,8 +162,8 @@ def _smallest_cuts(
     into, element = at[known], 2 * k + np.broadcast_to(np.arange(h), near.shape)[known]
     first, last = np.flatnonzero(span[0][own] < low), np.flatnonzero(span[1][own] >= high)
     source, sink, inside = 2 * k + h, 2 * k + h + 1, np.arange(k)
-    # In the graph, a path enters mesh node i at vertex i and leaves it at vertex i + k. Only the edge between both
-    # vertices has the capacity 1.
+    # In the graph, a path enters mesh node i at vertex i and leaves it at vertex i + k. The edge between both vertices
+    # has the capacity 1. All other edges have a larger capacity, so a minimum cut does not pass through them.
     lines = np.concatenate([inside, k + into, element, np.full(len(first), source), k + last])
     columns = np.concatenate([k + inside, element, into, first, np.full(len(last), sink)])
     wide = np.where(np.arange(len(lines)) < k, 1, k + 1).astype(np.int32)

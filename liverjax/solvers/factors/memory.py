@@ -3,7 +3,8 @@
 import os
 from pathlib import Path
 
-#: Files of Linux with three numbers: free memory [kB], memory limit of the container, and its used memory [bytes].
+#: Three files of Linux. They contain the free memory [kB], the memory limit of the container [bytes], and the memory
+#: that the container uses [bytes].
 _FREE, _LIMIT, _USED = Path("/proc/meminfo"), Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
 
 
@@ -19,5 +20,5 @@ def free_memory() -> float:
             return float("inf")
     try:
         return min(free, float(_LIMIT.read_text()) - float(_USED.read_text()))
-    except (OSError, ValueError):  # no container, or no limit ("max")
+    except (OSError, ValueError):  # the process is in no container, or the container has no limit ("max")
         return free

@@ -2,10 +2,10 @@
 
 `liverjax.solvers.factors.dissection` gives the order of elimination. Each group of nodes is eliminated in a dense
 matrix of the group and its border: the later unknowns that are coupled with the group (Duff and Reid 1983, ACM TOMS 9,
-302). `PIVOTS` unknowns are eliminated at a time, so that nearly all work is in matrix products. By symmetry the lower
-triangles are enough. Groups are eliminated in parallel, one per core, as soon as their children are done. While cores
-are idle, the matrix products of a group are divided into parts (tiles) that run in parallel on these cores. Pivots are
-chosen only among unknowns that are eliminated together.
+302). `PIVOTS` unknowns are eliminated at a time, so that nearly all work is in matrix products. Since the matrices are
+symmetric, only the lower triangles are computed. Groups are eliminated in parallel, one per core, as soon as their
+child groups are eliminated. While cores are idle, the matrix products of a group are divided into parts (tiles) that
+run in parallel on these cores. Pivots are chosen only among unknowns that are eliminated together.
 
 Large matrices are factorised in single precision, and solutions are refined iteratively. This needs half the time and
 memory, and the solution has the same number of digits. If the refinement does not converge, double precision is used.
@@ -27,7 +27,7 @@ from liverjax.solvers.factors.dissection import work
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Number of unknowns from which on single precision saves time.
+#: Single precision saves time if the number of unknowns is at least this number.
 SINGLE_FROM = 20_000
 #: PIVOTS: number of unknowns of a group that are eliminated together. TILE: number of columns of a tile.
 PIVOTS, TILE = 128, 192
@@ -42,19 +42,19 @@ STEPS, ENOUGH, WRONG = 12, 4e-16, 1e-11
 class Front(NamedTuple):
     """A group of n unknowns, and the m later unknowns that are coupled with it."""
 
-    own: np.ndarray  # (n,)
-    border: np.ndarray  # (m,)
+    own: np.ndarray  # (n,) unknowns of the group
+    border: np.ndarray  # (m,) later unknowns
     children: list[int]  # indices of the earlier groups that leave their remaining matrices to this group
 
 
 class Eliminated(NamedTuple):
     """Result for n unknowns that were eliminated together: A is their matrix, B couples them with m later unknowns."""
 
-    own: np.ndarray  # (n,)
-    after: np.ndarray  # (m,)
+    own: np.ndarray  # (n,) eliminated unknowns
+    after: np.ndarray  # (m,) later unknowns
     inverse: np.ndarray  # (n, n) A^-1
     X: np.ndarray  # (n, m) A^-1 B; as 16-bit integers (n, m), or (n, 2 m) if complex
-    sizes: np.ndarray | None = None  # (n,) factor by which the integers of each row are multiplied
+    sizes: np.ndarray | None = None  # (n,) factor that multiplies the integers of each row; None: X has no integers
 
     def times(self, y: np.ndarray) -> np.ndarray:
         """Product X y (n,)."""
@@ -70,9 +70,9 @@ class Eliminated(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """Result of the factorisation of a matrix with N unknowns."""
+    """Result of the factorisation of a matrix (N, N)."""
 
-    matrix: "scipy.sparse.csr_array"  # with scaled rows and columns
+    matrix: "scipy.sparse.csr_array"  # the factorised matrix, with scaled rows and columns
     scale: np.ndarray  # (N,) factors that multiply rows and columns
     steps: list[Eliminated]
 
@@ -122,9 +122,10 @@ def single_bytes(plan: list[Front], kind: np.dtype) -> float:
 
 
 def needed_bytes(plan: list[Front], kind: np.dtype, single: bool, small: bool) -> float:
-    """Memory [bytes] for an elimination in the order of the plan. Groups that run in parallel need more.
+    """Memory [bytes] for an elimination in the order of the plan. Groups that run in parallel need more memory.
 
-    This includes the factor, the matrix of one group, and the lower triangles that groups have left to their parents.
+    This memory contains the factor, the matrix of one group, and the lower triangles that eliminated groups have left
+    to their parent groups.
     """
     each = (8 if kind.kind == "c" else 4) * (1 if single else 2)
     of_factor, waiting, most = 0.0, 0.0, 0.0
@@ -195,7 +196,10 @@ class _Elimination(NamedTuple):
 
 
 def _all_pieces(own: _Elimination) -> list[Eliminated]:
-    """Eliminate all pieces, at most one per core at a time. The result does not depend on which piece ends first."""
+    """Eliminate all pieces (tasks), at most one per core at a time.
+
+    The result does not depend on which piece ends first.
+    """
     pieces, waits_for = _work_in_pieces(own.plan)
     running = own.running
     with ThreadPoolExecutor(cores()) as pool:
@@ -229,7 +233,7 @@ def _work_in_pieces(plan: list[Front]) -> tuple[list[list[int]], list[set[int]]]
         below[k] += below[front.children].sum()
     small, piece_of = below < least, np.full(len(plan), -1)
     pieces: list[list[int]] = []
-    for k in range(len(plan) - 1, -1, -1):  # parents first
+    for k in range(len(plan) - 1, -1, -1):  # parent groups come before their child groups
         if piece_of[k] < 0:
             piece_of[k] = len(pieces)
             pieces.append([])
@@ -279,9 +283,10 @@ def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) ->
 
 
 def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) -> None:
-    """Add the lower triangle `left` of a child to the group's own columns and to the rest, at ascending indices `at`.
+    """Add the lower triangle `left` of a child group to the columns `own` of the group and to the matrix `rest`.
 
-    Entries with consecutive indices are added as one block.
+    `rest` is the matrix of the group's border. `at`: ascending indices of the rows of `left` in the group and its
+    border. Entries with consecutive indices are added as one block.
     """
     n = own.shape[1]
     ends = np.unique([0, *(np.flatnonzero(np.diff(at) != 1) + 1), np.searchsorted(at, n), len(at)])
@@ -293,12 +298,11 @@ def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) ->
 
 
 def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[[], int]) -> list[Eliminated]:
-    """Eliminate a group with the columns `own` (n + m, n). Subtract its term from the lower triangle of `rest` (m, m).
+    """Eliminate a group of n unknowns, whose border has m unknowns.
 
-    The group has n unknowns, and its border has m unknowns.
-
-    `own` is updated after each `PIVOTS` unknowns. `rest` is updated once at the end, since large matrix products are
-    the fastest.
+    `own` (n + m, n) contains the columns of the group. It is updated after each `PIVOTS` unknowns. `rest` (m, m) is the
+    matrix of the border. Its lower triangle is updated only once, at the end, since large matrix products are the
+    fastest.
     """
     n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
     X = np.empty((n, len(rest)), own.dtype)
@@ -337,7 +341,10 @@ def _take_off(A: np.ndarray, left: np.ndarray, right: np.ndarray, cores: int) ->
 
 
 def _dealt_out(task: Callable[[int], None], size: int, cores: int, width: int) -> None:
-    """Divide `size` columns into parts of `width` columns. Call `task` with the first column of each, in parallel."""
+    """Divide `size` columns into parts of `width` columns. Call `task` for each part, in parallel on `cores` cores.
+
+    The argument of `task` is the index of the first column of the part.
+    """
     starts = range(0, size, width)
     if cores == 1 or len(starts) < 2:
         for j in starts:
@@ -348,7 +355,7 @@ def _dealt_out(task: Callable[[int], None], size: int, cores: int, width: int) -
 
 
 def _in_whole_numbers(step: Eliminated) -> Eliminated:
-    """Convert X of a step to 16-bit integers."""
+    """Return the result of an elimination with its matrix X converted to 16-bit integers."""
     parts = np.ascontiguousarray(step.X).view(step.X.real.dtype)
     sizes = np.abs(parts).max(axis=1, initial=0.0) / np.iinfo(np.int16).max
     sizes = np.where(sizes > 0, sizes, 1.0).astype(parts.dtype)
