@@ -452,10 +452,7 @@ def _bias_sentence(sd: np.ndarray, bias: np.ndarray, words: Sequence[str]) -> st
         return None
     largest = np.abs(bias)[beyond].max()
     if largest > LARGEST_BIAS:
-        return (
-            f"the {what} error changes the map by a third or more ({largest:.0%}), which is too much to correct: "
-            f"{remedy}"
-        )
+        return f"the {what} error changes the map by up to {largest:.0%}, which is too much to correct: {remedy}"
     return (
         f"the {what} error changes the map by up to {largest:.0%}, and by more than the standard deviation at "
         f"{beyond.mean():.0%} of the nodes: subtract {name} from the logarithm of the map, or {remedy}"

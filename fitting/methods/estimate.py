@@ -212,8 +212,8 @@ def _sentences_of(estimate: Estimate, bias: np.ndarray | None, source: tuple[str
     if len(lost):
         names = ", ".join(estimate.names[k] for k in lost)
         return [
-            f"the error of {what} changes {names} by a third or more, so the data do not determine these parameters "
-            f"in this simulation: {remedy}"
+            f"the error of {what} changes {names} by more than {LARGEST_BIAS:.0%}, so the data do not determine "
+            f"these parameters in this simulation: {remedy}"
         ]
     more = np.flatnonzero(np.abs(bias) > estimate.standard_errors)
     if not len(more):
