@@ -213,7 +213,7 @@ def test_a_sphere_between_the_points_of_contact_is_told(cells, told):
             "sphere",
             [0.05, 0.05, 0.125],
             -0.075,
-            "obstacle.0 has its centre in the body in step 1. It moves 0.075",
+            "obstacle.0 has its centre in the body in step 1. The obstacle moves 0.075",
         ),
         ("sphere", [0.05, 0.05, 0.125], -0.15, "obstacle.0 went through the body in step 1"),
         ("cylinder", [0.05, 0.05, 0.125], -0.075, "obstacle.0 has its centre in the body"),

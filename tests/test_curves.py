@@ -146,6 +146,18 @@ def test_coefficients_that_are_given_are_fitted_and_the_others_named(tmp_path):
     assert not stress_stretch.candidates("yeoh")[0].notes
 
 
+def test_errors_at_two_limits_are_those_of_the_law_there():
+    """With c1 to infinity and c2 to 0, the exponential law is Bogen's. The product of c1 and c2 counted as known, and
+    the error of alpha was five times too small."""
+    data, found = synthetic(lj.laws.Bogen(mu=-250.0, alpha=-8.0, bulk=None), 0.03, 1), {}
+    for name in ("exponential", "bogen"):
+        (candidate,) = stress_stretch.candidates(name)
+        found[name] = stress_stretch.fit(candidate, data)
+    assert found["exponential"].limits == {"c1": "infinity", "c2": "0"}
+    assert found["exponential"].values[2] == pytest.approx(found["bogen"].values[1], rel=1e-4)
+    assert found["exponential"].standard_errors[2] == pytest.approx(found["bogen"].standard_errors[1], rel=1e-3)
+
+
 def test_a_law_at_its_limit_says_so_without_warnings_of_numpy():
     """Eight chains of infinite length are neo-Hookean."""
     (candidate,) = stress_stretch.candidates("arruda_boyce")

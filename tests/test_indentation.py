@@ -143,6 +143,11 @@ def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
             [],
             "the force falls while the depth grows, so change its sign",
         ),
+        (
+            "depth_m,force_N\n" + "".join(f"{k}e-5,{k**2}e-3\n" for k in range(30, 0, -1)),
+            [],
+            "depth and force fall from row to row, so reverse the order of the rows",
+        ),
         ("depth_m,force_N\n", [], "there are no numbers below the header in line 1"),
         ("depth_m,force_N\n" + "".join(f"{k}e-5,0\n" for k in range(8)), [], "the force is the same in all rows"),
         ("depth_m,force_N\n" + "".join(f"{k}e-5,{k}e200\n" for k in range(8)), [], "beyond any measurement"),

@@ -243,7 +243,7 @@ def test_a_membrane_of_a_scene_file():
                 "law": {"name": "costa"}
                 | dict.fromkeys(("c", "b_ff", "b_ss", "b_nn", "b_fs", "b_fn", "b_sn", "bulk"), 1.0),
             },
-            "membrane.0.law has directions",
+            "membrane.0.law cannot be used, because a layer or bar needs an isotropic law",
         ),
         ({"thickness": 5e-5, "law": LAW, "where": {"z_min": 0.1, "x_min": 0.1}}, "no triangle of the boundary"),
     ],

@@ -56,7 +56,9 @@ def test_deviations(tmp_path):
 def test_sorting_and_repeats_are_said(tmp_path):
     s = read_sweep(_write(tmp_path, HEADER + "10,500,90\n0.1,300,30\n0.1,310,31\n"))
     assert s.storage.tolist() == [300, 310, 500]
-    assert any("sorted" in n for n in s.notes) and any("1 frequencies are repeated" in n for n in s.notes)
+    assert any("sorted" in n for n in s.notes) and any(
+        "repeated frequencies: 1. Each line counts" in n for n in s.notes
+    )
 
 
 TRIOS = """\

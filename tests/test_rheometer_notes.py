@@ -132,7 +132,7 @@ def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):
     ((_, apart),) = read_all_sweeps(tmp_path / "s.csv")
     assert not any("--master" in note for note in apart.notes)
     for column, values in (("temperature_C", (20, 21)), ("strain_%", (1, 1.2))):  # nearly the same conditions
-        assert "each line counts as a separate measurement" in notes(column, values)
+        assert "Each line counts as a separate measurement" in notes(column, values)
 
 
 @pytest.mark.parametrize("wrong", [1.0, 1.1])

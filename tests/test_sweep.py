@@ -243,7 +243,7 @@ def test_rows_that_end_crushed_are_told(files, capsys):
     words = command(files, "--out", str(files / "rows.h5"))
     assert main(words) == 0
     told = capsys.readouterr().err
-    assert "times their initial volume in 1 row (2; worst" in told and "worst: row 2, J = 0" in told
+    assert "at the end of 1 run (row 2; worst" in told and "worst: row 2, J = 0" in told
     with h5py.File(files / "rows.h5") as found:
         J = found["volume_ratios"][:]
     assert np.allclose(J[:, 0], [0.9, 0.1, 0.8], rtol=0.1) and np.all(J[:, 0] < J[:, 1])

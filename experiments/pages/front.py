@@ -135,8 +135,8 @@ def simulation() -> str:
         [
             *lines,
             "",
-            'The error is that of implicit Euler, which damps the motion. `integrator = "newmark"` does not damp it. A '
-            f"cube of {cube['tetrahedra']:,} tetrahedra",
+            'The last column is the error of implicit Euler, which damps the motion. `integrator = "newmark"` does not '
+            f"damp it. A cube of {cube['tetrahedra']:,} tetrahedra",
             f"is stretched by 20 % in one load step. This run takes {cube['seconds']:.2g} s (residual "
             f"{cube['residual']:.0e}).",
         ]
@@ -151,8 +151,8 @@ def runs() -> str:
     return (
         f"With a block of 384 tetrahedra, a sweep makes {bench['rows_a_minute']['1']:,.0f} runs per minute on one "
         f"core, and {bench['two_devices_over_one']:.3g} times as many on\ntwo cores. The largest residual is "
-        f"{bench['largest_residual']:.0e}. In a test, processes were killed {kills} times, and {lost} finished chunks "
-        "were\nlost."
+        f"{bench['largest_residual']:.0e} of the forces. In a test, processes were killed {kills} times, and {lost} "
+        "finished chunks were\nlost."
     )
 
 

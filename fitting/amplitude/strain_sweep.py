@@ -11,7 +11,8 @@ from fitting.readers.tables.text_tables import text_of
 from liverjax.core.errors import InputError
 
 FEWEST_POINTS, LARGEST_STRAIN, LARGEST_WITHOUT_UNIT = 4, 10.0, 2.0
-#: If no strain of a column in percent is above this value [1], the values may in fact be fractions.
+#: If a column has the unit % and its largest strain is at most this fraction (0.01, that is 1 %), its numbers may in
+#: fact be fractions.
 SMALLEST_LARGEST = 0.01
 #: If the temperature changes by more than this value [K], the table contains several sweeps.
 LARGEST_DRIFT = 2.0

@@ -80,7 +80,8 @@ def _said_of_rows(test: "TimeTest") -> list[str]:
     number, every, told = len(thinned(test)), int(test.used.sum()), []
     if number < every:
         told.append(
-            f"{number} of {every} points are fitted, spread over the logarithm of the time after each load change"
+            f"{number} of {every} points are fitted; they are spread about evenly over the logarithm of the time after "
+            "each load change"
         )
     first, last = test.resolved
     if test.answers_at_once:

@@ -199,7 +199,7 @@ def _check_waves(options: argparse.Namespace) -> None:
     if options.stride is not None and options.stride < 1:
         raise InputError(f"--stride {options.stride} is the number of voxels in a mean: give 1 or more")
     if options.samples < 0:
-        raise InputError(f"--samples {options.samples} cannot be a number of maps: give 0 or more")
+        raise InputError(f"--samples {options.samples}: the number of sampled maps must be 0 or more")
     for hertz in options.frequencies or ():
         if not (np.isfinite(hertz) and 0 < hertz <= 1e5):
             raise InputError(f"--frequencies {hertz:g} must be above 0 Hz: give e.g. --frequencies 60")

@@ -436,8 +436,8 @@ def level_sentence(found: Field) -> str | None:
 
 
 def map_bias_sentences(found: Field) -> list[str]:
-    """Return a warning for the mesh and one for the time step if its error changes the map at some node by more than
-    the standard deviation there."""
+    """Return a warning for the mesh, and one for the time step. Each is returned only if the error of the mesh (or of
+    the time step) changes the map at some node by more than the standard deviation there."""
     sources = (
         (found.mesh_bias, "mesh", "mesh_bias", "refine the mesh"),
         (found.time_step_bias, "time step", "time_step_bias", "use smaller time steps"),

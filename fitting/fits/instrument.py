@@ -38,8 +38,8 @@ SETTLED = 1e-6
 
 
 class Nuisance(NamedTuple):
-    """An error of the inertia or friction that the instrument subtracts. Its size is given in standard deviations of
-    its prior."""
+    """An error of the inertia or friction that the instrument subtracts. The size of the error is given in standard
+    deviations of its prior."""
 
     name: str
     moved: np.ndarray  # (n,) change of G* [Pa] at the n frequencies if the error is one standard deviation

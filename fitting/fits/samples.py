@@ -126,8 +126,8 @@ def _modes_for_all(
 
 
 def values_of_sample(fit: Fit) -> dict[str, tuple[float, float]]:
-    """Return the parameters of a fit with their standard errors: the parameters of `edges.values`, and the strengths of
-    a spectrum."""
+    """Return the parameters of a fit with their standard errors: those that `edges.values` returns and, for a spectrum,
+    also its strengths."""
     out = edges.values(fit)
     if fit.kind.effective is not None and fit.parameters is not None:
         rows = zip(fit.kind.names, fit.parameters.values, fit.parameters.standard_errors, strict=True)

@@ -151,8 +151,8 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
         return estimate
     warnings.warn(
         f"residuals of points within {alike.length:.2g} m are correlated: the measured field was smoothed, or the "
-        f"scene is inadequate. The standard errors include this correlation, up to {most:.2g} times those of "
-        "independent noise",
+        f"scene is inadequate. The standard errors include this correlation, and are up to {most:.2g} times those "
+        "for independent noise",
         stacklevel=3,
     )
     errors = np.maximum(errors, estimate.standard_errors)

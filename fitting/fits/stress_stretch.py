@@ -143,10 +143,12 @@ def assessed(
     limits = _run_away(candidate, values, every, scale)
     # A parameter at its limit gets no standard error. The errors of the others hold for the law at this limit.
     known = np.array([name not in limits for name in candidate.names])
-    own_slope = slope[np.ix_(known, known)]
-    half, s = spread(J[:n, known], noise, own_slope)
+    products = _products_of_limits(J[:n], known)
+    own_slope = np.pad(slope[np.ix_(known, known)], ((0, 0), (0, products.shape[1])))
+    own_J = np.column_stack([J[:n, known], products])
+    half, s = spread(own_J, noise, own_slope)
     errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
-    residuals = J[:n, known], misfit, noise
+    residuals = own_J, misfit, noise
     its_errors, its_correlation, alike, factors = _errors_of_law(curves, residuals, own_slope, half, of_tests)
     if n > p:
         errors[known] = its_errors
@@ -221,7 +223,7 @@ def _of_hidden_factors(
     factors: FactorNoise | None, names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
     """Return a warning about factors that may multiply the stress of each test. The residuals do not show such factors,
-    because the parameters compensate them."""
+    because the parameters compensate for these factors."""
     if factors is None or factors.shown:
         return []
     much = (factors.moves > _HIDDEN * errors) & (factors.moves > _MOVED * np.abs(values))
@@ -333,6 +335,27 @@ def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scal
         if lost and not 1 / RUNAWAY < ratio < RUNAWAY:
             ends[name] = "0" if ratio < 1 else "infinity"
     return ends
+
+
+#: The data determine a direction of the parameters at their limits if its derivative exceeds this fraction of the
+#: largest derivative of all parameters.
+_DETERMINED = 1e-3
+
+
+def _products_of_limits(J: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the derivatives (n, q) of the misfit in the q directions of the parameters at their limits that the data
+    determine. For example, one parameter goes to infinity and another to 0, and their product is a modulus. Without
+    this product, the errors of the other parameters would hold only for a known modulus.
+
+    Args:
+        J: derivatives (n, p) of the misfit with respect to the unknowns.
+        known: (p,) False for parameters at their limits.
+    """
+    if np.count_nonzero(~known) < 2 or not np.all(np.isfinite(J)):
+        return np.zeros((len(J), 0))
+    U, s, _ = np.linalg.svd(J[:, ~known], full_matrices=False)
+    shown = s[:-1] > _DETERMINED * np.linalg.norm(J, axis=0).max()
+    return (U * s)[:, :-1][:, shown]
 
 
 #: The program warns if the stress of the undeformed sample exceeds this fraction of the root mean square of the curve's

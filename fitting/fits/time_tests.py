@@ -165,8 +165,8 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
 
 
 def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> list[TimeFit]:
-    """Return fits with more and more modes. The search ends when two fits, one after the other, do not lower the
-    criterion."""
+    """Return fits with more and more modes. The search ends after two fits in a row that do not lower the criterion, do
+    not converge, or have superfluous modes. It also ends after an exact fit."""
     tried: list[TimeFit] = []
     best, failures = np.inf, 0
     for n in numbers:

@@ -185,8 +185,8 @@ def resolved_by(tests: Sequence[Measured]) -> tuple[float, float]:
 def _raised_together(
     tests: list[Measured], band: ResolvedBand, numbers: range, kind: Kind, progress: Callable
 ) -> list[Together]:
-    """Return fits with more and more modes. The search ends when two fits, one after the other, do not lower the
-    criterion."""
+    """Return fits with more and more modes. The search ends after two fits in a row that do not lower the criterion, do
+    not converge, or have superfluous modes."""
     tried: list[Together] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -277,8 +277,8 @@ def noises(
     tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, taken: np.ndarray | float
 ) -> np.ndarray:
     """Return the noise of each test, relative to its scales: the root of its squared residuals per degree of freedom.
-    With fewer than `LEAST_FREEDOM` degrees, it is at least `first_noise`. `used`: noise in the fit. `taken`: Jacobian
-    of the residuals, or effective number of parameters."""
+    With fewer than `LEAST_FREEDOM` degrees, the result is at least `first_noise`. `used`: noise in the fit. `taken`:
+    Jacobian of the residuals, or effective number of parameters."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals[: counts.sum()], np.cumsum(counts)[:-1])
     freedoms = degrees_of_freedom(np.asarray(taken), counts) if np.ndim(taken) else counts * (1 - taken / counts.sum())
@@ -401,7 +401,7 @@ def missed(shares: list[Share]) -> list[str]:
 
 
 def structured(fit: Together) -> list[str]:
-    """Return a warning for each test whose residuals keep their sign over many values."""
+    """Return a warning for each test (in a sweep, for each of G' and G'') whose residuals change sign too rarely."""
     out = []
     for test, fitted in zip(fit.tests, fit.fitted, strict=True):
         residuals = fitted - reported_numbers(test)[1]

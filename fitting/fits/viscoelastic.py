@@ -283,7 +283,7 @@ def choose_modes(
     """Raise the number of modes while the criterion falls and every mode is identifiable, or until the fit is exact.
     Return the chosen fit and all tried fits. `progress` is called with the name of each fit.
 
-    A single failure may be a local minimum, so the search ends when two numbers of modes fail one after the other. If
+    A single failure may be a local minimum, so the search ends when two numbers of modes in a row fail. If
     the computation for a number of modes breaks down, this counts as a failure too. A warning names this number, and
     the other fits are kept.
     """

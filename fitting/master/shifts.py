@@ -176,8 +176,8 @@ def _refuse_gap(columns: list, shifts: Shifts) -> None:
     T, other = sorted(celsius(shifts.temperatures[_gap(columns, shifts.log_a) or [0, 1]]))
     raise InputError(
         f"the sweeps at {T:.4g} and {other:.4g} °C do not overlap after the best shifts, so the data do not determine "
-        "the shift between them: measure at a temperature between them or at more frequencies, or give the factors "
-        "in a column shift_factor"
+        "the shift between them: measure at a temperature between these two or at more frequencies, or give the "
+        "factors in a column shift_factor"
     )
 
 

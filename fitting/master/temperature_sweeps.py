@@ -96,7 +96,8 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
         raise InputError(
             f"{path}: shift_factor = {factors.min():g} is not above 0; give positive factors of the frequency"
         )
-    # If a table has several temperatures, the same frequencies occur at each of them. A note on this would be wrong.
+    # If a table has several temperatures, the same frequencies occur at each temperature. So notes about repeated or
+    # sorted frequencies do not apply and are removed.
     if group.max() > 0:
         sweep = sweep._replace(notes=tuple(note for note in sweep.notes if REPEATED not in note and note != SORTED))
     out = []
@@ -106,6 +107,6 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
         own = some(sweep, mine)
         repeated = len(own.angular_frequency) - len(np.unique(own.angular_frequency))
         if repeated and group.max() > 0:
-            own = own._replace(notes=(*own.notes, f"{repeated} {REPEATED}"))
+            own = own._replace(notes=(*own.notes, f"repeated frequencies: {repeated}. {REPEATED}"))
         out.append((float(np.mean(T[mine])), factor, own))
     return out

@@ -47,7 +47,7 @@ def convert(
         moduli: function from angular frequencies (n,) [rad/s] to G' and G'' (n,) [Pa].
         low, high: ends of the frequency band [rad/s].
         solid: whether the model has an equilibrium modulus. If False, the modes get an equilibrium modulus only if
-            their error is too large without it.
+            the error of modes without this modulus is too large.
     """
     decades = np.log10(high / low)
     omega = np.geomspace(low, high, max(12, int(decades * PER_DECADE) + 1))

@@ -100,7 +100,7 @@ def fit_contact(
         np.append(v, np.zeros(2))[:2] for v in (numbers[1:], sizes[2:] * np.abs(force).max())
     )
     before = int(np.sum(depth <= start))
-    errors = sizes[:2] * np.array([E, span])
+    errors = sizes[:2] * np.array([abs(E), span])  # E is negative if the force falls with the depth
     bases = float(offset), float(offset_error), float(tilt), float(tilt_error)
     return ContactFit(E, start, errors, correlation, noise, residuals, before, *bases, independent)
 

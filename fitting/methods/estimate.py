@@ -189,7 +189,7 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
 
 def bias_sentences(estimate: Estimate) -> list[str]:
     """Return warnings if the mesh or the time step changes a parameter by more than its standard error, or too much for
-    a first-order estimate."""
+    a first-order estimate. Another warning is returned if the data do not determine a parameter."""
     of_mesh = _sentences_of(estimate, estimate.mesh_bias, ("the mesh", "mesh_bias", "refine the mesh"))
     steps = ("the time step", "time_step_bias", "use smaller time steps")
     return list(dict.fromkeys([*of_mesh, *_sentences_of(estimate, estimate.time_step_bias, steps)]))

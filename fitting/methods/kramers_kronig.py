@@ -38,7 +38,7 @@ class Consistency(NamedTuple):
     misfit: float  # relative root mean square distance of the best non-negative spectrum from the data
     scatter: float  # relative scatter of neighbouring points about a smooth curve
     breaches: tuple[tuple[float, float, str], ...]  # intervals [rad/s] and the violated bound
-    onset: float | None  # last frequency [rad/s] before the instrument's inertia shows; None: it does not show
+    onset: float | None  # last frequency [rad/s] before the instrument's inertia shows; None: no effect of this inertia
 
     @property
     def far(self) -> bool:
@@ -127,7 +127,7 @@ def _breach(omega, storage, loss, noise) -> str:
     if -rise > margin:
         return "G' falls"
     if abs(math.log(loss[1] / loss[0])) > step + max(SIGNIFICANT * math.hypot(*noise[1]), NEGLIGIBLE):
-        return "G'' changes faster than the frequency"
+        return "G'' changes by a larger factor than the frequency"
     return ""
 
 

@@ -320,8 +320,8 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
     return curves, column[2]
 
 
-#: Stretches of a sheared sample that differ by less than this count as one stretch. They differ because the stretch was
-#: measured again in each row.
+#: If two stretches of a sheared sample differ by less than this value, they are treated as equal. They differ because
+#: the stretch was measured again in each row.
 SAME_STRETCH = 0.01
 
 

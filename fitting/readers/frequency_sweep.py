@@ -58,7 +58,7 @@ class Sweep(NamedTuple):
 
     @property
     def relative_deviation(self) -> float:
-        """Median of the standard deviations divided by the moduli; NaN if there are none."""
+        """Median of the standard deviations divided by the moduli; NaN if no standard deviations are known."""
         if self.storage_sd is None or self.loss_sd is None:
             return np.nan
         return float(np.median(np.concatenate([self.storage_sd / self.storage, self.loss_sd / self.loss])))
@@ -145,8 +145,9 @@ def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarr
 #: Points whose logarithms of x differ by less than _NEAR are merged into one point of the smooth curve. The curve needs
 #: at least _PLACES such points, and has at most about _MOST.
 _NEAR, _PLACES, _MOST = 0.01, 5, 400
-#: A point is far from the curve if the distance of its logarithm from the curve is larger than _FAR, and also larger
-#: than _DEVIATIONS robust standard deviations.
+#: A point is far from its neighbours if its logarithm differs from their median by more than _FAR, and also by more
+#: than _DEVIATIONS robust standard deviations. The curve is fitted without such points. The same two limits determine
+#: which points are far above the fitted curve.
 _FAR, _DEVIATIONS = 0.4, 5.0
 
 
@@ -290,7 +291,7 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     inertia's contribution [Pa] exceeds the modulus. These points become `grey`.
 
     The inertia is found from raw torque and raw angle, with the torque of the sample or its `radius` and `height` [m].
-    If these columns do not show the inertia, it is found from the raw phase.
+    If these columns do not show the inertia, the inertia is found from the raw phase.
     """
     raw = sweep.raw
     if not raw or not set(raw_torque.COLUMNS) & set(raw):

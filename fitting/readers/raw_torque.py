@@ -122,7 +122,7 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
         return None
     if "phase" in own:
         inertias = (K * g.real - stiffness * np.cos(own["phase"])) / w**2
-    else:  # the equation for the inertia has two roots; this root holds above the resonance
+    else:  # the equation for the inertia has two roots; this root is the right one above the resonance
         inertias = (K * g.real + np.sqrt(np.maximum(stiffness**2 - (K * g.imag) ** 2, 0))) / w**2
     inertia = _agreed(w, inertias)
     if not inertia * omega[-1] ** 2 > K * np.abs(G[-1]):

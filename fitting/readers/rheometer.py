@@ -150,7 +150,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
         notes.append(SORTED)
     repeated = len(omega) - len(np.unique(omega))
     if repeated:
-        notes.append(f"{repeated} {REPEATED}")
+        notes.append(f"repeated frequencies: {repeated}. {REPEATED}")
     get: Content = {q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")}
     raw = {q: v[good][order] for q, v in table.raw.items()}
     return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)
@@ -159,10 +159,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
 #: Note on a file whose lines were not sorted by frequency.
 SORTED = "the frequencies were not in ascending order and have been sorted"
 #: Note on frequencies that occur in several lines. The number of repeated lines comes before this string.
-REPEATED = (
-    "frequencies are repeated; each line counts as a separate measurement, unless the noise of lines with the same "
-    "frequency is correlated"
-)
+REPEATED = "Each line counts as a separate measurement, unless the noise of lines with the same frequency is correlated"
 
 #: Part of the note on a sweep at several temperatures.
 WARM = "but one material at one temperature is fitted"

@@ -51,7 +51,8 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
 #: A straight line replaces a ramp only if the ramp has _ROWS_OF_RAMP rows or more, and if the misfit of the line is
 #: below _STRAIGHT times the noise.
 _ROWS_OF_RAMP, _STRAIGHT = 4, 1.5
-#: Maximum number of rows before the ramp (rest), and after the ramp (hold), that are used in the fit of this line.
+#: The straight ramp is fitted to all rows of the ramp, and to at most this number of rows before it (rest) and at most
+#: this number after it (hold).
 _OF_HOLD = 500
 
 

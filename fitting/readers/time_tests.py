@@ -184,7 +184,7 @@ BEGINS_LOADED = (
     "the first row, at 0 s, is under load already: a step from rest at 0 s is assumed. If the sample was loaded "
     "before, give these earlier rows too; otherwise G0 lacks the stress that relaxed before 0 s. If the sample was "
     "under a constant load until its stress was steady, subtract this strain and this stress from all rows. If the "
-    "load was a step, confirm it with ramp = 0 in a description, or with --ramp 0 (relaxation and creep only)"
+    "load was a step, confirm this with ramp = 0 in a description, or with --ramp 0 (relaxation and creep only)"
 )
 
 

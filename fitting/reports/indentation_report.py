@@ -139,7 +139,8 @@ def table(rig: Indenter, fit: ContactFit, content: Content) -> str:
             f"G   {content['shear_modulus']:11.5g} ± {e['shear_modulus']:<9.2g} Pa",
             f"d0  {fit.contact_point:11.5g} ± {e['contact_point']:<9.2g} m",
             *offset,
-            f"a half-space would have E = {content['half_space_young_modulus']:.5g} Pa; no friction, no adhesion",
+            f"if the layer is treated as a half-space, the fit gives E = {content['half_space_young_modulus']:.5g} Pa. "
+            "Both models contain no friction and no adhesion",
         ]
     )
 

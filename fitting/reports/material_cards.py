@@ -32,8 +32,8 @@ def write(folder: Path, model: Maxwell) -> list[str]:
         (folder / "febio.feb").write_text(febio(model))
     if np.sum(model.ratios) > LARGEST_SUM:
         told.append(
-            "the model is a fluid, but Abaqus and liverjax need an equilibrium modulus: in their cards, a millionth "
-            "of G0 does not relax"
+            "the model is a fluid, but Abaqus and liverjax need an equilibrium modulus: in the cards for these "
+            "programs, a millionth of G0 does not relax"
         )
     for name, card in (
         ("liverjax.toml", scene_tables),

@@ -321,8 +321,8 @@ def _bands(closed: Fit, sweep: Sweep) -> dict[str, tuple[np.ndarray, np.ndarray]
 
 
 def _moduli_as_measured(closed: Fit, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return G' and G'' as the instrument measures them. If the sample is compressed, they differ from the moduli of
-    the sample at rest."""
+    """Return G' and G'' as the instrument measures them. If the sample is compressed, these moduli differ from
+    those of the sample at rest."""
     found = closed.details.get("precompression")
     factors = (1.0, 1.0)
     if found is not None:

@@ -1,14 +1,14 @@
 """Torsion of a sample that the plates compress first (`--precompression`).
 
 At rest, the sample has the radius of the plates; it is not trimmed after the compression. It stays compressed until its
-stress has relaxed. Moduli in this file are the moduli that the instrument reports. The instrument computes them with
-the radius of the plates and the gap during the test.
+stress has relaxed. Moduli in this file are the moduli that the instrument reports. The instrument computes these
+moduli with the radius of the plates and the gap during the test.
 
-If the sample can slide sideways on the plates, it stays a cylinder. It has the stretches a along the radius and l along
-the axis, and the axial stress s. For an isotropic law, a shear between both directions has the modulus l^2 s / (l^2 -
-a^2) (Ericksen's relation; Rivlin 1949 for the incompressible cylinder). The part s of this modulus comes from the axial
-prestress. The remaining part, a^2 s / (l^2 - a^2), comes from the material. The torque is proportional to the fourth
-power of the radius. So the instrument reports
+If the sample can slide sideways on the plates, it stays a cylinder. The cylinder has the stretches a along the radius
+and l along the axis, and the axial stress s. For an isotropic law, a shear between both directions has the modulus
+l^2 s / (l^2 - a^2) (Ericksen's relation; Rivlin 1949 for the incompressible cylinder). The part s of this modulus comes
+from the axial prestress. The remaining part, a^2 s / (l^2 - a^2), comes from the material. The torque is proportional
+to the fourth power of the radius. So the instrument reports
 
     G*(omega) = a^4 s [a^2 / (l^2 - a^2) (1 - sum_k g_k / (1 + i omega tau_k)) + (1 - sum_k g_k)]
 
@@ -153,7 +153,7 @@ def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
         law: law of the sample.
         strain: compression, as a fraction of the height at rest.
         smooth: the sample slides sideways on the plates during the compression, so that it stays a cylinder. Otherwise
-            it is glued and bulges.
+            the sample is glued and bulges.
 
     Raises:
         InputError: the simulation does not converge at this compression.

@@ -9,8 +9,8 @@ modulus G:
     F(t) = integral of G(t - s) d f(d(s)).
 
 This is exact if strains are small and if the bulk modulus relaxes like the shear modulus or is much larger. For an
-indenter, the formula holds only while the contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438). At large strain,
-the formula is an approximation: Fung's quasi-linear viscoelasticity.
+indenter, the formula is valid only while the contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438). At large
+strain, the formula is an approximation: Fung's quasi-linear viscoelasticity.
 """
 
 import tomllib

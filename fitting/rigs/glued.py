@@ -3,9 +3,9 @@
 Each test is a rig: a scene without a law, and a reading (the force or displacement that is taken from the run). Law and
 viscosity are added for each run. The simulated sample is glued to its plates, so no shape factor is needed.
 
-By default, the mesh is a narrow sector of the cylinder between two planes of symmetry. Its cells are small at the rims
-of the plates and at the edge of the punch, where stresses are infinite. experiments/TABLES.md lists the error of this
-mesh.
+By default, the mesh is a narrow sector of the cylinder between two planes of symmetry. The cells of the mesh are small
+at the rims of the plates and at the edge of the punch, where stresses are infinite. experiments/TABLES.md lists the
+error of this mesh.
 """
 
 import warnings

@@ -15,8 +15,8 @@ from liverjax.core.struct import Number, param, static, struct
 from liverjax.mesh import shapes
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: Radius and height [m] from section 5.3 of the chapter. Section 5.2 prints 41 mm instead of 4 mm +- 1 mm (at 41 mm,
-#: the sample would be in resonance within the band).
+#: Radius and height [m] from section 5.3 of the book chapter. Section 5.2 prints 41 mm instead of 4 mm +- 1 mm (at
+#: 41 mm, the sample would be in resonance within the band).
 RADIUS, HEIGHT = 0.010, 0.004
 
 
@@ -52,8 +52,9 @@ def linear_cell_for(radius: float, height: float) -> float:
     """Return a cell size [m] that gives about 100 nodes. This is enough for small strain without inertia, because the
     bias (`geometry_factor`) is then the whole error of the mesh.
 
-    The remaining relative error is of the order of the strain. At a strain of 1e-3, the moduli differ by 1e-5 from the
-    moduli with `cell_size_for` (experiments/benchmarks/torsion_speed.py).
+    The remaining relative error is proportional to the strain, and much smaller than the strain. At a strain of 1e-3,
+    the moduli differ by about 1e-5 (relative) from those with `cell_size_for`
+    (experiments/benchmarks/torsion_speed.py).
     """
     return max((math.pi * radius**2 * height / 30) ** (1 / 3), radius / 4, height / 8)
 

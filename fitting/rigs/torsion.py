@@ -104,8 +104,8 @@ def scene_of(
     """Return the oscillation from rest as a scene with a rigid plate for `lj.simulate`. The arguments are the same as
     for `oscillate`.
 
-    `oscillate` with `start="rest"` gives the same result in a fraction of the time. It uses the inverse of the
-    stiffness, which is possible because the mesh is small.
+    `oscillate` with `start="rest"` gives the same result in a fraction of the time. `oscillate` uses the inverse
+    of the stiffness, which is possible because the mesh is small.
     """
     steps, n = drive.steps * drive.cycles, rig.mesh.number_of_nodes
     dt = 2 * jnp.pi / (omega * drive.steps)
@@ -397,7 +397,7 @@ def linearity_limit(strains: Numbers, storage: Numbers, deviation: float = 0.05)
     G' never differs that much.
 
     If a modulus is not finite (a diverged run) before this strain, the last strain with a finite modulus is returned,
-    or NaN if there is none.
+    or NaN if the first modulus is not finite.
     """
     strains, change = np.asarray(strains), np.abs(np.asarray(storage) / np.asarray(storage)[0] - 1)
     beyond = np.flatnonzero(~(change <= deviation))

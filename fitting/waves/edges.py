@@ -99,8 +99,8 @@ def region_matrices(
         m, body: the result of `balance.matrices`, and the body for which this result was computed.
         density: [kg/m^3].
         s: smoothed indicator functions (R, V) from `edge_places.places`.
-        farther: the same functions with edges moved outwards by `edge_places.FARTHER`. If it is None, the edges keep
-            the positions of the labels.
+        farther: the same functions with edges moved outwards by `edge_places.FARTHER`. If it is None, the edges stay
+            where the labels of the voxels change.
     """
     nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
     both = [s] if farther is None else [s, farther]

@@ -50,7 +50,8 @@ class Found(NamedTuple):
     # (F, 2 D) contribution of each of 2 D plane waves (D directions, two polarisations) to the uncertainty of this mean
     bias_left: np.ndarray
     parts_bias: np.ndarray | None = None  # (F, R) mesh bias of `parts`
-    parts_bias_left: np.ndarray | None = None  # (F, R, 2 D) contributions to the uncertainty of `parts_bias`
+    # (F, R, 2 D) contribution of each plane wave to the uncertainty of `parts_bias`
+    parts_bias_left: np.ndarray | None = None
 
 
 def body_of(field: WaveField, side: int | None = None) -> VoxelBody:

@@ -12,8 +12,8 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.versions import versions
 
-#: A function (name, find) -> regions. It returns the regions that are stored under this name. If there are none, it
-#: calls `find`, stores the result and returns it.
+#: A function (name, find) -> regions. It returns the regions that are stored under this name. If no regions are
+#: stored, it calls `find`, stores the result and returns it.
 Keep = Callable[[str, Callable[[], Regions]], Regions]
 _NUMBERS = tuple(name for name in Regions._fields if name != "correlations")
 

@@ -173,8 +173,8 @@ def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
-    """Return the prior inverse covariance (2 R + P, 2 R + P) of moduli and edge shifts. It is 0 for the moduli. For the
-    shifts it is the inverse of `Patches.covariance`."""
+    """Return the prior inverse covariance (2 R + P, 2 R + P) of moduli and edge shifts. The result is 0 for the moduli.
+    For the shifts it is the inverse of `Patches.covariance`."""
     P = len(m.patches.region)
     out = np.zeros((2 * R + P, 2 * R + P))
     out[2 * R :, 2 * R :] = np.linalg.inv(m.patches.covariance)

@@ -46,7 +46,7 @@ from liverjax.core.struct import Content
 #: Prior standard deviations of c that are tried: from a nearly uniform organ to an organ with a strongly varying
 #: modulus.
 DEVIATIONS = (0.2, 0.4, 0.8)
-#: Prior standard deviation of the real and the imaginary part of the levels.
+#: Prior standard deviation of the real and of the imaginary part of l_f (the level: one complex unknown per frequency).
 LEVEL = 0.5
 #: STEPS: maximum number of Gauss-Newton steps for each of `DEVIATIONS`. NEAR: a search ends if the next step is shorter
 #: than this. FAR: a map has converged if the next step is shorter than this (both in standard deviations of the map).
@@ -85,7 +85,8 @@ class Course(NamedTuple):
     whole: np.ndarray  # (F,) complex: modulus g_f of the uniform organ at each frequency [Pa]
     # F matrices (E, P + L). The product with (c, L levels) gives c + l_f of the E elements.
     exponents: tuple[scipy.sparse.csr_array, ...]
-    # 3 matrices (P, P). The product with c gives the change of c over the width w along x, y or z.
+    # 3 matrices (P, P). The product with c (the field of the exponent at the corners) gives the change of c along x, y
+    # or z over w, the width over which the prior smooths a jump.
     slopes: tuple[scipy.sparse.csr_array, ...]
     p: smooth.Prior
     length: float  # correlation length of the prior [m]

@@ -66,7 +66,8 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
 
 
 def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
-    """Print a note about optional files in the folder of results that are older than this run (its time `begin`)."""
+    """If the folder of results contains optional files from before this run, print a note that names them. `begin`:
+    time at which this run began."""
     names = [name for name in getattr(options, "optional_files", ()) if _older(options.out / name, begin)]
     if names:
         verb = "is" if len(names) == 1 else "are"

@@ -104,10 +104,11 @@ def _of_crushed(rows: dict[int, float]) -> list[str]:
         return []
     worst = max(rows, key=lambda row: abs(math.log(max(rows[row], 1e-300))))
     named = ", ".join(map(str, list(rows)[:20])) + (", …" if len(rows) > 20 else "")
-    how_many = f"{len(rows)} row{'s' if len(rows) > 1 else ''} ({named}; worst: row {worst}, J = {rows[worst]:.2g})"
+    s = "s" if len(rows) > 1 else ""
+    how_many = f"{len(rows)} run{s} (row{s} {named}; worst: row {worst}, J = {rows[worst]:.2g})"
     return [
-        "at the end, some elements have less than a fifth or more than five times their initial volume in "
-        f"{how_many}, which is impossible in tissue: use a larger bulk modulus or smaller loads"
+        f"at the end of {how_many}, some elements have less than a fifth or more than five times their initial "
+        "volume, which is impossible in tissue: use a larger bulk modulus or smaller loads"
     ]
 
 

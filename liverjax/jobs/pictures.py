@@ -59,7 +59,7 @@ def draw_surface(file: Path, surface: Surface) -> None:
 
 
 def of_result(file: Path, name: str, step: int | None = None) -> Surface:
-    """Read the surface from result.h5. Its colours show a field, the displacement or the pressure.
+    """Read the surface from result.h5. The colours of the surface show a field, the displacement or the pressure.
 
     Args:
         file: result.h5 of `liverjax simulate`.

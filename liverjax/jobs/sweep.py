@@ -93,7 +93,7 @@ def read_sweep(
     names, rows = read_table(parameters)
     for name in names:
         if np.shape(numbers_at(scene, name)):
-            raise InputError(f"parameter {name!r} is a list in the scene file: name one of its numbers by the index")
+            raise InputError(f"parameter {name!r} is a list in the scene file: add an index to the name, e.g. {name}.0")
     parts = {".".join(name.split(".")[:2]) for name in names}
     held = holding(scene, parts)
     for k, row in enumerate(rows.tolist()):
@@ -148,7 +148,7 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     try:
         text = file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not a text file"
+        reason = getattr(error, "strerror", None) or "not a text file"
         raise InputError(f"{file} cannot be read ({reason}): give a CSV file of parameters") from None
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     for mark, name in ((";", "semicolons"), ("\t", "tabs")):

@@ -249,7 +249,7 @@ def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]
 
 
 def _idle_parameters_row(law: Law, programs: Sequence[Callable], F: np.ndarray) -> list[Row]:
-    """Return a row with the parameters that change neither energy nor stress. Returns no row if there are none."""
+    """Return a row with the parameters that change neither energy nor stress. Otherwise return no row."""
     law = _with_other_parameters(law)
     leaves, structure = jax.tree_util.tree_flatten_with_path(law)
     before, idle = [_as_numbers(partial(f, law), F) for f in programs], []
@@ -456,7 +456,7 @@ def _jumps(law: Law, energy: Callable) -> list[Row]:
             else:
                 at = low
                 found = f"by {parts.max():.3g} Pa at {what} {at:.3g} in {test.replace('_', ' ')}"
-                return [Row("the energy jumps", found, "the stress does not show it", False)]
+                return [Row("the energy jumps", found, "the stress does not show this jump", False)]
     return []
 
 

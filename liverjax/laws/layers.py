@@ -37,11 +37,14 @@ def check(law: Law, name: str) -> None:
     """Check that a law can be used for a layer or bar.
 
     Raises:
-        InputError: the law has directions (then the message begins with `name`), or its parameters contradict each
-            other.
+        InputError: the law has directions or is written in Green's strain (then the message begins with `name`), or
+            the parameters of the law contradict each other.
     """
     if any(one.fibre is not None or one.green_energy is not None for one in law.summands()):
-        raise InputError(f"{name}.law has directions, which a layer or bar cannot use: use an isotropic law")
+        raise InputError(
+            f"{name}.law cannot be used, because a layer or bar needs an isotropic law that is not written in Green's "
+            "strain: use another law"
+        )
     law.check()
 
 
@@ -49,8 +52,8 @@ def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
     """Energy density (Q, m) [Pa] of a layer without stress through its thickness, at Q points of m elements.
 
     Args:
-        law: isotropic law. If `solved` is False, it is evaluated at J = 1. Otherwise it is evaluated at the J for which
-            the stress through the thickness is 0.
+        law: isotropic law. If `solved` is False, the law is evaluated at J = 1. Otherwise it is evaluated at the J for
+            which the stress through the thickness is 0.
         C: C_11, C_12, C_22 (Q, m) of the in-plane right Cauchy-Green tensor.
         solved: whether the thickness stretch is an unknown.
     """

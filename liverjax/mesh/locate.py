@@ -85,7 +85,8 @@ def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarra
 
 
 def around_a_point(corners: np.ndarray) -> np.ndarray:
-    """Return, for each of E tetrahedra, whether it contains the origin. `corners` (E, 4, 3): their corners."""
+    """Return, for each of E tetrahedra, whether it contains the origin. `corners` (E, 4, 3): corners of the
+    tetrahedra."""
     a, b, c, d = np.moveaxis(corners, 1, 0)
 
     def volume(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:

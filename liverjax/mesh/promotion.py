@@ -1,4 +1,5 @@
-"""Make quadratic tetrahedra with a node at the middle of every edge, and add cubic shape functions."""
+"""Make quadratic meshes (a node at the middle of every edge) from linear ones, and cubic meshes from quadratic ones by
+additional shape functions on edges and faces."""
 
 import jax
 import jax.numpy as jnp

@@ -82,7 +82,7 @@ def _fourteen_points() -> tuple[np.ndarray, np.ndarray]:
 def triangle_rule(degree: int = 4) -> tuple[np.ndarray, np.ndarray]:
     """Return weights (Q,) and barycentric coordinates (3, Q) of an integration rule on a triangle.
 
-    Its degree is 4 (Dunavant 1985) or 5 (Radon 1948).
+    The degree of the rule is 4 (Dunavant 1985) or 5 (Radon 1948).
     """
     pairs = [(0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)]
     if degree == 5:

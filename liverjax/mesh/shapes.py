@@ -131,9 +131,12 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
 def _not_too_many(tetrahedra: int, names: str) -> None:
     """Raise `InputError` if a mesh would have more than `MOST_TETRAHEDRA` elements, before the mesh is made."""
     if tetrahedra > MOST_TETRAHEDRA:
+        remedy = (
+            "give fewer cells" if names == "cells" else "use larger cells, or give lengths in metres, or add the unit"
+        )
         raise InputError(
             f"the shape with these values of {names} would have about {tetrahedra:.2g} tetrahedra, but at most "
-            f"{MOST_TETRAHEDRA:.0e} are allowed: give lengths in metres, or add the unit"
+            f"{MOST_TETRAHEDRA:.0e} are allowed: {remedy}"
         )
 
 

@@ -58,7 +58,7 @@ class TetMesh:
 
     @property
     def number_of_vertices(self) -> int:
-        """Number of vertices of elements. They are the first nodes."""
+        """Number of vertices of elements. The vertices are the first nodes."""
         return self.pattern.row_nodes.shape[1]
 
     @property

@@ -121,7 +121,7 @@ class Start(NamedTuple):
 
 
 class Step(NamedTuple):
-    """The state at the beginning of a step. It is constant during the step."""
+    """The state at the beginning of a step. This state is constant during the step."""
 
     mesh: TetMesh
     x: jax.Array  # (V, 3) [m] positions at the beginning of the step

@@ -27,9 +27,10 @@ LEAST_J = 1e-3
 
 
 class Flow(NamedTuple):
-    """The pressure equation of a step at its initial positions, with the pressure matrix A and its diagonal D.
+    """The pressure equation of a step, for the positions at the beginning of the step.
 
-    A contains the storage of fluid plus dt times the flow between nodes, both per unit of pressure.
+    A is the pressure matrix, and D its diagonal. A contains the storage of fluid plus dt times the flow
+    between nodes, both per unit of pressure.
     """
 
     matrix: block_matrix.BlockMatrix  # A: symmetric, positive definite, with 1 x 1 blocks
@@ -118,7 +119,7 @@ def lack(flow: Flow, b: jax.Array, pressure: jax.Array) -> jax.Array:
 class Guess(NamedTuple):
     """Starting pressures of a solve, and the accuracy that this solve needs."""
 
-    pressure: jax.Array  # (V,) [Pa]; derivatives of the solution do not depend on them
+    pressure: jax.Array  # (V,) [Pa]; derivatives of the solution do not depend on these pressures
     looser: Number  # tolerance of the solve, divided by `Flow.tolerance`
 
 

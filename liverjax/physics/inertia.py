@@ -2,8 +2,9 @@
 
 Newmark's method uses the mean of the forces at both ends of a step. The forces of an obstacle with a given position are
 an exception: only their value at the end of the step is used (Kane et al. 1999, Comput. Methods Appl. Mech. Eng. 180,
-1). Then an obstacle at rest never adds energy to the body. With the mean of the forces, it would add energy if contact
-begins or ends within a step. The stored acceleration (`Motion`) does not contain the part due to these obstacle forces.
+1). Then an obstacle at rest never adds energy to the body. With the mean of the forces, the obstacle would add energy
+if contact begins or ends within a step. The stored acceleration (`Motion`) does not contain the part due to these
+obstacle forces.
 """
 
 from typing import Any, ClassVar, NamedTuple

@@ -5,9 +5,9 @@
 sigma_p is the volumetric stress, J the volume ratio, P the pressure of the fluid at the nodes, kappa the permeability,
 lap the Laplacian, and 1/K_lim the stored fluid volume per volume and pressure. The Kerdok-Hencky stress is sigma_Heq =
 K0 r_w ln((r_w + J - 1)/r_w), with the drained bulk modulus K0 and the fluid fraction r_w. Below J0 = 1 - r_w + r_w
-K0/K_lim it is replaced by its tangent line at J0, which has the slope K_lim. (The chapter prints J0 without the factor
-r_w. Without this factor, the slope would be r_w K_lim.) The pressure equation uses the volumes at the beginning of a
-step, so that it is linear in P. There are two schemes:
+K0/K_lim this stress is replaced by its tangent line at J0, which has the slope K_lim. (The chapter prints J0 without
+the factor r_w. Without this factor, the slope would be r_w K_lim.) The pressure equation uses the volumes at the
+beginning of a step, so that it is linear in P. There are two schemes:
 
 * "implicit": P at the end of the step follows from the volume change of the same step. P is a function of the positions
   x and is eliminated. The equations for x are symmetric, and stable for any time step. Newton's direction is computed

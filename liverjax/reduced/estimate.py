@@ -161,8 +161,8 @@ def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid | None
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """Return a function that solves the linear equations of one step. With a fluid, this is the function of
-    `coupled_solver`. Without a fluid, the matrix of the equations is K."""
+    """Return a function that solves the linear equations of one step. With a fluid, it is the function that
+    `coupled_solver` returns. Without a fluid, the matrix of the equations is K."""
     from scipy.sparse.linalg import splu
 
     if fluid is not None:

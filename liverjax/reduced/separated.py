@@ -148,7 +148,8 @@ def _names_and_limits(
         raise InputError(f"ranges has {len(ranges)} parameters: give 1 to {MOST_PARAMETERS}")
     if points < 2 or points ** len(ranges) > MOST_RUNS:
         raise InputError(
-            f"points = {points} needs {points ** len(ranges)} runs: give 2 points or more, but {MOST_RUNS} runs at most"
+            f"points = {points} needs {points ** len(ranges)} runs: give at least 2 points, and few enough that "
+            f"at most {MOST_RUNS} runs are needed"
         )
     for name, limits in ranges.items():
         if np.ndim(numbers_at(scene, name)) != 0:

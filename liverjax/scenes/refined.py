@@ -1,6 +1,7 @@
 """Convert a scene to a finer mesh, to estimate the mesh error of a run with a fluid. Every element is cut into eight.
 
-The pressures of a fluid are linear in linear and in quadratic elements. So only a finer mesh represents them better.
+The pressures of a fluid are linear in linear and in quadratic elements. So only a finer mesh represents the pressures
+better.
 """
 
 from collections.abc import Callable

@@ -141,7 +141,7 @@ def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
 def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
     """Read the tables of all sections in `liverjax.physics.registry`, for example [[support]] and [[obstacle]].
 
-    Each table becomes an object of the first class that knows all keys of the table.
+    Each table becomes an object of the first class that accepts all keys of the table.
     """
     for section in dict.fromkeys(p.section for p in NAMED):
         for k, table in enumerate(_tables(content, section)):
@@ -243,7 +243,7 @@ def _linear_mesh(table: dict, folder: Path) -> TetMesh:
 
 
 def _cylinder(table: dict, scale: float) -> TetMesh:
-    """Make the mesh of a cylinder. Optional keys make it finer near rims and rings, or match the area of the circle."""
+    """Make the mesh of a cylinder. Optional keys refine the mesh near rims and rings, or match the circle's area."""
     for key in ("radius", "height", "cell_size"):
         if key not in table:
             raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")

@@ -101,7 +101,7 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
 
 
 def _pressure_errors(result: Result) -> tuple[str, str]:
-    """Return two additions to the result of `mesh_sentence`: which error it omits, and the error of the pressures."""
+    """Return two additions to the sentence of `mesh_sentence`: an omitted error, and the error of the pressures."""
     if result.pressure is None or result.mesh_error is None:
         return "", ""
     if result.mesh_error.pressure is None:
@@ -150,7 +150,7 @@ _LOCKING = 100.0
 
 
 def of_locking(scene: Scene) -> list[str]:
-    """Warn if quadratic elements are too stiff (lock). With volumetric = "mixed" they would not lock."""
+    """Warn if quadratic elements are too stiff (lock). With volumetric = "mixed" these elements would not lock."""
     if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
         return []
     try:
@@ -242,9 +242,9 @@ def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result,
         between, approach = missed_depth(obstacle, scene.mesh, x, moved[k])
         if between > BETWEEN * approach:
             return [
-                f"{name} penetrates the body by {between:.2g} m between the points at which contact is tested (its "
-                f"approach is {approach:.2g} m), because the triangles are too large for its radius: refine the mesh "
-                "there"
+                f"{name} penetrates the body by {between:.2g} m between the points at which contact is tested "
+                f"(approach of the obstacle: {approach:.2g} m), because the triangles are too large for the radius "
+                "of the obstacle: refine the mesh there"
             ]
     return []
 
@@ -262,9 +262,9 @@ def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, m
         what = passed_in_step(obstacle.shape, axis, scene.mesh, both, centres[k : k + 2], triangles)
         if what:
             return (
-                f"{name} {what} the body in step {k + 1}. It moves {ways[k]:.2g} m in this step, and its radius is "
-                f"{radius:.2g} m, so it passed the surface between two steps. Contact forces are missing or have the "
-                "wrong direction: use more steps"
+                f"{name} {what} the body in step {k + 1}. The obstacle moves {ways[k]:.2g} m in this step, and has a "
+                f"radius of {radius:.2g} m, so it passed the surface between two steps. Contact forces are missing or "
+                "have the wrong direction: use more steps"
             )
     return ""
 

@@ -28,7 +28,7 @@ class State(NamedTuple):
     """The state between two steps."""
 
     x: jax.Array  # (V, 3) [m] positions
-    memories: tuple  # internal variables of each physics object, in order; None if it has no such variables
+    memories: tuple  # internal variables of each physics object, in order; None: the object has no such variables
 
 
 class Sizes(NamedTuple):
@@ -43,7 +43,7 @@ class Equations(NamedTuple):
 
     scene: Scene
     physics: tuple[Physics, ...]
-    acting: tuple  # force term of each physics object in this step; None if it has no force
+    acting: tuple  # force term of each physics object in this step; None: the object has no force
     state: State  # state at the beginning of the step
     k: Number  # number of the step, from 1
     free: Free
@@ -215,7 +215,7 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
         # With volumetric = "mixed", inertia forces count in the tolerance only with a weight of about shear modulus
         # divided by bulk modulus (`Mixed.counted`). In short time steps the roundoff of inertia forces exceeds this
         # tolerance, so this roundoff is added. Single precision also uses the roundoff of double precision, so that a
-        # run reports if it stops at a larger residual.
+        # run that stops at a larger residual reports this.
         noise = noise + ROUNDINGS * sizes.roundoff * (eps / float(jnp.finfo(state.x.dtype).eps))
     return Equations(
         scene=scene,
@@ -247,7 +247,7 @@ def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
     held, free = e.mesh.points, e.free
     q = q[: 3 * e.mesh.number_of_nodes]
     if e.moved is not None:
-        # Prescribed motion is linear within a step. Of a history, only the values at the ends of steps are used.
+        # Prescribed motion is linear within a step. Only the values of a history at the ends of the steps are used.
         before, after = e.moved
         held = held + before + s * (after - before)
     x = free.mask * jnp.stack(columns(q), axis=-1) + (1 - free.mask) * held

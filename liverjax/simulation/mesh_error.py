@@ -1,7 +1,7 @@
 """Estimate the error of a run due to the mesh. Each step needs one linearised solve in a richer space of functions.
 
-The richer space has quadratic functions for linear elements, and cubic functions for quadratic elements. It can
-represent the positions of a step exactly. In the richer space these positions are not in equilibrium: the
+The richer space has quadratic functions for linear elements, and cubic functions for quadratic elements. The richer
+space contains the positions of a step exactly. In the richer space these positions are not in equilibrium: the
 out-of-balance forces are r. With the tangent stiffness K, the estimated change of the displacements is du = -K^-1 r.
 The estimated change of the reactions is their derivative in the direction du. A second run, in the richer space, is
 computed step by step together with the first run. The second run has separate internal variables of viscosity, fluid

@@ -102,7 +102,7 @@ def stiffness(e: Equations, pressure: jax.Array | None, x: jax.Array, kind: Kind
 
 
 def node_blocks(e: Equations) -> Block | None:
-    """Sum of the diagonal stiffness blocks (V,) [N/m] of all force terms at nodes; None if there are none."""
+    """Sum of the diagonal stiffness blocks (entries (V,) [N/m]) of force terms at nodes; None if no term has blocks."""
     total: Block | None = None
     for a in e.nodal:
         own = a.stiffness()
@@ -173,7 +173,7 @@ def tangent(
 ) -> Tangent:
     """Derivative of the forces at positions x (V, 3) [m], at fraction s of the step. JAX treats it as a constant.
 
-    `pressure`: pressures at the nodes (V,) [Pa], or None if there are none. `near`: a flag and a tangent; if the flag
+    `pressure`: pressures at the nodes (V,) [Pa], or None without pressures. `near`: a flag and a tangent; if the flag
     is true, the coarse space of this tangent is used. `kind`: a `Kind`.
     """
     e, pressure, x, s = jax.lax.stop_gradient((e, pressure, x, s))

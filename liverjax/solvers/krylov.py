@@ -142,7 +142,8 @@ class Earlier(NamedTuple):
     solutions: jax.Array  # (EARLIER, m), m entries each
 
     def combined(self, b: jax.Array) -> jax.Array:
-        """Linear combination (m,) of the earlier solutions. Its right-hand side is as close as possible to b (n,).
+        """Linear combination (m,) of the earlier solutions. The same combination of right-hand sides is as close as
+        possible to b (n,).
 
         The method is Gram-Schmidt orthogonalisation of the right-hand sides, applied twice.
         """

@@ -52,8 +52,8 @@ class Kept(NamedTuple):
     surprise: jax.Array
     trust: jax.Array
     beside: jax.Array | None = None  # the additional unknowns at the root (`Problem.beside`)
-    #: The last linear solves for derivatives. The next such solve begins with a combination of their solutions. They
-    #: are zeros if no derivatives are computed.
+    #: The last linear solves for derivatives. The next such solve begins with a combination of their solutions. All
+    #: entries are zeros if no derivatives are computed.
     adjoints: Earlier | tuple[()] = ()
 
 

@@ -60,7 +60,7 @@ class _Point(NamedTuple):
     size: jax.Array  # |r| at q
     aim: jax.Array  # norm of the right-hand side for the last direction dq
     kept: Kept
-    beside: jax.Array | None  # additional unknowns at q (`Problem.beside`); None if there are none
+    beside: jax.Array | None  # additional unknowns at q (`Problem.beside`); None: no such unknowns
     looser: jax.Array  # factor that multiplies the tolerance of the next solve for `beside`
     indefinite: jax.Array  # whether the tangent of the last solve was not positive definite
     stale: jax.Array  # whether dq comes from a tangent that was made at an earlier iterate

@@ -208,7 +208,8 @@ def _divided_power(p: Any, y: list) -> Number:
 
     It is computed by the binomial series of the power, truncated at 0.11^16 = 5e-16.
     """
-    homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]  # complete homogeneous polynomials h_k of y
+    # complete homogeneous symmetric polynomials h_k of y
+    homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]
     for node in y:
         for k in range(1, 16):
             homogeneous[k] = homogeneous[k] + node * homogeneous[k - 1]

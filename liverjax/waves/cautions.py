@@ -27,7 +27,7 @@ def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]
         said.append("the scene has no [body], so the body has no inertia: write density = 1060.0 in [body]")
     inlets = () if scene.porosity is None else scene.porosity.inlet
     if not scene.displaced and not scene.traction and not inlets:
-        said.append("the scene has no excitation: give amplitudes as [[displaced]] or [[traction]]")
+        said.append("the scene has no excitation: give amplitudes as [[displaced]], [[traction]] or [[porosity.inlet]]")
     x = scene.mesh.points if about is None else about
     for name, physics in named_physics(scene):
         if isinstance(physics, Ligament) and physics.is_straight_without_tension(scene.mesh, x):

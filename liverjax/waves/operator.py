@@ -152,7 +152,8 @@ Motion = tuple[jax.Array, jax.Array | None]
 
 def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion) -> Motion:
     """Return the complex nodal forces (V, 3) [N] due to a motion, and the left-hand side (P,) [m^3] of the volume
-    balance for P unknown pressures (see `liverjax.waves.pressures`). This is None if no pressures are unknown.
+    balance for P unknown pressures (see `liverjax.waves.pressures`). The left-hand side is None if no
+    pressures are unknown.
 
     Args:
         A: `Operator`.

@@ -273,7 +273,7 @@ def _has_to_be_small(
             return own
     warnings.warn(
         f"{K.shape[0]} equations of harmonic motion need at least {needed / 1e9:.3g} GB of memory, but only "
-        f"{free / 1e9:.3g} GB are free: use a coarser mesh, order = 1, or a machine with more memory",
+        f"{free / 1e9:.3g} GB are free: use a coarser mesh, a lower order, or a machine with more memory",
         stacklevel=2,
     )
     return None

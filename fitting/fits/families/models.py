@@ -118,6 +118,7 @@ def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = 
         noise = fit.uncertainty.noise * float(np.median(sweep.deviations[0] / sweep.storage))
         told = limits.still_relaxing(moduli(u, lowest)[0], noise, float(np.max(found.times)))
         fit = fit._replace(warnings=(*fit.warnings, *told))
+    fit = fit._replace(warnings=(*fit.warnings, *relaxation_spectrum.gap_sentences(found)))
     return _finished(fit, made)
 
 

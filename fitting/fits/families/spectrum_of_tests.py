@@ -180,7 +180,7 @@ def _as_a_fit(
         },
     }
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(u)))
-    sentences += limits.limit_sentences("spectrum", spread, model, own)
+    sentences += limits.limit_sentences("spectrum", spread, model, own) + relaxation_spectrum.gap_sentences(told)
     return SpectrumFit(kind, model, solution, spread, own, details, tuple(sentences))
 
 

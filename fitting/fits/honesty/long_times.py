@@ -47,7 +47,7 @@ class Interval(NamedTuple):
 
     low: float  # [Pa]
     high: float
-    longest: float  # [s] the interval holds for materials whose relaxation times are at most this long
+    longest: float  # [s] the interval is valid for materials whose relaxation times are at most this long
     modes: int  # number of modes of the model
 
 
@@ -215,12 +215,12 @@ def _told_interval(ends: tuple[float, float, float], error: float, found: Interv
         if high < LARGE * whole:
             return []
         return [
-            f"a solid fits the data as well as the fluid. Its equilibrium modulus may be 0 to {high:.3g} Pa (95 %), "
-            f"{where}: only a longer test can decide"
+            f"a solid fits the data as well as the fluid. The equilibrium modulus of the solid may be 0 to "
+            f"{high:.3g} Pa (95 %), {where}: only a longer test can decide"
         ]
     if max(rest - low, high - rest) <= max(WIDER * NORMAL * error, LARGE * rest):
         return []
     return [
         f"{SHORT}: the equilibrium modulus may be {low:.3g} to {high:.3g} Pa (95 %), {where}. The value {rest:.4g} ± "
-        f"{error:.2g} Pa holds only for the chosen modes"
+        f"{error:.2g} Pa is valid only for the chosen modes"
     ]

@@ -1,4 +1,4 @@
-"""Errors of the fitted moduli. They contain the error due to the choice of the model.
+"""Errors of the fitted moduli. These errors contain the error due to the choice of the model.
 
 Models that explain the data about equally well differ in their moduli. Each model gets its Akaike weight, and the
 weighted differences between the models become part of the error. Sources: Buckland, Burnham and Augustin 1997,

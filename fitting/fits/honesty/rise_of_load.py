@@ -74,7 +74,8 @@ def _assumed_between_rows(test: TimeTest) -> str:
             f"no row shows how the load rose before {end:.4g} s, so a linear rise is assumed. If the load was a step "
             "at 0 s,"
         )
-    more = f", and in {len(test.jumps) - 1} more jumps" if len(test.jumps) > 1 else ""
+    others = len(test.jumps) - 1
+    more = f" (the same is true for {others} more jump{'s' if others > 1 else ''})" if others else ""
     steps = "the changes were steps at the later rows" if more else f"the change was a step at {end:.4g} s"
     return (
         f"no row shows how the load changed between {begin:.4g} and {end:.4g} s{more}, so linear changes are assumed. "

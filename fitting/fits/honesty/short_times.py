@@ -53,9 +53,9 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
     if missing <= SHOWN * error:
         return fit
     told = (
-        f"G0 may be {missing:.2g} Pa larger, if the modulus fell before {first:.3g} s in the same way as after it. The "
-        "chosen modes do not contain this part (the total error contains it): begin the record earlier, or compare "
-        "with --model auto"
+        f"G0 may be {missing:.2g} Pa larger, if the modulus fell before {first:.3g} s in the same way as after this "
+        "time. The chosen modes do not contain this part (the total error contains this part): begin the record "
+        "earlier, or compare with --model auto"
     )
     return fit._replace(warnings=(*fit.warnings, told), details=fit.details | {MISSING: float(missing)})
 

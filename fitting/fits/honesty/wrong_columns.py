@@ -29,8 +29,8 @@ class _Cause(NamedTuple):
     values in the stress column from (nominal stress, true driven quantity, number).
 
     `number` is the fitted offset, the same for all curves. The optimiser uses it in dimensionless form: divided by the
-    stress scale of the first curve with a structured misfit if it is a stress, otherwise by the range of the driven
-    column of this curve.
+    stress scale of the first curve with a structured misfit if the offset is a stress, otherwise by the range of
+    the driven column of this curve.
     """
 
     words: str

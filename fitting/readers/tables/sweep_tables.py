@@ -76,7 +76,7 @@ def choose_table(
     if len(tables) == 1:
         return k, []
     why = f"{'the first' if counts.count(counts[k]) > 1 else 'the one'} with most {what}, {counts[k]}"
-    listed = f"the file holds {len(tables)} tables: {', '.join(names)}"
+    listed = f"the file contains {len(tables)} tables: {', '.join(names)}"
     return k, [f"{listed}; table {names[k]} is used, {why}; choose another table with --table NUMBER or NAME"]
 
 
@@ -201,9 +201,7 @@ def _perhaps_thousands(rows: list[list[str]], columns: list[Column], sign: str |
     shown = next((cell for cell in cells if re.fullmatch(r"[1-9]\d{0,2},\d{3}", cell)), None)
     if sign is not None or shown is None:
         return []
-    return [
-        f"{shown} is read as {shown.replace(',', '.')}: if the comma separates thousands, write the numbers without it"
-    ]
+    return [f"{shown} is read as {shown.replace(',', '.')}: if the comma separates thousands, write no comma there"]
 
 
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:

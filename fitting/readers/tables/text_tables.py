@@ -98,7 +98,7 @@ def _delimiters(line: str) -> list[str]:
 
 def delimiter_of_header(line: str, complete: Callable[[list[str]], bool]) -> str:
     """Return the most frequent delimiter for which the cells name all needed quantities (`complete` is true). If there
-    is none, return the most frequent delimiter.
+    is no such delimiter, return the most frequent one.
 
     In "Frequency, Hz;Modulus, Pa" the commas are more frequent, but only the semicolon gives two complete headings.
     """

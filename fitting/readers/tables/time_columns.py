@@ -237,7 +237,7 @@ def _told_of_tables(below: list[str]) -> list[str]:
     more = sum(map(_begins_a_table, below))
     if not more:
         return []
-    return [f"the file holds {more + 1} tables of a test, and only the first is read: give one file for each table"]
+    return [f"the file contains {more + 1} tables of a test, and only the first is read: give one file for each table"]
 
 
 def _begins_a_table(line: str) -> bool:

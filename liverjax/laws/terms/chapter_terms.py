@@ -71,7 +71,8 @@ class _At(NamedTuple):
     B: Matrix  # I1 Id - C
     cof: Matrix
     J: jax.Array
-    groups: list  # for each group of products: terms, and the derivatives phi' and phi'' of its function
+    # for each group of products with the energy phi(sum of products): its terms, phi' and phi'' (None if phi'' is 0)
+    groups: list
 
 
 def _state_at(law: Energies, F: Matrix) -> _At:

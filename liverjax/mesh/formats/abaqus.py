@@ -2,8 +2,8 @@
 
 A file consists of cards. A card is a keyword line such as ``*ELSET, ELSET=hard``, with data lines. Several cards of the
 same set add members to the set, and a data line may name another set. The reader of meshio 5.3 keeps only the last card
-of a set and ignores the names of sets in data lines. It can also give the set of an ``*ELEMENT`` card to the elements
-of another card.
+of a set and ignores the names of sets in data lines. That reader can also give the set of an ``*ELEMENT`` card to the
+elements of another card.
 """
 
 import re
@@ -275,7 +275,8 @@ def _nodes_of(element_sets: dict[str, set[int]], blocks: dict[int, _Block], labe
 
 
 def _range_of(card: _Card, cells: list[str]) -> set[int]:
-    """Return the numbers of a data line with the first and last number and the step (default 1)."""
+    """Return all numbers of the range that a data line describes by its first number, last number and step (default
+    1)."""
     if not 2 <= len(cells) <= 3 or not all(cell.isdigit() for cell in cells) or cells[2:] == ["0"]:
         raise _Wrong(f"*{card.keyword}, GENERATE has the line {','.join(cells)}; give first, last, step")
     first, last, step = (int(cell) for cell in (*cells, "1")[:3])

@@ -1,4 +1,5 @@
-"""A membrane on a part of the surface, for example the capsule. It follows the surface and has no bending stiffness.
+"""A membrane on a part of the surface, for example the capsule. A membrane follows the surface without bending
+stiffness.
 
 The law of the membrane acts in its plane. The stress through the thickness is 0 (plane stress). If the law has an
 isochoric part, the membrane is incompressible: the stretch through the thickness is 1 divided by the area ratio. For
@@ -27,7 +28,7 @@ from liverjax.physics.base import Physics, Step
 
 @struct
 class Membrane(Physics):
-    """A thin layer on m triangles of the surface. It has no tension in the reference shape."""
+    """A thin layer on m triangles of the surface. The layer has no tension in the reference shape."""
 
     triangles: Indices = param("1", "node numbers (m, 3)", lower=0)
     thickness: Number = param("m", "thickness of the layer: one number, or one per triangle (m,)", above=0.0)

@@ -129,7 +129,7 @@ class Rubbing(Touching):
         return trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
 
     def _guessed(self, mesh: TetMesh, at: jax.Array, s: Number) -> jax.Array:
-        """Return whether points just touch the obstacle (1, 1, Q, m).
+        """Return a mask (1, 1, Q, m) of the points with friction that just touch the obstacle and are not inside it.
 
         In the tangent, such points count as pressed and sticking.
         """
@@ -152,7 +152,7 @@ class Rubbing(Touching):
         """Return the energy [J] of the contact, plus an energy of the slip.
 
         Up to the maximum slip at `start`, the energy of the slip is half of stiffness times slip squared. Above the
-        maximum slip it grows linearly.
+        maximum slip this energy grows linearly.
         """
         one = jnp.ones((), x.dtype)
         n, most = self._law(self.points(start), one)

@@ -269,8 +269,8 @@ def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
 def depths(d: Distance, near: jax.Array) -> jax.Array:
     """Return the signed distances (Q, m) [m] of points inside the obstacle (negative), and 0 for other points.
 
-    Points nearer than `near` (m,) [m] count as pressed, so they have a stiffness. `minimum` is not used: at a point
-    that just touches, it would give half of the derivative.
+    Points nearer than `near` (m,) [m] count as pressed, so they have a stiffness. `jnp.minimum(d.value, 0)` is not
+    used, because JAX gives it only half of the derivative at a point that just touches.
     """
     pressed = d.value - jax.lax.stop_gradient(jnp.maximum(d.value, 0.0))
     return jnp.where(d.value <= near[None], pressed, 0.0)

@@ -1,7 +1,7 @@
 """A rigid obstacle that a given force presses into the body, for example an indenter with a weight on it.
 
-The obstacle moves only along the line of its force. Its displacement t along this line follows from the balance of
-forces,
+The obstacle moves only along the line of its force. The displacement t of the obstacle along this line follows
+from the balance of forces,
 
     dE/dt(x, t) = F,
 
@@ -80,7 +80,7 @@ class PressedObstacle(Obstacle):
             if self._meets(mesh, near_points):
                 raise InputError(
                     f"{name} passes between the points at which contact is tested, because the triangles are too large "
-                    "for its radius: refine the mesh there"
+                    "for the radius of the obstacle: refine the mesh there"
                 )
             force = np.asarray(self.force, float).tolist()
             raise InputError(f"{name} force = {force} presses the obstacle past the body: change force or position")

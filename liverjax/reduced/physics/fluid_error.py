@@ -8,7 +8,7 @@ reference shape,
 with the matrix K of stiffness and inertia of the solid, and the volumetric stiffness K_p of the drained body. `load` is
 the sum of the negative out-of-balance forces and the forces from earlier steps. B e is the change of volume at the
 vertices. A and S are the matrices of `liverjax.reduced.physics.fluid`, here on the full mesh. The index `before` means
-the end of the previous step. The lagged scheme uses the change of volume of the previous step.
+the end of the previous step. In the lagged scheme, B (e - e_before) is replaced by its value in the previous step.
 """
 
 from collections.abc import Callable

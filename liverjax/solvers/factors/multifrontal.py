@@ -54,7 +54,7 @@ class Eliminated(NamedTuple):
     after: np.ndarray  # (m,) later unknowns
     inverse: np.ndarray  # (n, n) A^-1
     X: np.ndarray  # (n, m) A^-1 B; as 16-bit integers (n, m), or (n, 2 m) if complex
-    sizes: np.ndarray | None = None  # (n,) factor that multiplies the integers of each row; None: X has no integers
+    sizes: np.ndarray | None = None  # (n,) scale factor of each row of X; None: X is not stored as integers
 
     def times(self, y: np.ndarray) -> np.ndarray:
         """Product X y (n,)."""
@@ -285,8 +285,8 @@ def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) ->
 def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) -> None:
     """Add the lower triangle `left` of a child group to the columns `own` of the group and to the matrix `rest`.
 
-    `rest` is the matrix of the group's border. `at`: ascending indices of the rows of `left` in the group and its
-    border. Entries with consecutive indices are added as one block.
+    `rest` is the matrix of the group's border. `at`: for each row of `left`, its index among the unknowns of the group
+    and its border (ascending). Entries with consecutive indices are added as one block.
     """
     n = own.shape[1]
     ends = np.unique([0, *(np.flatnonzero(np.diff(at) != 1) + 1), np.searchsorted(at, n), len(at)])
