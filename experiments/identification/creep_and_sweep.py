@@ -74,6 +74,7 @@ def main(quick: bool) -> None:
                 "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
                 "off_in_standard_errors": ((found.values - true) / found.standard_errors).tolist(),
                 "mesh_bias": None if found.mesh_bias is None else found.mesh_bias.tolist(),
+                "time_step_bias": None if found.time_step_bias is None else found.time_step_bias.tolist(),
                 "chi2_per_reading": found.chi2 / found.components,
                 "readings": found.components,
                 "iterations": found.iterations,
