@@ -115,7 +115,12 @@ def test_hanging_nodes_are_told(cells):
     points, number = np.unique(np.round(both, 6), axis=0, return_inverse=True)
     cells_of = number[np.concatenate([tets, np.asarray(beside.tetrahedra) + len(x)])]
     hanging = (cells[1] + 1) * (cells[2] + 1) - 4
-    for mesh in (lj.tet_mesh(points, cells_of), lj.quadratic(lj.tet_mesh(points, cells_of))):
+    # Six digits of a turned mesh
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0] * [[1, 1, -1]]
+    turn *= np.sign(np.linalg.det(turn))
+    rounded = np.array([[float(f"{v:.5e}") for v in row] for row in points @ turn.T])
+    meshes = [lj.tet_mesh(x, cells_of) for x in (points, rounded)]
+    for mesh in (*meshes, lj.quadratic(meshes[0])):
         said = [sentence for sentence in cautions_of_mesh(mesh) if "hanging" in sentence]
         assert [sentence.split(" nodes")[0] for sentence in said] == [str(hanging)] * (hanging > 0)
 
@@ -178,6 +183,7 @@ def test_they_stand_in_the_report_and_in_the_results(tmp_path, capsys):
         ([0.0, 0.001], [0.0, 1.0], "is not linear within steps"),
         ([0.0, 0.1], [0.0, 1.0], None),
         ([0.5, 0.9], [0.0, 1.0], "begins at 0.5 s, but the run ends at 0.3 s"),
+        ([0.5], [1.0], None),
     ],
 )
 def test_a_history_that_changes_within_a_step_is_told(times, history, told):

@@ -13,7 +13,7 @@ import pytest
 import scipy.sparse
 
 import liverjax as lj
-from liverjax.solvers.factors import dissection, multifrontal
+from liverjax.solvers.factors import dissection, memory, multifrontal
 from liverjax.solvers.factors.memory import free_memory
 from liverjax.waves import harmonic, sparse
 
@@ -208,6 +208,14 @@ def test_memory_of_an_elimination_is_foretold(monkeypatch):
 
 def test_free_memory_is_below_that_of_the_machine():
     assert 1e8 < free_memory() <= 1.01 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_the_cache_of_files_of_a_container_is_free(monkeypatch, tmp_path):
+    """A process with 10 GB of files in the cache had no memory left."""
+    monkeypatch.setattr(memory, "_CONTAINER", tmp_path)
+    for name, text in (("max", "2e8"), ("current", "1.9e8"), ("stat", "anon 100\ninactive_file 150000000\n")):
+        (tmp_path / f"memory.{name}").write_text(text)
+    assert free_memory() == pytest.approx(1.6e8)
 
 
 @pytest.mark.slow

@@ -94,6 +94,16 @@ BAD = {
         ["--ramp", "1"],
         "--ramp 1 cannot be right, since the rows begin under load at 0 s, and the rise cannot end later",
     ),
+    "no duration": (
+        "time_s,strain,stress_Pa\n0.2,1,9\n1,1,7\n2,1,6\n3,1,5\n",
+        ["--ramp", "-1"],
+        "--ramp -1 is not a duration: give 0 or more seconds",
+    ),
+    "ramp while the load rises": (
+        "time_s,strain,stress_Pa\n0.1,0.1,9\n0.5,0.5,30\n1,1,60\n2,1,50\n3,1,45\n4,1,44\n",
+        ["--ramp", "0.05"],
+        "since the rows show how the load rose; remove this setting",
+    ),
     "ramp in rows": (
         "time_s,strain,stress_Pa\n0,0,0\n1,0.5,7\n2,1,6\n3,1,5\n",
         ["--ramp", "1"],

@@ -94,6 +94,20 @@ def test_a_map_states_what_its_time_step_does_to_it():
     np.testing.assert_allclose(noisy.data[0].sd, 2e-5 * np.hypot(1.0, error), rtol=1e-12)
 
 
+@pytest.mark.slow
+def test_a_run_that_fails_is_no_noise():
+    """Its mesh error counted as noise, and the data of this scene lost their weight."""
+    (scene,), data = with_fine_data(2e-5)
+    pulled = replace(scene, traction=tuple(replace(t, value=-1e9 * t.value) for t in scene.traction))
+    with pytest.warns(UserWarning, match="the effect of the ") as told:
+        same, sizes = scene_numbers.with_discretisation_as_noise(scene_numbers.Problem((pulled,), data))
+    assert [str(w.message).split(" on ")[0] for w in told] == [
+        "the effect of the mesh error",
+        "the effect of the time step",
+    ]
+    assert sizes == [{}] and np.array_equal(same.data[0].sd, data[0].sd)
+
+
 @pytest.mark.filterwarnings("ignore:the error of the mesh changes")
 def test_a_fit_states_what_its_time_step_does_to_the_numbers():
     """The data come from steps of 1/32. Ratio and relaxation time are wrong by more than their standard errors, as

@@ -117,7 +117,7 @@ def test_a_component_that_is_zero_may_not_have_been_measured():
     field = plane_waves((9, 9, 9), noise=4e-7)
     said = components.order_sentence(field._replace(displacement=np.array([1.0, 1.0, 0.0]) * field.displacement))
     assert said is not None and said.endswith(
-        "If component z was not measured, this is the cause: write NaN instead of zeros"
+        "The cause may be a component that was not measured (z): write NaN instead of zeros"
     )
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -119,11 +120,13 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     how = field.MapOptions(max_iterations=options.iterations, file=file, resume=options.resume, progress=told)
     problem, beside = scene_numbers.with_discretisation_as_noise(problem)
     _tell_sizes(problem, beside)
-    with bar:
+    with bar, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="the effect of the (mesh error|time step)")  # a second time
         found = field.estimate(problem, options.name, length, how)
     good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR
     print(field_report.table_of_field(mesh, found))
-    sizes = {f"{kind}_error_over_noise": [each[kind] for each in beside] for kind in beside[0]}
+    kinds = dict.fromkeys(("mesh", *beside[0]))
+    sizes = {f"{kind}_error_over_noise": [each.get(kind, np.nan) for each in beside] for kind in kinds}
     content = _files(options) | {"map": field_report.of_field(mesh, found) | sizes}
     _warn(field_report.noise_sentence(found))
     _warn(field.distance_sentence(found))

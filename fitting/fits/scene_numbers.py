@@ -200,7 +200,9 @@ def discretisation_errors(problem: Problem, values: Content) -> Discretisation:
     timed = any(scene.solve.dt is not None for scene in problem.scenes)
     if timed and not np.all(np.isfinite(of_steps)):
         warnings.warn(
-            "the effect of the time step on the fit is unknown: the run with half the step failed", stacklevel=3
+            "the effect of the time step on the fit is unknown: a run with this step, or with half of it, did not "
+            "converge",
+            stacklevel=3,
         )
     known = Discretisation(of_mesh, of_steps if timed else None)
     return Discretisation(*(e if e is not None and np.all(np.isfinite(e)) else None for e in known))
@@ -214,10 +216,9 @@ def _errors_in(scene: Scene, data: Displacements) -> tuple[np.ndarray, np.ndarra
         run = lj.simulate(scene, mesh_error=True)
         assert run.mesh_error is not None
         exact = replace(run, positions=run.positions + run.mesh_error.positions)
-        of_mesh, cause = (
-            np.asarray(readings(exact)) - np.asarray(readings(run)),
-            "the estimate of the mesh error failed",
-        )
+        good = np.all(run.status == status.CONVERGED) and np.all(run.mesh_error.found)
+        of_mesh = np.where(good, readings(exact) - readings(run), np.nan)
+        cause = "a step of the run failed, or the mesh is too coarse for an estimate"
     except InputError as e:
         run, of_mesh, cause = None, np.full(np.size(data.measured), np.nan), str(e)
     if not np.all(np.isfinite(of_mesh)):

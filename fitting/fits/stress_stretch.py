@@ -143,9 +143,7 @@ def assessed(
     limits = _run_away(candidate, values, every, scale)
     # A parameter at its limit gets no standard error. The errors of the others hold for the law at this limit.
     known = np.array([name not in limits for name in candidate.names])
-    products = _products_of_limits(J[:n], known)
-    own_slope = np.pad(slope[np.ix_(known, known)], ((0, 0), (0, products.shape[1])))
-    own_J = np.column_stack([J[:n, known], products])
+    own_J, own_slope = _with_products_of_limits(J[:n], slope, known)
     half, s = spread(own_J, noise, own_slope)
     errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
     residuals = own_J, misfit, noise
@@ -342,20 +340,24 @@ def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scal
 _DETERMINED = 1e-3
 
 
-def _products_of_limits(J: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the derivatives (n, q) of the misfit in the q directions of the parameters at their limits that the data
-    determine. For example, one parameter goes to infinity and another to 0, and their product is a modulus. Without
-    this product, the errors of the other parameters would hold only for a known modulus.
+def _with_products_of_limits(J: np.ndarray, slope: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives (n, k + q) of the misfit for the k known parameters and for q directions of the parameters
+    at their limits that the data determine. Also return the derivatives (k, k + q) of the known parameters.
+
+    For example, one parameter goes to infinity and another to 0, and their product is a modulus. Without this product,
+    the errors of the other parameters would hold only for a known modulus.
 
     Args:
-        J: derivatives (n, p) of the misfit with respect to the unknowns.
+        J: derivatives (n, p) of the misfit with respect to the p unknowns.
+        slope: derivatives (p, p) of the parameters with respect to the unknowns.
         known: (p,) False for parameters at their limits.
     """
+    own, own_slope = J[:, known], slope[np.ix_(known, known)]
     if np.count_nonzero(~known) < 2 or not np.all(np.isfinite(J)):
-        return np.zeros((len(J), 0))
+        return own, own_slope
     U, s, _ = np.linalg.svd(J[:, ~known], full_matrices=False)
-    shown = s[:-1] > _DETERMINED * np.linalg.norm(J, axis=0).max()
-    return (U * s)[:, :-1][:, shown]
+    shown = np.flatnonzero(s[:-1] > _DETERMINED * np.linalg.norm(J, axis=0).max())
+    return np.column_stack([own, (U * s)[:, shown]]), np.pad(own_slope, ((0, 0), (0, len(shown))))
 
 
 #: The program warns if the stress of the undeformed sample exceeds this fraction of the root mean square of the curve's

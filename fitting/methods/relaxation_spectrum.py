@@ -131,9 +131,9 @@ def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) ->
 def gap_sentences(found: GridSpectrum) -> list[str]:
     """Return a warning if strengths within the spectrum are zero. Such gaps occur if the material has a few separate
     modes. The errors are then too small, because they assume that these strengths are exactly zero."""
-    between = int(np.ptp(found.places)) + 1
+    between = int(np.ptp(found.places)) + 1 if len(found.places) else 0
     gaps = between - len(found.places)
-    if gaps < GAPS * between:
+    if gaps <= GAPS * between:
         return []
     return [
         f"the spectrum has gaps: {gaps} of its {between} relaxation times have the strength 0, as in a material with a "

@@ -74,7 +74,7 @@ def read_indentation(path: str | Path) -> IndentationCurve:
     if last < _FEWEST or np.ptp(depth[:last]) == 0:
         falls = len(depth) >= _FEWEST and np.argmax(depth) < len(depth) / 10 and depth[-1] < depth[0]
         pulls = len(force) >= _FEWEST and np.mean(force) < 0 and np.argmin(force) > len(force) / 2
-        reversed_rows = falls and np.corrcoef(depth, force)[0, 1] > 0 and np.mean(force) > 0
+        reversed_rows = falls and np.cov(depth, force)[0, 1] > 0 and np.mean(force) > 0
         remedy = "the depth falls during loading, so change its sign" if falls else "give more loading points"
         if reversed_rows:
             remedy = "depth and force fall from row to row, so reverse the order of the rows, or give the loading"

@@ -206,10 +206,13 @@ def from_rest(
     """
     size, rows = np.abs(driven), _rows_of_jumps(driven)
     loaded = size[0] > AT_REST * np.max(size)
-    early = ramp is not None and loaded and 0 <= ramp <= time[0]  # the rise was complete before the first row
+    still = loaded and bool(np.all(np.abs(driven[1:6] - driven[0]) <= _JUMP * np.max(size)))
+    early = ramp is not None and loaded and (ramp == 0 or (still and 0 < ramp <= time[0]))  # complete at the first row
+    if ramp is not None and not ramp >= 0:
+        raise InputError(f"{names[0]}: {names[1]} {ramp:g} is not a duration: give 0 or more seconds")
     if ramp is not None and not early and not (len(rows) and 0 <= ramp <= time[rows[0]] - time[rows[0] - 1]):
         shown = "the rows show how the load rose"
-        if loaded:
+        if still:
             shown = f"the rows begin under load at {time[0]:.4g} s, and the rise cannot end later"
         elif len(rows):
             shown = f"the load rose between {time[rows[0] - 1]:.4g} and {time[rows[0]]:.4g} s"

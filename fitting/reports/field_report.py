@@ -36,8 +36,8 @@ def misfit_sentence(found: Estimate, with_mesh: bool = False) -> str | None:
     """Return a warning if the residuals are much larger or much smaller than the noise of the displacements, or else
     None.
 
-    If the noise contains an estimate of the mesh error (`with_mesh`), a small misfit does not mean that the noise is
-    wrong.
+    If the noise contains an estimated error of the mesh or of the time step (`with_mesh`), a small misfit does not mean
+    that the noise is wrong.
     """
     ratio = found.chi2 / found.components
     if ratio < TOO_NEAR and found.components >= FEW and not with_mesh:

@@ -58,8 +58,13 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     begin = time.perf_counter()
     found = jax.block_until_ready(harmonic(scene, about=x))
     seconds = time.perf_counter() - begin
-    error = harmonic_errors(scene, found, about=x) if mesh_error else None
     said = cautions_of_waves(scene, x)
+    error = None
+    if mesh_error:
+        try:
+            error = harmonic_errors(scene, found, about=x)
+        except InputError as e:  # the waves are known
+            said.append(str(e))
     if x is not None and reactions is not None:
         said += _of_rest(scene, x, reactions, f"--about {about}")
     return Waves(found, error, seconds, said)

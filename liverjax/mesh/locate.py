@@ -13,9 +13,11 @@ from liverjax.mesh.tetrahedra import TetMesh
 _INSIDE = 1e-9
 #: Two vertices coincide if their distance is below this fraction of the body's size.
 SAME_PLACE = 1e-9
-#: A vertex lies on a face if its distance is below this fraction of the size of the face. The fraction is not smaller,
-#: because coordinates in mesh files may have only six digits.
-_ON_FACE = 1e-5
+#: A vertex lies on a face if its distance is below _ON_FACE times the size of the face. For coordinates with six digits
+#: (relative roundoff _DIGITS), the allowed distance is up to a hundred times larger.
+_ON_FACE, _DIGITS = 1e-5, 5e-6
+#: Only needle-like triangles have more vertices nearby.
+_MOST_NEAR = 200
 #: A piece of a line is ignored if it is shorter than this fraction of the line.
 _SHORTEST = 1e-9
 
@@ -38,25 +40,36 @@ def doubled_vertices(mesh: TetMesh) -> int:
 
 def hanging_vertices(mesh: TetMesh) -> int:
     """Return the number of vertices that lie inside a face or an edge of the boundary (hanging nodes). At such
-    vertices, the mesh is not connected, because each of them is a corner only of the elements on one side."""
+    vertices, the mesh is not connected, because each of them is a corner only of the elements on one side. Needle-like
+    triangles with more than `_MOST_NEAR` vertices nearby are not searched."""
     from scipy.spatial import cKDTree  # slow to import
 
     points, triangles = np.asarray(mesh.points), np.asarray(boundary_triangles(mesh))
     corners, vertices = points[triangles], np.unique(triangles)
     middles = corners.mean(axis=1)
     radii = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
-    near = cKDTree(points[vertices]).query_ball_point(middles, radii)
-    pair = np.repeat(np.arange(len(triangles)), [len(one) for one in near])
-    vertex = vertices[np.concatenate(near).astype(int)]
-    others = np.all(vertex[:, None] != triangles[pair], axis=1)
-    pair, vertex = pair[others], vertex[others]
-    a, b, c = np.moveaxis(corners[pair], 1, 0)
+    tree, found = cKDTree(points[vertices]), []
+    few = np.flatnonzero(tree.query_ball_point(middles, radii, return_length=True) <= _MOST_NEAR)
+    for chunk in np.array_split(few, len(few) // 10_000 + 1):
+        near = tree.query_ball_point(middles[chunk], radii[chunk])
+        pair = np.repeat(chunk, [len(one) for one in near])
+        vertex = vertices[np.concatenate([*near, []]).astype(int)]
+        away = np.clip(_DIGITS * np.abs(points).max() / radii[pair], _ON_FACE, 100 * _ON_FACE)
+        found.append(vertex[_on_triangle(points[vertex], corners[pair], away)])
+    return len(np.unique(np.concatenate(found)))
+
+
+def _on_triangle(p: np.ndarray, corners: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """Return for n points p (n, 3) whether each lies on a triangle with the corners (n, 3, 3), but not at a corner.
+    `away` (n,): allowed distance, divided by the size of the triangle."""
+    a, b, c = np.moveaxis(corners, 1, 0)
     normal = np.cross(b - a, c - a)
-    square, p = np.sum(normal**2, axis=1), points[vertex]
-    height = np.abs(np.sum(normal * (p - a), axis=1)) / np.sqrt(square)
-    parts = [np.sum(normal * np.cross(y - x, p - x), axis=1) / square for x, y in ((b, c), (c, a), (a, b))]
-    inside = (np.min(parts, axis=0) >= -_ON_FACE) & (np.max(parts, axis=0) < 1 - _ON_FACE)
-    return len(np.unique(vertex[inside & (height <= _ON_FACE * radii[pair])]))
+    square = np.sum(normal**2, axis=1)
+    size = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=2).max(axis=1)
+    flat = np.abs(np.sum(normal * (p - a), axis=1)) <= away * size * np.sqrt(square)
+    parts = [np.sum(normal * np.cross(y - x, p - x), axis=1) for x, y in ((b, c), (c, a), (a, b))]
+    inside = (np.min(parts, axis=0) >= -away * square) & (np.max(parts, axis=0) < (1 - away) * square)
+    return flat & inside
 
 
 def barycentric(mesh: TetMesh, points: np.ndarray) -> np.ndarray:

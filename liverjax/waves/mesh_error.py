@@ -78,7 +78,10 @@ def harmonic_errors(
     of_all_nodes = partial(_padded, rich.mesh, within)
     motion = None if motion is None else of_all_nodes(jnp.asarray(motion, complex))
     about = None if about is None else of_all_nodes(jnp.asarray(about))
-    more = harmonic(rich, found.frequencies_Hz, factors, about, motion)
+    try:
+        more = harmonic(rich, found.frequencies_Hz, factors, about, motion)
+    except InputError as e:
+        raise InputError(f"the mesh error cannot be estimated with richer elements: {e}") from None
     force = _on_nodes(scene.mesh, rich.mesh, within, more.reactions)
     factor = 1.0 if within is None else REFINED
     pressure = None

@@ -47,7 +47,7 @@ def order_sentence(field: WaveField) -> str | None:
     whole = -1 if sum(signs) < 0 else 1  # a common sign of all components does not matter
     names = ", ".join(("-" if whole * s < 0 else "") + "xyz"[c] for c, s in zip(order, signs, strict=True))
     empty = [axis for c, axis in enumerate("xyz") if not np.any(np.nan_to_num(field.displacement[..., c]))]
-    instead = f". If component {' and '.join(empty)} was not measured, this is the cause: write NaN instead of zeros"
+    instead = f". The cause may be a component that was not measured ({', '.join(empty)}): write NaN instead of zeros"
     return (
         f"the components of the displacement may have a wrong order or sign: with order and signs ({names}), the "
         "displacements change the volume much less, as expected for shear waves. Give the components in the order and "

@@ -20,7 +20,7 @@ def cautions_of_histories(scene: Scene, ends: np.ndarray) -> list[str]:
     steps = np.concatenate([[0.0], ends])
     for name, part in histories(scene).items():
         times, values = (np.asarray(getattr(part, column)) for column in ("times", "history"))
-        if times[0] >= steps[-1]:
+        if times[0] >= steps[-1] and np.ptp(values, axis=0).any():
             said.append(
                 f"the history of {name} begins at {times[0]:.4g} s, but the run ends at {steps[-1]:.4g} s, so the run "
                 "uses only the first value: check that the times are in seconds, or use more steps"

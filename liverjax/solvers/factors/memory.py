@@ -3,9 +3,8 @@
 import os
 from pathlib import Path
 
-#: Three files of Linux. They contain the free memory [kB], the memory limit of the container [bytes], and the memory
-#: that the container uses [bytes].
-_FREE, _LIMIT, _USED = Path("/proc/meminfo"), Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
+#: File of Linux with the free memory [kB], and folder of the memory limits [bytes] of the container.
+_FREE, _CONTAINER = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 
 def free_memory() -> float:
@@ -19,6 +18,9 @@ def free_memory() -> float:
         except (AttributeError, OSError, ValueError):  # Windows has no sysconf
             return float("inf")
     try:
-        return min(free, float(_LIMIT.read_text()) - float(_USED.read_text()))
+        limit, used = (float((_CONTAINER / f"memory.{name}").read_text()) for name in ("max", "current"))
+        lines = dict(line.split() for line in (_CONTAINER / "memory.stat").read_text().splitlines())
+        # The system frees this part of the cache of files if a process needs memory.
+        return min(free, limit - used + float(lines.get("inactive_file", 0)))
     except (OSError, ValueError):  # the process is in no container, or the container has no limit ("max")
         return free
