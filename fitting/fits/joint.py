@@ -40,10 +40,9 @@ class Test(NamedTuple):
     predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
     measured: np.ndarray  # (n,)
     sd: np.ndarray  # (n,) standard deviation of the noise
-    #: Change (n,) of the predicted values on an infinitely fine mesh; None: the test has no mesh.
-    mesh_error: Callable[[Law, Prony], jax.Array] | None = None
-    #: Change (n,) of the predicted values with infinitely small time steps; None: the test has no time steps.
-    time_step_error: Callable[[Law, Prony], np.ndarray] | None = None
+    #: Changes (n,) of the predicted values on an infinitely fine mesh, and with infinitely small time steps. None: the
+    #: test has no mesh and no time steps, or their errors are unknown.
+    errors: Callable[[Law, Prony], tuple[jax.Array, np.ndarray]] | None = None
 
 
 def sweep(data: Sweep) -> Test:
@@ -104,7 +103,7 @@ def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
         readings, codes = glued.read(rig, law, viscosity)
         return readings, jnp.max(codes)
 
-    return Test(name, predict, measured, sd, partial(glued.mesh_error, rig), partial(glued.time_step_error, rig))
+    return Test(name, predict, measured, sd, partial(glued.reading_errors, rig))
 
 
 def fit(
@@ -160,8 +159,8 @@ def fit(
     names = parameter_names((len(found.u) - 1) // 2)
     converged = bool(found.converged) and all(c == status.CONVERGED for c in worst)
     estimate = estimated(names, parameter_vector, found, len(found.residuals))
-    if any(test.mesh_error for test in tests):
-        missing = (_missing(tests, material(found.u)[:2], name) for name in ("mesh_error", "time_step_error"))
+    if any(test.errors for test in tests):
+        missing = _missing(tests, material(found.u)[:2])
         of_mesh, of_steps = (mesh_bias(found, parameter_vector, rows) for rows in missing)
         estimate = estimate._replace(mesh_bias=of_mesh, time_step_bias=of_steps)
         for sentence in bias_sentences(estimate):
@@ -191,11 +190,13 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
         raise InputError(f"start: relaxation_times = {times.tolist()} must be above 0 s; correct the times")
 
 
-def _missing(tests: Sequence[Test], material: tuple[Law, Prony], name: str) -> np.ndarray:
-    """Return the errors (n,) of all n readings, divided by the standard deviations of their noise. `name`: function of
-    the tests that computes the errors due to their meshes or their time steps."""
-    rows = []
+def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors (n,) of all n readings due to the meshes, and due to the time steps, divided by the standard
+    deviations of their noise."""
+    both = []
     for test in tests:
-        error = getattr(test, name)
-        rows.append(np.zeros(len(test.sd)) if error is None else np.asarray(error(*material)) / test.sd)
-    return np.concatenate(rows)
+        none = np.zeros(len(test.measured))
+        errors = (none, none) if test.errors is None else test.errors(*material)
+        both.append([np.asarray(error) / test.sd for error in errors])
+    of_mesh, of_steps = (np.concatenate(rows) for rows in zip(*both, strict=True))
+    return of_mesh, of_steps

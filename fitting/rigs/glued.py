@@ -91,19 +91,24 @@ def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
     The estimate needs one run, and for each step one linear solve with elements of higher order
     (`liverjax.simulation.mesh_error`). The result is NaN for a step without an estimate.
     """
-    result = lj.simulate(_with(rig, law, prony), mesh_error=True)
-    assert result.mesh_error is not None
-    return result.mesh_error.change(lambda x, force: _reading(rig, x, force), result)[1]
+    return _changed_by_mesh(rig, lj.simulate(_with(rig, law, prony), mesh_error=True))
 
 
-def time_step_error(rig: Rig, law: Law, prony: Prony | None) -> np.ndarray:
-    """Estimate how each reading (T,) [N] or [m] would change with infinitely small time steps. The load rises during
-    the first step of the rig, also with smaller steps."""
+def _changed_by_mesh(rig: Rig, run: lj.Result) -> jax.Array:
+    assert run.mesh_error is not None
+    return run.mesh_error.change(lambda x, force: _reading(rig, x, force), run)[1]
+
+
+def reading_errors(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, np.ndarray]:
+    """Estimate how each reading (T,) [N] or [m] would change with an infinitely fine mesh (see `mesh_error`), and with
+    infinitely small time steps. The load rises during the first step of the rig, also with smaller steps."""
     scene = _with(rig, law, prony)
+    run = lj.simulate(scene, mesh_error=True)
     dt, steps = scene.solve.dt, scene.solve.steps
     rise = {"times": jnp.array([0.0, dt, (steps + 1) * dt]), "history": jnp.array([0.0, 1.0, 1.0])}
     scene = replace(scene, traction=tuple(replace(pull, **rise) for pull in scene.traction))
-    return change_with_small_steps(scene, lambda run: _reading(rig, run.positions, run.reactions))
+    of_steps = change_with_small_steps(scene, lambda run: _reading(rig, run.positions, run.reactions), run)
+    return _changed_by_mesh(rig, run), of_steps
 
 
 def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:

@@ -28,7 +28,7 @@ def change_with_small_steps(
     Args:
         scene: a scene with time steps, with known numbers (not inside jit, grad or vmap).
         readings: function from a run of T steps to its readings, with any shape (T, …).
-        run: the run of the scene, if it is known already.
+        run: the run of the scene, or of a scene with the same loads at the ends of these steps, if it is known already.
 
     Returns:
         The change, in the shape of the readings. It is NaN if a run fails.
