@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import liverjax as lj
 from fitting.__main__ import main
-from fitting.fits import field
+from fitting.fits import field, inclusion
 from fitting.methods.estimate import Estimate, bias_sentences
 from fitting.reports import field_report
 
@@ -60,6 +61,18 @@ def test_a_map_whose_level_is_open_says_so_and_the_mesh_is_blamed_for_its_own_sh
         .replace("time step_", "time_step_")
         for one in said
     ]
+
+
+@pytest.mark.parametrize(("cells", "told"), [(2, True), (6, False)])
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_sphere_as_small_as_the_elements_is_told(cells, order, told):
+    """With an edge of 0.8 radii, the modulus of a sphere was wrong by 29 %, or seven standard errors."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (cells,) * 3)
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    found = SimpleNamespace(values=np.array([0.05, 0.05, 0.05, 0.03, 1000.0, 3000.0]))
+    said = inclusion.size_sentence(mesh, found)
+    assert (said is not None) == told
+    assert said is None or "is only 0.53 times the edges of the elements (0.056 m)" in said
 
 
 def test_a_number_is_named_once(tmp_path, capsys):

@@ -318,6 +318,11 @@ def test_a_region_that_says_nothing_is_told(monkeypatch):
     assert np.all(np.isfinite(found.parts.modulus))
     told = cautions.cautions_of_elastography(own, found, None)
     assert any("region 9: the standard error" in one for one in told) and not any("region 2" in one for one in told)
+    for converged in (True, False):
+        ended = found._replace(parts=found.parts._replace(converged=np.array([converged])))
+        said = cautions.cautions_of_elastography(own, ended, None)
+        stopped = [one.startswith("100 Hz: the search for the moduli of the regions did not converge") for one in said]
+        assert any(stopped) != converged
     monkeypatch.setattr(cautions, "LEAST_RADIUS", 100.0)
     told = cautions.cautions_of_elastography(own, found, None)
     assert any("a modulus is not reliable" in one and "2 (" in one and "9 (" not in one for one in told)

@@ -137,8 +137,11 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
         sphere = inclusion.estimate(problem, options.name, inclusion.start_from(problem, found))
         print(field_report.table_of_numbers(sphere))
         with_mesh = any(size > _TOLD for each in beside for size in each.values())
+        small = inclusion.size_sentence(mesh, sphere)
         _warn(field_report.misfit_sentence(sphere, with_mesh))
+        _warn(small)
         content["sphere"] = field_report.of_numbers(sphere, with_mesh)
+        content["sphere"]["warnings"] += [small] if small else []
         good = good and sphere.converged
     field_report.write(options.out, mesh, content, found)
     print(f"written: {options.out}/field.json, field.vtu, field.h5, field.png")

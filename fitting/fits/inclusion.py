@@ -92,3 +92,20 @@ def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> 
 
     unknowns = Unknowns(np.asarray(start) / np.asarray(scale), values_of, natural_of, NAMES)
     return fit(problem, unknowns, **options)[0]
+
+
+#: A sphere whose radius is below this number of element edges is represented too coarsely.
+SMALL = 1.5
+
+
+def size_sentence(mesh: TetMesh, found: Estimate) -> str | None:
+    """Return a warning if the sphere is as small as the elements, otherwise None. Each element has one modulus, so the
+    elements that the sphere cuts have a modulus in between. The estimated error of the mesh does not contain this."""
+    radius, edge = float(found.values[3]), edge_width(mesh) * mesh.order / _EDGE
+    if radius >= SMALL * edge:
+        return None
+    return (
+        f"the radius of the sphere ({radius:.2g} m) is only {radius / edge:.2g} times the edges of the elements "
+        f"({edge:.2g} m), so radius and modulus of the sphere may be wrong by much more than their errors and mesh "
+        "bias: refine the mesh"
+    )

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy.special
 
-from fitting.readers.frequency_sweep import smooth_curve
+from fitting.readers.frequency_sweep import distances_from_polynomials, merged, smooth_curve
 from fitting.readers.tables.text_tables import split_line, text_of, to_number
 from fitting.readers.units import WAVE_UNITS
 from fitting.waves.shear_waves import DENSITY
@@ -24,6 +25,10 @@ WORDS = (
     ("speed", "velocity"),
     ("attenuation", "attenuation"),
 )
+#: Number of neighbouring points whose distance from a smooth curve (a cubic) shows the noise.
+_NEIGHBOURS = 5
+#: Relative scatter below this value may be the curvature of exact data.
+CURVED = 3e-3
 #: Minimum number of frequencies in a file.
 FEWEST = 3
 
@@ -50,10 +55,26 @@ class Dispersion(NamedTuple):
 
     @property
     def scales(self) -> np.ndarray:
-        """Values of smooth curves through the measured values. Relative errors are errors divided by these smooth
-        values."""
-        columns = [self.velocity] if self.attenuation is None else [self.velocity, self.attenuation]
-        return np.concatenate([smooth_curve(self.angular_frequency, column) for column in columns])
+        """Values of smooth curves through the measured values, so errors divided by these scales are relative. If the
+        attenuation scatters much more than the velocity, or much less, its scales are larger or smaller by this
+        factor."""
+        smooth = smooth_curve(self.angular_frequency, self.velocity)
+        if self.attenuation is None:
+            return smooth
+        factor = self._noise_of_attenuation()
+        return np.concatenate([smooth, factor * smooth_curve(self.angular_frequency, self.attenuation)])
+
+    def _noise_of_attenuation(self) -> float:
+        """Return the relative noise of the attenuation, divided by that of the velocity; 1 if this may be chance."""
+        assert self.attenuation is not None
+        omega, *columns = merged(self.angular_frequency, self.velocity, self.attenuation)
+        freedom = len(omega) - _NEIGHBOURS
+        if freedom < 1:
+            return 1.0
+        distances = (distances_from_polynomials(np.log(omega), np.log(c), _NEIGHBOURS) for c in columns)
+        noise, own = (max(float(np.sqrt(np.mean(d**2))), CURVED) for d in distances)
+        chance = np.sqrt(scipy.special.fdtri(freedom, freedom, 0.99))
+        return own / noise if not 1 / chance < own / noise < chance else 1.0
 
 
 def names_velocities(path: str | os.PathLike) -> bool:

@@ -67,6 +67,8 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
         raise InputError(
             f"--rows {rows} and {len(ranges)} parameters make no table: give at least one row and one parameter"
         )
+    if seed < 0:
+        raise InputError(f"--seed {seed} is negative: give 0 or a positive integer")
     low, high = np.array(list(ranges.values())).T
     if kind == "grid":
         if rows < 2 ** len(low):

@@ -97,7 +97,7 @@ def tried(scene: Scene) -> Tried:
         small, beside["reduced_pressure_error"] = small and off.max() <= solve.reduced_tolerance * whole, (off, "Pa")
     failed = int(np.count_nonzero(np.asarray(first.status)))
     if failed or not small:
-        limit = f"{float(np.asarray(solve.reduced_tolerance)):.2%}"
+        limit = f"{100 * float(np.asarray(solve.reduced_tolerance)):.3g} %"
         why = f"{failed} steps of the reduced run failed" if failed else f"The error is above {limit}"
         return Tried(None, f"{said}. {why}, so the full model runs")
     ran = Ran(_as_result(found, x, P), len(found.times), run_time, compile_time, beside)

@@ -48,7 +48,7 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
         coarse = _of_voxel_size(hertz, found, f)
         told += coarse + _of_residuals(hertz, each, f, "regions" if found.parts else "moduli", bool(coarse))
         any_coarse |= bool(coarse)
-        told += _of_long_waves(hertz, found, f)
+        told += _of_long_waves(hertz, found, f) if each.converged[f] else _of_stopped_search(hertz, found)
     if found.parts is not None and found.labels is not None:
         few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus)).all(axis=0)
         for label in found.labels[few]:
@@ -119,6 +119,14 @@ def _of_no_motion(field: WaveField, f: int) -> list[str]:
     return [
         f"{field.frequencies[f]:g} Hz: the displacements ({size:.2g} m) are hardly larger than their noise "
         f"({field.noise[f]:.2g} m), so the waves are unknown; remove the data of this frequency"
+    ]
+
+
+def _of_stopped_search(hertz: float, found: Found) -> list[str]:
+    what = "moduli" if found.parts is None else "moduli of the regions"
+    return [
+        f"{hertz:g} Hz: the search for the {what} did not converge, so the moduli and their errors at this frequency "
+        "are not reliable: remove this frequency, or join small or stiff regions with their surroundings"
     ]
 
 

@@ -112,7 +112,8 @@ def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
         try:
             sweep = rheometer.read_sweep(file)
         except InputError as error:
-            told.append(f"{name}: no springpot is fitted over the frequencies: {error}")
+            why = "a modulus is not above 0" if "is not positive" in str(error) else error
+            told.append(f"{name}: no springpot is fitted over the frequencies: {why}")
             continue
         told += [f"{name}: the springpot is fitted without some frequencies: {note}" for note in sweep.notes]
         fit, _ = models.best_of_models(models.fractional(sweep), sweep)
