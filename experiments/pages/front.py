@@ -226,7 +226,7 @@ def together() -> str:
             return f"{value:.3g}{unit} ± {sd:.2g}" if sd < abs(value) else "not determined"
 
         cells = (interval("shear_modulus", " Pa"), interval("ratios[0]", ""), interval("relaxation_times[0]", " s"))
-        known = r["mesh_bias"] is not None and r["time_step_bias"] is not None
+        known = r.get("mesh_bias") is not None and r.get("time_step_bias") is not None
         biases = f"{r['mesh_bias'][4]:.2g} s; {r['time_step_bias'][4]:.2g} s" if known else ""
         rows.append(f"| {r['tests']} | " + " | ".join(cells) + f" | {biases} | {r['seconds']:.0f} s |")
     true = found["true"]

@@ -48,7 +48,7 @@ def cautions_of_elastography(organ: Organ, found: Found, drawn: WaveMap | None) 
         coarse = _of_voxel_size(hertz, found, f)
         told += coarse + _of_residuals(hertz, each, f, "regions" if found.parts else "moduli", bool(coarse))
         any_coarse |= bool(coarse)
-        told += _of_long_waves(hertz, found, f) if each.converged[f] else _of_stopped_search(hertz, found)
+        told += _of_stopped_search(hertz, found, f) + (_of_long_waves(hertz, found, f) if each.converged[f] else [])
     if found.parts is not None and found.labels is not None:
         few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus)).all(axis=0)
         for label in found.labels[few]:
@@ -122,11 +122,13 @@ def _of_no_motion(field: WaveField, f: int) -> list[str]:
     ]
 
 
-def _of_stopped_search(hertz: float, found: Found) -> list[str]:
-    what = "moduli" if found.parts is None else "moduli of the regions"
+def _of_stopped_search(hertz: float, found: Found, f: int) -> list[str]:
+    searches = {"the modulus of the whole organ": found.whole, "the moduli of the regions": found.parts}
     return [
-        f"{hertz:g} Hz: the search for the {what} did not converge, so the moduli and their errors at this frequency "
-        "are not reliable: remove this frequency, or join small or stiff regions with their surroundings"
+        f"{hertz:g} Hz: the search for {what} did not converge, so these values and their errors are not reliable: "
+        "remove this frequency, or join small or stiff regions with their surroundings"
+        for what, own in searches.items()
+        if own is not None and not own.converged[f]
     ]
 
 
