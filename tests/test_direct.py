@@ -124,6 +124,28 @@ def test_auto_decides_by_size_and_stiffness():
     lj.simulate(replace(PULLED, law=Bare(mu=770.0))).check()
 
 
+def test_the_columns_of_a_jacobian_have_one_factor(monkeypatch):
+    """Each column factorised the same matrix again."""
+    made, original = [], direct._factorised
+    monkeypatch.setattr(direct, "_factorised", lambda *given: made.append(original(*given)) or made[-1])
+    monkeypatch.setattr(direct, "_last", [])
+
+    def top(values):
+        numbers = {"law.mu": values[0], "law.bulk": values[1], "displaced.0.by": values[2:]}
+        return lj.simulate(lj.with_parameters(directly(PULLED), numbers)).positions[-1].ravel()
+
+    values = jnp.array([770.0, 2200.0, 0.01, 0.0, 0.02])
+    top(values).block_until_ready()
+    of_run = len(made)
+    columns = np.asarray(jax.jit(jax.jacfwd(top))(values))
+    assert of_run >= 2 and len(made) - of_run <= of_run + 1
+    step = 1e-4 * np.array([770.0, 2200.0, 0.01, 0.01, 0.01])
+    for k in range(5):
+        ends = [np.asarray(top(values.at[k].add(sign * step[k]))) for sign in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * step[k])
+        assert np.linalg.norm(columns[:, k] - difference) < 1e-6 * np.linalg.norm(difference)
+
+
 @pytest.mark.slow
 def test_a_matrix_without_an_inverse_is_told():
     loose = lj.Scene(mesh=MESH, law=LAW, body=BODY, solve=lj.Solve())  # the body is not supported

@@ -4,8 +4,9 @@ The factorisation is SciPy's SuperLU. It runs on the CPU, outside the compiled p
 than the number n of nodes (as n^1.5 to n^2), so it is suitable for bodies with a few thousand nodes.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from liverjax.solvers.point_matrix import PointMatrix
 
 if TYPE_CHECKING:
     import scipy.sparse
+    import scipy.sparse.linalg
 
 
 def solve(
@@ -103,10 +105,16 @@ def _entries(attached: tuple[Between, ...], n: int) -> list[tuple]:
 
 
 def _solve(*given: object) -> np.ndarray:
+    rows, diagonal, nodes, free, b, normals, attached = jax.tree.map(np.asarray, given)
+    own = _kept_or_made(_factorised_blocks, (rows, diagonal, nodes, free, normals, attached))
+    return _solution(own, b.ravel()).reshape(b.shape)
+
+
+def _factorised_blocks(matrix: tuple) -> "_Factor":
     import scipy.sparse
 
-    rows, diagonal, nodes, free, b, normals, attached = jax.tree.map(np.asarray, given)
-    m, n = b.shape
+    rows, diagonal, nodes, free, normals, attached = matrix
+    m, n = free.shape
     own = np.arange(n)
     lines, columns, values = [], [], []
     for r in range(m):
@@ -118,8 +126,7 @@ def _solve(*given: object) -> np.ndarray:
         more = [a.ravel() for a in np.broadcast_arrays(*entry)]
         values, lines, columns = [*values, more[0]], [*lines, more[1]], [*columns, more[2]]
     A = scipy.sparse.coo_array((np.concatenate(values), (np.concatenate(lines), np.concatenate(columns))))
-    ways = _given_ways(attached, m * n)
-    return _one_solution(A.tocsr(), free.ravel(), b.ravel(), (normals, abs(diagonal[0, 0]).mean()), ways).reshape(m, n)
+    return _factorised(A.tocsr(), free.ravel(), (normals, abs(diagonal[0, 0]).mean()), _given_ways(attached, m * n))
 
 
 def _given_ways(attached: tuple[Between, ...], size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -135,10 +142,19 @@ def _given_ways(attached: tuple[Between, ...], size: int) -> tuple[np.ndarray, n
 
 
 def _solve_points(order: int, *given: object) -> np.ndarray:
+    blocks, nodes_and_signs, own, coupled, free, b, normals, attached = jax.tree.map(np.asarray, given)
+    matrix = (blocks, nodes_and_signs, own, coupled, free, normals, attached)
+    load = b[0].ravel()
+    if coupled is not None:
+        load = np.concatenate([load, b[1] if len(b[1]) else np.zeros(len(coupled[2]))])
+    return _solution(_kept_or_made(partial(_factorised_points, order), matrix), load).astype(b[0].dtype)
+
+
+def _factorised_points(order: int, matrix: tuple) -> "_Factor":
     import scipy.sparse
 
-    blocks, (nodes, signs), own, coupled, free, b, normals, attached = jax.tree.map(np.asarray, given)
-    n, c = b[0].shape[1], basis(order).c
+    blocks, (nodes, signs), own, coupled, free, normals, attached = matrix
+    n, c = free[0].shape[1], basis(order).c
     pairs = [(a, b) for a in (1, 2, 3) for b in (1, 2, 3) if a <= b]
     K = np.zeros((4, 4, 3, 3, *blocks.shape[-2:]))
     for (a, k), block in zip(pairs, blocks, strict=True):
@@ -152,7 +168,7 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
     if own is not None:
         every = np.arange(n)
         entries += [(own[r, s], r * n + every, s * n + every) for r in range(3) for s in range(3)]
-    known, load = free[0].ravel(), b[0].ravel()
+    known = free[0].ravel()
     if coupled is not None:
         border, rows, diagonal, near = coupled
         g = np.concatenate([-border.sum(axis=0)[None], border])
@@ -163,38 +179,77 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
         entries += [(G, at[:, None], balance[None]), (G, balance[None], at[:, None])]
         entries += [(-rows, every[None], 3 * n + near), (-diagonal, every, every)]
         known = np.concatenate([known, free[1] if len(free[1]) else np.ones(len(diagonal))])
-        load = np.concatenate([load, b[1] if len(b[1]) else np.zeros(len(diagonal))])
     parts = [[a.ravel() for a in np.broadcast_arrays(*entry)] for entry in entries]
     values, lines, columns = (np.concatenate(a) for a in zip(*parts, strict=True))
     A = scipy.sparse.coo_array((values, (lines, columns)), shape=(len(known), len(known))).tocsr()
     ways = _given_ways(attached, len(known))
-    x = _one_solution(A, known, load, (normals, abs(element[0, 0]).mean()), ways)
-    return x.astype(b[0].dtype)
+    return _factorised(A, known, (normals, abs(element[0, 0]).mean()), ways)
 
 
-def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: tuple) -> np.ndarray:
-    """Solve (A - H S^-1 H^T) x = b (n,). x is 0 where `free` (n,) is 0. `ways` contains H and the diagonal of S.
+class _Factor(NamedTuple):
+    """Factor of a matrix, for the unknowns that are free."""
 
-    `along` contains the normals (or None) and a stiffness. x is 0 along the normals, and the stiffness replaces the
-    entries of A in these directions.
+    keep: np.ndarray  # indices of the free unknowns
+    factor: "scipy.sparse.linalg.SuperLU | None"  # None: the matrix is singular, or has entries that are not finite
+    ways: tuple[np.ndarray, np.ndarray]  # H and the diagonal of S, for the rank-one changes
+
+
+def _factorised(A: "scipy.sparse.csr_array", free: np.ndarray, along: tuple, ways: tuple) -> _Factor:
+    """Factorise A - H S^-1 H^T without the unknowns for which `free` (n,) is 0. `ways`: H and the diagonal of S.
+
+    `along` contains the normals (or None) and a stiffness. The solution is 0 along the normals, and the stiffness
+    replaces the entries of A in these directions.
     """
     import scipy.sparse.linalg
 
     (normals, mean), (H, size) = along, ways
     if normals is not None:
-        N = across(np.asarray(normals), len(b))
-        inside = scipy.sparse.eye_array(len(b)) - N
+        N = across(np.asarray(normals), len(free))
+        inside = scipy.sparse.eye_array(len(free)) - N
         A, H = inside @ A @ inside + mean * N, inside @ H
     keep = np.flatnonzero(free)
-    A = A[keep][:, keep].tocsc()
-    x = np.zeros_like(b)
     try:
         # The sparsity pattern of A is symmetric, so an elimination order for A + A^T is also good for A.
-        factor = scipy.sparse.linalg.splu(A, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        x[keep] = factor.solve(b[keep])
+        factor = scipy.sparse.linalg.splu(
+            A[keep][:, keep].tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+        )
+    except (RuntimeError, ValueError):
+        factor = None
+    return _Factor(keep, factor, (H, size))
+
+
+def _solution(own: _Factor, b: np.ndarray) -> np.ndarray:
+    """Return the solution x (n,) for the right-hand side b (n,). x is 0 at unknowns that are not free, and NaN at the
+    others if the matrix is singular."""
+    x, keep, (H, size) = np.zeros_like(b), own.keep, own.ways
+    if own.factor is None:
+        x[keep] = np.nan
+        return x
+    try:
+        x[keep] = own.factor.solve(b[keep])
         if len(size):  # formula of Sherman, Morrison and Woodbury
-            Z, H = factor.solve(H[keep]), H[keep]
+            Z, H = own.factor.solve(H[keep]), H[keep]
             x[keep] += Z @ np.linalg.solve(np.diag(size) - H.T @ Z, H.T @ x[keep])
-    except (RuntimeError, ValueError, np.linalg.LinAlgError):  # A is singular, or has entries that are not finite
+    except (RuntimeError, ValueError, np.linalg.LinAlgError):
         x[keep] = np.nan
     return x
+
+
+#: The last matrix, as copies of its arrays, and its factor. The columns of a Jacobian have the same matrix, and vmap
+#: solves them one after another.
+_last: list[tuple[list[np.ndarray], object, _Factor]] = []
+
+
+def _kept_or_made(made: Callable[[tuple], _Factor], matrix: tuple) -> _Factor:
+    """Return the factor of a matrix. If it is the last matrix again, its factor is not computed again."""
+    leaves, structure = jax.tree.flatten(matrix)
+    for before, own_structure, factor in _last[:1]:
+        if structure == own_structure and all(map(_equal, before, leaves)):
+            return factor
+    factor = made(matrix)
+    _last[:] = [([np.array(leaf) for leaf in leaves], structure, factor)]  # JAX may reuse the memory of its arrays
+    return factor
+
+
+def _equal(a: np.ndarray, b: np.ndarray) -> bool:
+    return a.shape == b.shape and a.dtype == b.dtype and bool(np.array_equal(a, b))
