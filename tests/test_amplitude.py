@@ -290,7 +290,7 @@ def test_a_strain_without_a_unit_several_tables_and_a_gap(tmp_path, tanned):
     assert "states no unit, so the unit 1" in found.notes[0]
     path.write_text(f"sample A\n{text}\nsample B\n" + "\n".join(lines[:-1]))
     first, second = (strain_sweep.read_strain_sweep(path, table) for table in (None, "2"))
-    assert "holds 2 tables" in first.notes[0] and len(first.strain) == len(whole.strain) == len(second.strain) + 1
+    assert "contains 2 tables" in first.notes[0] and len(first.strain) == len(whole.strain) == len(second.strain) + 1
     with pytest.raises(InputError, match="--table sample is in the names of 2 tables"):
         strain_sweep.read_strain_sweep(path, "sample")
     a, _, *more = lines[3].split(",")

@@ -105,7 +105,7 @@ def test_a_second_table_is_not_appended_to_the_first(gap, first, tmp_path):
     text += "time_s,relaxation modulus [kPa]\n" + rows(first + np.arange(30.0))
     (tmp_path / "two.csv").write_text(text)
     test = read_time_test(tmp_path / "two.csv", "relaxation")
-    assert test.used.sum() == 50 and any("holds 2 tables" in note for note in test.notes)
+    assert test.used.sum() == 50 and any("contains 2 tables" in note for note in test.notes)
 
 
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])
