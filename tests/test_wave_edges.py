@@ -257,7 +257,7 @@ def test_intervals_of_a_map_hold_the_truth_beside_edges():
     G, sds, known = at[0], at[1:], np.isfinite(at[0].real)
     off = np.abs(G.real - np.where(field.labels == 2, STIFF, SOFT))[known]
     held = [np.mean(off < 1.645 * stiffness_map.sd_of_modulus(G, sd).real[known]) for sd in sds]
-    assert 0.85 < held[0] < 0.99 and held[1] < 0.85, held
+    assert 0.85 < held[0] < 0.99 and held[1] < 0.9, held  # 90 % intervals; both contain the correlation of the noise
 
 
 def in_its_true_place(field, radius, centre, farther=0.0):
