@@ -177,18 +177,6 @@ def box_spectrum(omega: np.ndarray, low: float, high: float, noise: float = 0.0)
     return Sweep(omega, storage * factor[0], loss * factor[1])
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_spectrum_of_separate_modes_says_that_its_errors_are_too_small(seed):
-    """Half to four fifths of the 95 % intervals of the moduli contained the truth, without a warning."""
-    omega, rng = 2 * np.pi * np.logspace(-1.5, 1.5, 40), np.random.default_rng(seed)
-    modes = generalised_maxwell.Maxwell(3000.0, np.array([0.2, 0.3, 0.2]), np.array([3.0, 0.2, 0.01]))
-    noisy = (np.asarray(m) * (1 + 0.03 * rng.standard_normal(40)) for m in generalised_maxwell.moduli(modes, omega))
-    told = models.spectrum_fit(Sweep(omega, *noisy)).warnings
-    assert any(w.startswith("the spectrum has gaps: ") and "use --model prony" in w for w in told)
-    smooth = models.spectrum_fit(box_spectrum(np.geomspace(1e-2, 1e2, 41), 1e-3, 1e3, 0.03))
-    assert not any("gaps" in w for w in smooth.warnings)
-
-
 def test_a_box_spectrum_is_found_inside_the_box():
     s = box_spectrum(np.geomspace(1e-3, 1e3, 61), 1e-2, 1e2, 0.01)
     found = relaxation_spectrum.fit(s)

@@ -6,12 +6,12 @@ from functools import partial
 import numpy as np
 import pytest
 import scipy.optimize
-from test_models import FORMULAS, TRUTHS
+from test_models import FORMULAS, TRUTHS, box_spectrum
 from test_springpots_in_time import TIMES, inverse_laplace
 
 from fitting.__main__ import main
 from fitting.fits import samples, time_tests, together
-from fitting.fits.families import choice, spectrum_of_tests
+from fitting.fits.families import choice, models, spectrum_of_tests
 from fitting.fits.families.choice import Label
 from fitting.methods import generalised_maxwell, relaxation_spectrum, time_response
 from fitting.methods.generalised_maxwell import Maxwell
@@ -155,3 +155,15 @@ def test_criteria_count_the_parameters_in_effect():
     found = spectrum_of_tests.spectrum_in_time(test, NEAR)
     m, square = len(found.measured), np.sum(((found.fitted - found.measured) / found.scales) ** 2)
     assert time_tests.criterion(found) == pytest.approx(m * np.log(square / m) + found.kind.effective * np.log(m))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_spectrum_of_separate_modes_says_that_its_errors_are_too_small(seed):
+    """Half to four fifths of the 95 % intervals of the moduli contained the truth, without a warning."""
+    omega, rng = 2 * np.pi * np.logspace(-1.5, 1.5, 40), np.random.default_rng(seed)
+    modes = Maxwell(np.float64(3000.0), np.array([0.2, 0.3, 0.2]), np.array([3.0, 0.2, 0.01]))
+    noisy = (np.asarray(m) * (1 + 0.03 * rng.standard_normal(40)) for m in generalised_maxwell.moduli(modes, omega))
+    told = models.spectrum_fit(Sweep(omega, *noisy)).warnings
+    assert any(w.startswith("the spectrum has gaps: ") and "use --model prony" in w for w in told)
+    smooth = models.spectrum_fit(box_spectrum(np.geomspace(1e-2, 1e2, 41), 1e-3, 1e3, 0.03))
+    assert not any("gaps" in w for w in smooth.warnings)
