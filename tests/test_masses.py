@@ -43,7 +43,7 @@ def test_masses_integrate_products_of_functions(order):
     moments.
     """
     mesh = MESHES[order]
-    mass, shared = Inertia(density=1000.0, mass="consistent")._masses(mesh)
+    mass, shared = Inertia(density=1000.0, mass="consistent").masses_on(mesh)
 
     def product(v: jax.Array) -> jax.Array:
         return mass[:, None] * v + jnp.stack(attached.product(shared, tuple(v.T)), axis=1)
@@ -62,7 +62,7 @@ def test_masses_integrate_products_of_functions(order):
 def test_numbers_by_node_are_means_by_element():
     mesh = MESHES[2]
     density = jnp.linspace(900.0, 1100.0, mesh.number_of_nodes)
-    mass, shared = Inertia(density=density, mass="consistent")._masses(mesh)
+    mass, shared = Inertia(density=density, mass="consistent").masses_on(mesh)
     total = jnp.sum(mass) + jnp.sum(jnp.stack(attached.product(shared, (jnp.ones_like(mass),))))
     assert np.isclose(total, jnp.sum(mesh.volumes * density[mesh.tetrahedra].mean(axis=1)), rtol=1e-13)
 
@@ -86,7 +86,7 @@ def test_accelerations_at_the_beginning_are_those_of_the_weight():
     mask = jnp.ones_like(mesh.points).at[mesh.node_sets["x_min"]].set(0.0)
     weight = 1000.0 * load_volumes(mesh)[:, None] * jnp.asarray(GRAVITY)[None]
     a = own.begin(Start(mesh, mesh.points, Free(mask), lambda: -weight)).acceleration
-    mass, shared = own._masses(mesh)
+    mass, shared = own.masses_on(mesh)
     force = mass[:, None] * a + jnp.stack(attached.product(shared, tuple(a.T)), axis=1)
     assert np.all(a[mesh.node_sets["x_min"]] == 0)
     assert np.abs(mask * (force - weight)).max() < 1e-10 * np.abs(weight).max()

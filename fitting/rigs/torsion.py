@@ -54,7 +54,7 @@ from liverjax.physics import viscosity
 from liverjax.physics.base import End, Free, Physics, Step
 from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.inertia import Inertia, Motion
-from liverjax.physics.prescribed import Fixed
+from liverjax.physics.prescribed import Fixed, given_acceleration
 from liverjax.physics.rigid_plate import RigidPlate
 from liverjax.physics.viscosity import Prony, Viscoelasticity
 from liverjax.scenes.scene import Body, Scene, Solve
@@ -244,15 +244,17 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
     """Solve one time step. Returns the new coordinates and internal variables, then angle, torque, lift and
     Newton's statistics."""
     (q_old, memories), rig, mesh = carry, o.rig, o.rig.mesh
-    mask = jnp.ones_like(mesh.points)
-    if not o.by_torque and o.drive.start == "rest":
-        # The velocity of the top plate jumps at the start, so its acceleration would oscillate and grow in the average
-        # acceleration method. Therefore this acceleration is ignored. The remaining error is of first order in the
-        # time step. If the run starts on the cycle, the velocity does not jump, and the error is of second order.
-        mask = mask.at[len(mask) - rig.top :, :2].set(0.0)
-    physics, free = _sample_physics(rig, o.law, o.prony), Free(mask)
+    mask, given = jnp.ones_like(mesh.points), None
     steps, tolerance = o.drive.steps * o.drive.cycles, o.drive.options.tolerance
-    begin = Step(mesh, o.positions(q_old), 1, steps, o.dt, True, tolerance, free)
+    if not o.by_torque and o.drive.start == "rest":
+        # The velocity of the top plate jumps at the start, so its acceleration would oscillate in the average
+        # acceleration method. Therefore the acceleration follows from the given angle.
+        mask = mask.at[len(mask) - rig.top :, :2].set(0.0)
+        still = jnp.zeros_like(o.solved_part(q_old))
+        place = lambda k: o.positions(o.full(still, k * o.dt))  # noqa: E731
+        given = given_acceleration(place, jnp.round(t / o.dt), steps, o.dt) if rig.density is not None else None
+    physics, free = _sample_physics(rig, o.law, o.prony), Free(mask)
+    begin = Step(mesh, o.positions(q_old), 1, steps, o.dt, True, tolerance, free, given=given)
     solid, *nodal = (p.freeze(memory, begin) for p, memory in zip(physics, memories, strict=True))
 
     def forces(q):

@@ -52,6 +52,11 @@ class Tied(Protocol):
     A few unknowns define their motion. These unknowns are stored in the rows of these nodes in a nodal field (V, 3).
     """
 
+    @property
+    def linear(self) -> bool:
+        """Whether the positions of these nodes are a linear function of their unknowns."""
+        raise NotImplementedError
+
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
         """Project a nodal field (V, 3) onto the free motions of the nodes. For forces, x (V, 3) are the positions."""
 
@@ -118,6 +123,7 @@ class Start(NamedTuple):
     free: Free
     force: Callable[[], jax.Array]  # (V, 3) [N] nodal forces at x, without inertia
     moved: bool = False  # True: the body was just moved to x. False: it is at rest at x, or x is only a guess
+    given: jax.Array | None = None  # (V, 3) [m/s^2] acceleration in directions with a given motion; None: it is 0
 
 
 class Step(NamedTuple):
@@ -132,6 +138,8 @@ class Step(NamedTuple):
     tolerance: Any  # tolerance of the residual, a constant in derivatives
     free: Free
     averaged: bool = False  # True (Newmark): the step uses the mean of the forces at its beginning and end
+    #: (V, 3) [m/s^2] acceleration at the end of the step in directions with a given motion; None: Newmark is not used
+    given: jax.Array | None = None
 
 
 class End(NamedTuple):

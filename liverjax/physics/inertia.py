@@ -51,8 +51,10 @@ class Inertia(Physics):
         """
         acceleration = None
         if self.integrator == "newmark":
-            force = -start.free.vectors(start.force())
-            acceleration = _accelerations(*self._masses(start.mesh), start.free, force)
+            (mass, shared), force = self.masses_on(start.mesh), start.force()
+            if start.given is not None and shared is not None:
+                force = force + inertia_forces(mass, shared, start.given)
+            acceleration = _accelerations(mass, shared, start.free, -start.free.vectors(force))
         return Motion(jnp.zeros_like(start.x), acceleration)
 
     @classmethod
@@ -65,15 +67,15 @@ class Inertia(Physics):
         if memory is None:
             still = jnp.zeros_like(step.x)
             memory = Motion(still, still if self.integrator == "newmark" else None)
-        mass, shared = self._masses(step.mesh)
+        mass, shared = self.masses_on(step.mesh)
         mask, axes = step.free.mask, None
         for nodes in step.free.tied:
             mask, axes = nodes.not_given(mask, axes)
         own = {"x": step.x, "motion": memory, "dt": step.dt, "mask": mask, "integrator": self.integrator}
-        own["free"] = step.free if step.averaged else None
+        own |= {"free": step.free if step.averaged else None, "given": step.given}
         return Moving(mass=mass, shared=shared, axes=axes, **own)
 
-    def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
+    def masses_on(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
         """Return the diagonal masses (V,) [kg] of the nodes, and the remaining part of the consistent mass matrix.
 
         The remaining part is the consistent mass matrix minus the diagonal masses. It is None if the mass is lumped.
@@ -110,7 +112,7 @@ def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: ja
 
     def product(a: jax.Array) -> jax.Array:
         own = free.vectors(a)
-        return free.vectors(_inertia(mass, shared, own)) + mean * (a - own)
+        return free.vectors(inertia_forces(mass, shared, own)) + mean * (a - own)
 
     def nearly_solved(r: jax.Array) -> jax.Array:
         own = free.vectors(r)
@@ -120,7 +122,7 @@ def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: ja
     return free.vectors(found)
 
 
-def _inertia(mass: jax.Array, shared: Masses | None, a: jax.Array) -> jax.Array:
+def inertia_forces(mass: jax.Array, shared: Masses | None, a: jax.Array) -> jax.Array:
     """Return the inertia forces (V, 3) [N]: mass times accelerations a (V, 3) [m/s^2]."""
     force = mass[:, None] * a
     return force if shared is None else force + jnp.stack(attached.product(shared, tuple(a.T)), axis=1)
@@ -142,6 +144,9 @@ class Moving(NodalForce):
     )
 
     free: Free | None = param("1", "free directions; None for implicit Euler", default=None)
+    given: jax.Array | None = param(
+        "m/s^2", "(V, 3) acceleration where the motion is given; None: it is 0", default=None
+    )
 
     everywhere: ClassVar[bool] = True
 
@@ -154,8 +159,11 @@ class Moving(NodalForce):
             # Newmark's formula is used only in free directions. With a prescribed motion, the acceleration from this
             # formula would oscillate forever.
             average = 4 * acceleration - before.acceleration
-            velocity = self._where_free(before.velocity + 0.5 * dt * (before.acceleration + average), velocity)
-            acceleration = self._where_free(average, acceleration)
+            given = jnp.zeros_like(x) if self.given is None else self.given
+            velocity = self._where_free(
+                before.velocity + 0.5 * dt * (before.acceleration + average), velocity + 0.5 * dt * given
+            )
+            acceleration = self._where_free(average, given)
         return velocity, acceleration
 
     def _where_free(self, own: jax.Array, given: jax.Array) -> jax.Array:
@@ -169,7 +177,7 @@ class Moving(NodalForce):
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Return the inertia forces (V, 3) [N] at positions x (V, 3): mass times acceleration."""
-        return _inertia(self.mass, self.shared, self.kinematics(x)[1])
+        return inertia_forces(self.mass, self.shared, self.kinematics(x)[1])
 
     def accelerations(self, force: jax.Array, x: jax.Array) -> jax.Array | None:
         """Return the accelerations a (V, 3) [m/s^2] in the free directions due to forces (V, 3) [N].
@@ -181,7 +189,7 @@ class Moving(NodalForce):
 
     def inertial(self, acceleration: jax.Array) -> jax.Array:
         """Return the inertia forces (V, 3) [N]: mass times acceleration."""
-        return _inertia(self.mass, self.shared, acceleration)
+        return inertia_forces(self.mass, self.shared, acceleration)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
         """Return the incremental energy m a . a dt^2/(2k) [J], whose gradient is the inertia force.
@@ -189,7 +197,7 @@ class Moving(NodalForce):
         m are the masses, a the accelerations, dt is the time step, and k is from `FACTOR`.
         """
         a = self.kinematics(x)[1]
-        return 0.5 * self.dt**2 / FACTOR[self.integrator] * jnp.sum(_inertia(self.mass, self.shared, a) * a)
+        return 0.5 * self.dt**2 / FACTOR[self.integrator] * jnp.sum(inertia_forces(self.mass, self.shared, a) * a)
 
     def stiffness(self) -> Block:
         """Return the stiffness k m/dt^2 [N/m] of every node, equal for all axes.

@@ -1,5 +1,7 @@
 """Prescribed motion: fixed nodes, and nodes with a given displacement."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,3 +85,24 @@ def prescribed(mesh: TetMesh, displaced: tuple, time: Number, fraction: Number) 
             value = jnp.stack([jnp.interp(time, condition.times, history[:, k]) for k in axes])
         u = u.at[jnp.asarray(condition.nodes)[:, None], axes].set(value)
     return u
+
+
+def given_acceleration(place: Callable[[Number], jax.Array], k: Number, steps: int, dt: Number) -> jax.Array:
+    """Return the acceleration (V, 3) [m/s^2] of a given motion at the end of step k, with an error of order dt^2.
+
+    It is the central difference of the positions. At the last step, where the next position is unknown, it is
+    extrapolated. For k = 0, the motion begins at rest, and a velocity that jumps there has its full impulse.
+
+    Args:
+        place: function k -> positions (V, 3) [m] after k steps.
+        k: number of the step.
+        steps: number of steps of the run.
+        dt: time step [s].
+    """
+    n = jnp.where(k == steps, k - 1, k)
+    x = [place(jnp.maximum(n + i, 0)) for i in (1, 0, -1, -2)]
+    now, before = x[0] - 2 * x[1] + x[2], x[1] - 2 * x[2] + x[3]
+    # Before step 2, the second difference contains the jump of the velocity at the beginning.
+    change = jnp.where(n > 1, now - before, 0.0) if steps > 2 else jnp.zeros_like(now)
+    begin = jnp.where(k == 0, 2.0, 1.0)
+    return (begin * now + (k - n) * change) / dt**2

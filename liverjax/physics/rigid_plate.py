@@ -51,7 +51,9 @@ class RigidPlate(Physics):
                 f"{name} has fewer than two nodes, or a node number above {mesh.number_of_nodes - 1}: correct the nodes"
             )
         if abs(np.linalg.norm(np.asarray(self.axis)) - 1) > 1e-6:
-            raise InputError(f"{name} axis = {self.axis} must be of length 1: divide this vector by its length")
+            raise InputError(
+                f"{name} axis = {self.axis} must be of length 1: give such a vector, for example [0, 0, 1]"
+            )
         if times.shape != turn.shape or (times.ndim and (np.diff(times) <= 0).any()):
             raise InputError(f"{name} needs ascending times and one value of turn for each time: correct the history")
         arms = self.at_rest(mesh).arms(mesh.points)
@@ -130,6 +132,11 @@ class Plate(NamedTuple):
     def radius(self) -> jax.Array:
         """Return R [m]: the square root of the sum of the squared distances of the nodes from the axis."""
         return jnp.linalg.norm(self._arms(self.reference))
+
+    @property
+    def linear(self) -> bool:
+        """Whether positions are linear in the plate's unknowns: true if the angle is given, not the torque."""
+        return self.plate.by == "angle"
 
     def angle(self, x: jax.Array) -> jax.Array:
         """Return the angle [rad] of the plate at positions x (V, 3), between -pi and pi."""

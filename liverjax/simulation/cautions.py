@@ -11,7 +11,6 @@ from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.locate import doubled_vertices, hanging_vertices
-from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.membrane import Membrane
 from liverjax.physics.base import Physics
@@ -20,7 +19,8 @@ from liverjax.physics.contact.obstacle import Obstacle, missed_depth
 from liverjax.physics.contact.passage import passed_in_step
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.elastic_support import ElasticSupport
-from liverjax.physics.loads import follows, nodal_tractions
+from liverjax.physics.inertia import Inertia, inertia_forces
+from liverjax.physics.loads import dead_loads, follows
 from liverjax.physics.rigid_plate import RigidPlate
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes import regions
@@ -193,18 +193,19 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
     motions can grow.
     """
     body, solve = scene.body, scene.solve
-    if solve.kind != "dynamic" or solve.integrator != "newmark" or body is None or body.mass != "lumped":
+    if solve.kind != "dynamic" or solve.integrator != "newmark" or body is None:
         return []
     driven = any(np.any(np.asarray(d.by)) for d in scene.displaced) or histories(scene) or follows(scene.traction)
     inlets = scene.porosity is not None and (scene.porosity.inlet or scene.porosity.initial_pressure is not None)
     driven = driven or not all(_gives_no_energy(physics) for _, physics in named_physics(scene))
     if driven or inlets or np.ndim(body.density) or solve.dt is None:
         return []
-    mass = float(body.density) * np.asarray(nodal_volumes(scene.mesh))[:, None]
-    force = mass * np.asarray(body.gravity) + np.asarray(nodal_tractions(scene.mesh, scene.traction))
+    momentum = partial(inertia_forces, *Inertia(density=body.density, mass=body.mass).masses_on(scene.mesh))
     x = np.concatenate([np.asarray(scene.mesh.points)[None], np.asarray(result.positions)])
+    force = np.asarray(dead_loads(scene.mesh, body.density, body.gravity, scene.traction))
     work = np.sum((x - x[0]) * force, axis=(1, 2))
-    moving = 0.5 * np.sum(mass * (np.diff(x, axis=0) / float(solve.dt)) ** 2, axis=(1, 2))
+    velocity = np.diff(x, axis=0) / float(solve.dt)
+    moving = 0.5 * np.sum(velocity * np.asarray(jax.lax.map(momentum, velocity)), axis=(1, 2))
     given = 0.5 * (work[1:] + work[:-1])
     if not np.any(moving > given + 1e-3 * np.abs(work).max()):
         return []

@@ -16,7 +16,7 @@ from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Free, NodalForce, Physics, Solid, Start, Step, VolumeStress
 from liverjax.physics.darcy import Guess
-from liverjax.physics.prescribed import free_degrees, prescribed
+from liverjax.physics.prescribed import free_degrees, given_acceleration, prescribed
 from liverjax.physics.registry import law_at_rest, physics_of
 from liverjax.scenes.scene import Scene
 from liverjax.solvers.block_matrix import columns, flat
@@ -122,7 +122,8 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
         return sum(forces, jnp.zeros_like(x))
 
     free = _with_tied(physics, _first_step(scene, x, free)).free
-    begin = Start(scene.mesh, x, free, force, moved=start is not None and scene.solve.kind == "dynamic")
+    given = _prescribed_acceleration(scene, physics, _first_step(scene, x, free)._replace(k=0))
+    begin = Start(scene.mesh, x, free, force, moved=start is not None and scene.solve.kind == "dynamic", given=given)
     return State(x, tuple(p.begin(begin) for p in physics))
 
 
@@ -150,6 +151,24 @@ def _with_tied(physics: tuple[Physics, ...], step: Step) -> Step:
     """Add the nodes that move together to the step."""
     tied = tuple(nodes for nodes in (p.tied(step) for p in physics) if nodes is not None)
     return step._replace(free=step.free._replace(tied=tied))
+
+
+def _prescribed_acceleration(scene: Scene, physics: tuple[Physics, ...], step: Step) -> jax.Array | None:
+    """Acceleration (V, 3) [m/s^2] at the end of a step of Newmark's method, where the motion is given; 0 elsewhere.
+
+    None if no motion is given, or for other methods, which do not need it.
+    """
+    turned = any(nodes.linear for nodes in _with_tied(physics, step).free.tied)
+    if not step.averaged or not (scene.displaced or turned):
+        return None
+
+    def place(k: Number) -> jax.Array:
+        x = prescribed(step.mesh, scene.displaced, step.dt * k, k / step.steps)
+        for nodes in _with_tied(physics, step._replace(k=k)).free.tied:
+            x = nodes.placed(x, 1.0)
+        return x
+
+    return given_acceleration(place, step.k, step.steps, step.dt)
 
 
 def force_sizes(scene: Scene) -> Sizes:
@@ -209,6 +228,7 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
     free = free_directions(scene)
     tolerance = jax.lax.stop_gradient(scene.solve.tolerance)
     step = _with_tied(physics, _first_step(scene, state.x, free)._replace(k=k, tolerance=tolerance))
+    step = step._replace(given=_prescribed_acceleration(scene, physics, step))
     eps = float(np.finfo(np.float64).eps)
     free, noise = step.free, 20 * eps * sizes.unit_strain
     if scene.solve.volumetric == "mixed":
