@@ -5,7 +5,6 @@ Newton's method uses the inverse of a tangent from an earlier step. This inverse
 forces (quasi-Newton method). A new tangent is computed only if the residual decreases too little.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -28,6 +27,7 @@ from liverjax.reduced.physics.fluid import (
 )
 from liverjax.reduced.tangent import ReducedTangent, SinglePrecision, near_inverse, solved_by_tangent
 from liverjax.scenes.scene import Scene
+from liverjax.solvers.krylov import one_by_one
 from liverjax.tensors.matrices import IDENTITY, add_matrices, determinant
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -285,30 +285,8 @@ def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, i
     def solve(*arrays: jax.Array) -> _Found:
         return _solved(newmark, most, *jax.tree.unflatten(tree, arrays))
 
-    found: _Found = _lane_by_lane(solve)(*arrays) if jax.default_backend() == "cpu" else solve(*arrays)
+    found: _Found = one_by_one(solve)(*arrays)
     return found
-
-
-def _lane_by_lane(function: Callable) -> Callable:
-    """Return the same function, but vmap computes the runs of a batch (lanes) one after another.
-
-    Otherwise, on a CPU, all runs of the batch would wait for the slowest run, and for every new tangent in any run.
-    `jax.custom_batching.sequential_vmap` is not used because it fails in second derivatives.
-    """
-    own = jax.custom_batching.custom_vmap(function)
-
-    @own.def_vmap
-    def lanes(size: int, batched: list[bool], *arrays: jax.Array) -> tuple[Any, Any]:
-        with_lanes = [a for a, b in zip(arrays, batched, strict=True) if b]
-
-        def one(lane: list[jax.Array]) -> Any:
-            left = iter(lane)
-            return own(*(next(left) if b else a for a, b in zip(arrays, batched, strict=True)))
-
-        out = jax.lax.map(one, with_lanes) if with_lanes else function(*arrays)
-        return out, jax.tree.map(lambda _: bool(with_lanes), out)
-
-    return own
 
 
 def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, inverse: jax.Array) -> _Found:

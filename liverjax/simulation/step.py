@@ -33,6 +33,7 @@ from liverjax.solvers import block_matrix, step_cutting
 from liverjax.solvers.krylov import (
     Earlier,
     conjugate_gradients,
+    one_by_one,
     stabilised_biconjugate_gradients,
     started,
     true_residual,
@@ -60,9 +61,9 @@ def problem_of(e: Equations) -> Problem:
         tangent=partial(_tangent, e, "true"),
         solve=partial(tangent.solve, e),
         preconditioner=partial(tangent.preconditioner, e),
-        # If nodes rotate together about an axis, the tangent is exact only for small rotations. So it cannot be used
-        # for derivatives.
-        adjoint=partial(adjoint, e) if e.conservative and not e.free.tied else None,
+        # If nodes rotate together by an unknown angle, the tangent is exact only for small rotations. So it cannot be
+        # used for derivatives.
+        adjoint=partial(adjoint, e) if e.conservative and all(nodes.linear for nodes in e.free.tied) else None,
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
         roundoff=e.roundoff,
@@ -174,12 +175,28 @@ def adjoint(
     With a flowing fluid, x also contains the pressures of the fluid, and b contains forces and minus the balance of
     volumes. The returned right-hand side (3 V,) is then what remains of b after the elimination of the pressures.
     Otherwise it is b. Iterations begin with a combination of `earlier` solves if this reduces the residual. Follower
-    loads are not allowed.
+    loads are not allowed. On a CPU, the columns of a Jacobian are solved one after another.
     """
+    if e.scene.solve.linear_solver == "direct":
+        return _adjoint(e, K, b, (tolerance, max_iterations), earlier)
+    arrays, tree = jax.tree.flatten((e, K, b, tolerance, earlier))
+
+    def solved(*arrays: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        e, K, b, tolerance, earlier = jax.tree.unflatten(tree, arrays)
+        return _adjoint(e, K, b, (tolerance, max_iterations), earlier)
+
+    found: tuple[jax.Array, jax.Array, jax.Array] = one_by_one(solved)(*arrays)
+    return found
+
+
+def _adjoint(
+    e: Equations, K: tangent.Tangent, b: jax.Array, limits: tuple[Number, int], earlier: Earlier | None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    tolerance, max_iterations = limits
     volume = tangent.volume_with_pressures(e)
     flows = e.mixed is None and volume is not None and volume.flow is not None
     if flows:
-        return _with_flow(e, K, b, (tolerance, max_iterations), earlier)
+        return _with_flow(e, K, b, limits, earlier)
     apply = tangent.product(e, K, exactly=True)
     if e.scene.solve.linear_solver == "direct":
         x = tangent.factorised_solution(e, K, b)

@@ -1,7 +1,7 @@
 """Preconditioned Krylov methods for use inside `jax.jit`. At the end, the methods compute the true residual."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -282,3 +282,27 @@ def differentiable_solve(
         return jnp.where(good, x, jnp.nan)
 
     return jax.lax.custom_linear_solve(matvec, b, solve=solve, transpose_solve=solve, symmetric=symmetric)
+
+
+def one_by_one(function: Callable) -> Callable:
+    """Return the same function of arrays. On a CPU, `jax.vmap` computes the members of a batch one after another.
+
+    Otherwise all members would wait for the member with the most iterations, and products of several small matrices
+    are slow on a CPU. `jax.custom_batching.sequential_vmap` is not used because it fails in second derivatives.
+    """
+    if jax.default_backend() != "cpu":
+        return function
+    own = jax.custom_batching.custom_vmap(function)
+
+    @own.def_vmap
+    def members(size: int, batched: list[bool], *arrays: jax.Array) -> tuple[Any, Any]:
+        changing = [a for a, b in zip(arrays, batched, strict=True) if b]
+
+        def one(member: list[jax.Array]) -> Any:
+            left = iter(member)
+            return own(*(next(left) if b else a for a, b in zip(arrays, batched, strict=True)))
+
+        out = jax.lax.map(one, changing) if changing else function(*arrays)
+        return out, jax.tree.map(lambda _: bool(changing), out)
+
+    return own
