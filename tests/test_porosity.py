@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax.core.struct import replace
+from liverjax.core.struct import in_precision, replace
 from liverjax.physics import darcy, porosity
 from liverjax.scenes.scene_file import scene_from
 from liverjax.simulation.cautions import cautions_of_run
 from liverjax.simulation.equations import initial_state
-from liverjax.simulation.run import _cast
 from liverjax.tensors.matrices import deformation_gradient
 from liverjax.waves.cautions import cautions_of_waves
 
@@ -283,7 +282,7 @@ def test_pressure_in_float32_where_storage_is_lost_beside_what_flows():
     sponge = replace(scene.porosity, drained=None)
     smaller = 1 - 0.01 * jnp.linspace(0.0, 2.0, scene.mesh.number_of_elements)  # 1 % on average
     for dtype in (jnp.float64, jnp.float32):
-        mesh, own = jax.tree.map(lambda a, d=dtype: _cast(a, d), (scene.mesh, sponge))
+        mesh, own = jax.tree.map(lambda a, d=dtype: in_precision(a, d), (scene.mesh, sponge))
         fluid = porosity.initial_fluid(own, mesh)
         flow = darcy.flow(own, mesh, fluid.J, deformation_gradient(mesh, mesh.points), dtype(1e4), 1e-6)
         P = porosity.pressure(own, mesh, fluid, flow, smaller.astype(dtype))

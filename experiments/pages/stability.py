@@ -107,8 +107,9 @@ def _locking() -> list[str]:
     (data,) = load("stability_bulk")
     kinds = [(v, p) for p in ("float64", "float32") for v in ("element", "nodal")]
     rows = [
-        "The next table shows errors due to locking. The reference is a finer mesh with averaged volumes in float64, "
-        "and matrices are factorised. The table also gives Newton iterations and run time.",
+        "The next table shows errors due to locking and bending. The reference is a finer mesh of quadratic elements",
+        "with pressure unknowns in float64, and matrices are factorised. The table also gives Newton iterations and "
+        "run time.",
         '"Stalled" means that the precision of the numbers allows no residual below the tolerance of 1e-4. The best '
         "result was kept:",
         "",

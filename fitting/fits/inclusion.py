@@ -5,9 +5,12 @@ Unlike a stiffness map, the sphere has few parameters. A smooth map spreads a sh
 the modulus of an inclusion. The map only gives the starting point of the fit. The edge of the sphere is smooth over a
 length proportional to the element size, so the residuals have derivatives with respect to the position of the sphere.
 An error of the radius can compensate an error of the modulus. The elements should therefore be quadratic, or much
-smaller than the sphere.
+smaller than the sphere. An element that the edge cuts has the mean of both moduli, weighted by volume. The estimated
+error of the mesh contains the error of this mean: the richer elements of the estimate have the modulus of the sphere
+at each integration point.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -21,26 +24,39 @@ from liverjax.core.struct import Number
 from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Width of the smooth edge of the sphere, divided by the mean distance between neighbouring integration points.
-_EDGE = 0.25
+#: Points per edge of an element at which the sphere is evaluated.
+_POINTS = 5
+#: Width of the smooth edge of the sphere, divided by the distance between these points.
+_EDGE = 0.15
 NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion")
 
 
-def edge_width(mesh: TetMesh) -> float:
-    """Return the width [m] of the smooth edge of the sphere, a quarter of the mean distance between neighbouring
-    integration points."""
-    size = float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
-    return _EDGE * size / mesh.order
+def edge_length(mesh: TetMesh) -> float:
+    """Return the mean length [m] of the edges: that of a regular tetrahedron with the mean volume."""
+    return float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
 
 
-def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> jax.Array:
-    """Return the fraction of each element (E,) that lies inside the sphere: 1 inside, 0 outside, smooth in between. The
-    fraction is a mean over points in the element."""
-    corners = mesh.points[mesh.tetrahedra]
-    L = np.full((4, 1), 0.25) if mesh.order == 1 else basis(mesh.order).L
-    points = jnp.einsum("kq,eki->qei", L, corners)
+def _places_in_element() -> np.ndarray:
+    """Return the barycentric coordinates (4, n) of a regular grid of points inside a tetrahedron."""
+    m = _POINTS
+    rows = [(a, b, c, m - 1 - a - b - c) for a in range(m) for b in range(m - a) for c in range(m - a - b)]
+    return (np.array(rows, float).T + 0.25) / m
+
+
+def inside(mesh: TetMesh, L: np.ndarray, centre: jax.Array, radius: Number) -> jax.Array:
+    """Return whether points lie inside the sphere, (n, E): 1 inside, 0 outside, smooth in between.
+
+    `L` (4, n) are the barycentric coordinates of the n points of each element.
+    """
+    width = _EDGE * edge_length(mesh) / _POINTS
+    points = jnp.einsum("kq,eki->qei", L, mesh.points[mesh.tetrahedra])
     distance = jnp.sqrt(jnp.sum((points - centre[None, None]) ** 2, axis=-1) + 1e-3 * width**2)
-    return jnp.mean(jax.nn.sigmoid((radius - distance) / width), axis=0)
+    return jax.nn.sigmoid((radius - distance) / width)
+
+
+def fraction(mesh: TetMesh, centre: jax.Array, radius: Number) -> jax.Array:
+    """Return the fraction of each element (E,) that lies inside the sphere."""
+    return jnp.mean(inside(mesh, _places_in_element(), centre, radius), axis=0)
 
 
 def start_from(problem: Problem, field: Field) -> np.ndarray:
@@ -77,20 +93,31 @@ def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> 
         options: options of `fitting.fits.scene_numbers.fit`.
     """
     base, mesh = start_of(problem, name), problem.scenes[0].mesh
-    width = edge_width(mesh)
     size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
     scale = jnp.array([size] * 3 + [1.0] * 3)
 
-    def values_of(u):
+    def modulus(u, base, part_of):
         u = u * scale
-        return {name: base * jnp.exp(u[4] + u[5] * factor(mesh, u[:3], jnp.exp(u[3]), width))}
+        return {name: base * jnp.exp(u[4]) * (1 + jnp.expm1(u[5]) * part_of(u[:3], jnp.exp(u[3])))}
+
+    def values_of(u):
+        return modulus(u, base, partial(fraction, mesh))
+
+    def at_points(u, richer):
+        own = jnp.repeat(base, richer.number_of_elements // mesh.number_of_elements)  # parts of elements if refined
+        if richer.order == 1:
+            return modulus(u, own, partial(fraction, richer))
+        return modulus(u, own[None], partial(inside, richer, basis(richer.order).L))
 
     def natural_of(u):
         u = u * scale
         at_rest = jnp.mean(base)
         return jnp.stack([*u[:3], jnp.exp(u[3]), at_rest * jnp.exp(u[4]), at_rest * jnp.exp(u[4] + u[5])])
 
-    unknowns = Unknowns(np.asarray(start) / np.asarray(scale), values_of, natural_of, NAMES)
+    # The numbers of regions replace those of the sphere, element by element. A loaded mesh has other points in the run.
+    other = any(scene.region or scene.points_are == "loaded" for scene in problem.scenes)
+    resolved = None if other else at_points
+    unknowns = Unknowns(np.asarray(start) / np.asarray(scale), values_of, natural_of, NAMES, resolved)
     return fit(problem, unknowns, **options)[0]
 
 
@@ -100,12 +127,13 @@ SMALL = 1.5
 
 def size_sentence(mesh: TetMesh, found: Estimate) -> str | None:
     """Return a warning if the sphere is as small as the elements, otherwise None. Each element has one modulus, so the
-    elements that the sphere cuts have a modulus in between. The estimated error of the mesh does not contain this."""
-    radius, edge = float(found.values[3]), edge_width(mesh) * mesh.order / _EDGE
+    elements that the sphere cuts have a modulus in between. `mesh_bias` contains this error, but only its first order,
+    which is not enough for so few elements."""
+    radius, edge = float(found.values[3]), edge_length(mesh)
     if radius >= SMALL * edge:
         return None
     return (
         f"the radius of the sphere ({radius:.2g} m) is only {radius / edge:.2g} times the edges of the elements "
-        f"({edge:.2g} m), so radius and modulus of the sphere may be wrong by much more than their errors and mesh "
-        "bias: refine the mesh"
+        f"({edge:.2g} m), so radius and modulus of the sphere may be wrong by more than their errors and mesh bias: "
+        "refine the mesh"
     )

@@ -20,8 +20,14 @@ from fitting.rigs.time_steps import change_with_small_steps
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, replace
+from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes.scene import Scene, numbers_at
 from liverjax.simulation.automatic import with_solver
+from liverjax.simulation.mesh_error import mesh_error_of
+from liverjax.simulation.run import prepared
+
+#: Function of a richer mesh -> parameters by dotted name (see `mesh_error_of`).
+Finer = Callable[[TetMesh], Content]
 
 
 class Problem(NamedTuple):
@@ -60,6 +66,9 @@ class Unknowns(NamedTuple):
     values_of: Callable[[jax.Array], Content]  # u -> parameters of the scenes by dotted name
     natural_of: Callable[[jax.Array], jax.Array]  # u -> m parameters to report (m,)
     names: Sequence[str]  # names of the reported parameters
+    #: Function (u, mesh) -> parameters (Q, E) at the Q integration points of the E elements, if they vary within an
+    #: element more than those of `values_of`; the estimated error of the mesh then contains this difference
+    at_points: Callable[[jax.Array, TetMesh], Content] | None = None
 
 
 def fit(
@@ -81,7 +90,7 @@ def fit(
             than its standard error. The estimate needs more runs, and one linear solve per step.
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
-    start, values_of, natural_of, names = unknowns
+    start, values_of, natural_of, names, at_points = unknowns
     problem = with_solvers(problem, values_of(jnp.asarray(start, float)))
 
     @jax.jit
@@ -105,18 +114,21 @@ def fit(
     estimate = _of_alike_noise(problem, natural_of, found, estimate)
     known = np.all(np.isfinite(estimate.standard_errors))  # an infinite error means that a parameter ran to a limit
     if mesh_error and known:
-        estimate = _of_discretisation(problem, values_of(found.u), (estimate, found, natural_of))
+        finer = None if at_points is None else partial(at_points, found.u)
+        estimate = _of_discretisation(problem, (values_of(found.u), finer), (estimate, found, natural_of))
         for sentence in bias_sentences(estimate):
             warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=ended, seconds=seconds), found
 
 
-def _of_discretisation(problem: Problem, values: Content, fitted: tuple[Estimate, Solution, Callable]) -> Estimate:
+def _of_discretisation(
+    problem: Problem, values: tuple[Content, Finer | None], fitted: tuple[Estimate, Solution, Callable]
+) -> Estimate:
     """Return the estimate with the changes of the parameters due to the meshes, and due to the time steps if a scene
-    has time steps. `values`: parameters of the scenes. `fitted`: estimate, solution, and function from u to the
+    has time steps. `values`: see `discretisation_errors`. `fitted`: estimate, solution, and function from u to the
     reported parameters."""
     estimate, found, natural_of = fitted
-    of_mesh, of_steps = discretisation_errors(problem, values)
+    of_mesh, of_steps = discretisation_errors(problem, *values)
     if of_mesh is not None:
         size = float(np.sqrt(np.sum(of_mesh**2) / problem.components))
         estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, of_mesh), mesh_over_noise=size)
@@ -189,11 +201,11 @@ class Discretisation(NamedTuple):
     time_step: np.ndarray | None  # (n,); None: unknown, or no scene has time steps
 
 
-def discretisation_errors(problem: Problem, values: Content) -> Discretisation:
+def discretisation_errors(problem: Problem, values: Content, finer: Finer | None = None) -> Discretisation:
     """Return the errors of the residuals due to the meshes and the time steps, for scenes with the parameters `values`.
-    The function warns if an error is unknown."""
+    The function warns if an error is unknown. `finer`: see `mesh_error_of`."""
     both = [
-        _errors_in(lj.with_parameters(scene, values), data)
+        _errors_in(lj.with_parameters(scene, values), data, finer)
         for scene, data in zip(problem.scenes, problem.data, strict=True)
     ]
     of_mesh, of_steps = (np.concatenate(rows) for rows in zip(*both, strict=True))
@@ -208,15 +220,17 @@ def discretisation_errors(problem: Problem, values: Content) -> Discretisation:
     return Discretisation(*(e if e is not None and np.all(np.isfinite(e)) else None for e in known))
 
 
-def _errors_in(scene: Scene, data: Displacements) -> tuple[np.ndarray, np.ndarray]:
+def _errors_in(scene: Scene, data: Displacements, finer: Finer | None) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of the n residuals of a scene due to the mesh (n,), and due to the time steps (n,). Unknown
     errors are NaN. If the mesh error is unknown, the function warns."""
     readings = partial(_all_differences, data, scene)
     try:
-        run = lj.simulate(scene, mesh_error=True)
-        assert run.mesh_error is not None
-        exact = replace(run, positions=run.positions + run.mesh_error.positions)
-        good = np.all(run.status == status.CONVERGED) and np.all(run.mesh_error.found)
+        run = lj.simulate(scene, mesh_error=finer is None)
+        error = run.mesh_error
+        if error is None:
+            error = mesh_error_of(prepared(scene), run.positions, run.reactions, run.pressure, finer)
+        exact = replace(run, positions=run.positions + error.positions)
+        good = np.all(run.status == status.CONVERGED) and np.all(error.found)
         of_mesh = np.where(good, readings(exact) - readings(run), np.nan)
         cause = "a step of the run failed, or the mesh is too coarse for an estimate"
     except InputError as e:

@@ -6,6 +6,7 @@ from dataclasses import replace as replace
 from typing import Any, TypedDict, TypeVar, Unpack, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 T = TypeVar("T")
@@ -116,3 +117,8 @@ def struct(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
     return made
+
+
+def in_precision(value: Any, dtype: Any) -> Any:
+    """Return a leaf of a pytree in the precision `dtype` if it is a real number or an array of real numbers."""
+    return jnp.asarray(value, dtype) if jnp.issubdtype(jnp.result_type(value), jnp.floating) else value

@@ -24,7 +24,7 @@ richer run. Each step of the richer run is linearised at its positions before th
 first run in this step.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -34,15 +34,16 @@ import numpy as np
 
 from liverjax.core import names
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, struct
+from liverjax.core.struct import in_precision, param, replace, struct
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.promotion import on_middles
+from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
 from liverjax.scenes.by_element import sponge_at_points
 from liverjax.scenes.enriched import enriched
 from liverjax.scenes.refined import REFINED, Within, can_be_refined, on_refined_mesh
 from liverjax.scenes.regions import changed_numbers, laws_of, refused_name
-from liverjax.scenes.scene import Scene
+from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation import automatic, tangent
 from liverjax.simulation.equations import (
     Equations,
@@ -109,7 +110,11 @@ class MeshError:
 
 
 def mesh_error_of(
-    scene: Scene, positions: jax.Array, reactions: jax.Array, pressure: jax.Array | None = None
+    scene: Scene,
+    positions: jax.Array,
+    reactions: jax.Array,
+    pressure: jax.Array | None = None,
+    finer: Callable[[TetMesh], Mapping[str, Any]] | None = None,
 ) -> MeshError:
     """Estimate the mesh error of a run that began at the reference positions.
 
@@ -119,6 +124,9 @@ def mesh_error_of(
         scene: the scene that was run (`liverjax.simulation.run.prepared`).
         positions, reactions: positions [m] and reactions [N] of the run (T, V, 3) with T steps.
         pressure: pressures [Pa] of the run (T, V), if it has a fluid.
+        finer: function of a richer mesh (E elements with Q integration points) -> numbers by dotted name, (Q, E) each.
+            They replace the numbers of the scene, which vary less than they should within an element. The estimate then
+            contains this error, too.
 
     Raises:
         InputError: the scene has another mesh than the run, or uses the one-step scheme, which has an additional error.
@@ -128,7 +136,12 @@ def mesh_error_of(
             f"result.positions has {positions.shape[1]} nodes, but the scene has {scene.mesh.number_of_nodes}: give "
             "the scene of the run"
         )
-    return estimated_error(scene, richer(scene), positions, reactions, pressure)
+    rich = richer(scene)
+    if finer is not None:
+        changed = with_parameters(rich.scene, finer(rich.scene.mesh))
+        precise = partial(in_precision, dtype=rich.scene.mesh.points.dtype)
+        rich = replace(rich, scene=jax.tree.map(precise, changed))
+    return estimated_error(scene, rich, positions, reactions, pressure)
 
 
 @struct

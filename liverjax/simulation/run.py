@@ -10,7 +10,7 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, param, replace, struct
+from liverjax.core.struct import Number, in_precision, param, replace, struct
 from liverjax.mesh.tetrahedra import with_points
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene
@@ -230,11 +230,7 @@ def _ready(scene: Scene) -> Scene:
         )
     scene = automatic.chosen(by_element(scene))
     if scene.solve.precision == "float32":
-        scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
+        scene = jax.tree.map(partial(in_precision, dtype=jnp.float32), scene)
     elif jnp.result_type(float) != jnp.float64:  # 64-bit mode is off
         raise InputError("precision = 'float64' needs JAX's 64-bit mode: unset JAX_ENABLE_X64, or use float32")
     return scene
-
-
-def _cast(value: Any, dtype: Any) -> Any:
-    return jnp.asarray(value, dtype) if jnp.issubdtype(jnp.result_type(value), jnp.floating) else value
