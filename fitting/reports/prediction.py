@@ -94,4 +94,6 @@ def sentence(found: Prediction) -> str:
     )
     if abs(found.factor - 1) > 0.005 * off:  # at least half of the error is one common factor
         told += f"; {found.factor:.3g} times the prediction would fit the test best"
-    return told + (f"; {share - inside} numbers outside the band are not counted" if inside < share else "")
+    outside = share - inside
+    also = "1 number outside the band is" if outside == 1 else f"{outside} numbers outside the band are"
+    return told + (f"; {also} not counted" if outside else "")

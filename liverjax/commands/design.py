@@ -10,7 +10,9 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("table", type=Path, metavar="PARAMETERS.csv")
     command.add_argument("range", nargs="+", metavar="NAME=LOW:HIGH", help="e.g. law.mu=500:1000")
     command.add_argument("--kind", default="sobol", metavar="KIND", help="grid | latin | sobol (default sobol)")
-    command.add_argument("--rows", type=int, default=64, metavar="N", help="number of rows (default 64)")
+    command.add_argument(
+        "--rows", type=int, default=64, metavar="N", help="number of rows, of a grid at most (default 64)"
+    )
     command.add_argument(
         "--seed", type=int, default=0, metavar="N", help="seed of the random numbers of latin and sobol (default 0)"
     )

@@ -65,7 +65,7 @@ def _tell(scene: "Scene", ran: "Waves") -> None:
             line += (
                 ", nothing moves"
                 if np.isnan(motion)
-                else f", mesh error about {motion:.2g} of the largest displacement"
+                else f", mesh error about {motion:.2g} of the displacement (root mean square)"
             )
             line += "" if np.isnan(force) else f" and {force:.2g} of the reaction forces"
         print(line)

@@ -11,7 +11,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -76,6 +76,18 @@ class Done(NamedTuple):
     crushed: dict[int, float]  # row number of a converged run -> final volume ratio J, if J is impossible in tissue
 
 
+def _check_names(scene: Scene, parameters: Path, names: Sequence[str]) -> None:
+    for name in names:
+        try:
+            shape = np.shape(numbers_at(scene, name))
+        except InputError as error:
+            raise InputError(f"{parameters}: {error}") from None
+        if shape:
+            raise InputError(
+                f"{parameters}: parameter {name!r} is a list in the scene file: add an index to the name, e.g. {name}.0"
+            )
+
+
 def read_sweep(
     scene_file: Path,
     parameters: Path,
@@ -91,9 +103,7 @@ def read_sweep(
     """
     scene = load_scene(scene_file)
     names, rows = read_table(parameters)
-    for name in names:
-        if np.shape(numbers_at(scene, name)):
-            raise InputError(f"parameter {name!r} is a list in the scene file: add an index to the name, e.g. {name}.0")
+    _check_names(scene, parameters, names)
     parts = {".".join(name.split(".")[:2]) for name in names}
     held = holding(scene, parts)
     for k, row in enumerate(rows.tolist()):

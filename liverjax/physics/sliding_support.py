@@ -44,7 +44,9 @@ class SlidingSupport(Physics):
         selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
         bounds.check_shape(f"{name}.normal", self.normal, (3,))
         if not self.axis and (self.normal is None or abs(np.linalg.norm(np.asarray(self.normal)) - 1) > 1e-6):
-            raise InputError(f"{name} normal = {self.normal} must be of length 1: divide this vector by its length")
+            raise InputError(
+                f"{name} normal = {self.normal} must be of length 1: give such a vector, for example [0, 0, 1]"
+            )
 
     def constrain(self, free: Free) -> Free:
         """Return the free directions without the normal of the plane at the nodes."""

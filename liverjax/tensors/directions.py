@@ -16,7 +16,8 @@ def components(direction: Numbers | None, like: Number) -> Vector:
     shape, elements = direction.shape, jnp.shape(like)
     if shape[-1:] != (3,) or (len(shape) > 1 and elements and shape[-2] != elements[-1]):
         raise InputError(
-            f"a direction has shape {shape}: give shape (3,), or one row of 3 per element, shape {(*elements, 3)}"
+            f"a fibre or sheet direction has shape {shape}: give shape (3,), or one row of 3 per element, shape "
+            f"{(*elements, 3)}"
         )
     return unit(tuple(direction[..., i] for i in range(3)))
 

@@ -122,7 +122,9 @@ class Obstacle(Physics):
                 f"{name} half_angle = {self.half_angle} must be below 90 degrees: use shape = 'plane' for 90"
             )
         if abs(np.linalg.norm(np.asarray(self.axis, float)) - 1) > 1e-6:
-            raise InputError(f"{name} axis = {self.axis} must be of length 1: divide this vector by its length")
+            raise InputError(
+                f"{name} axis = {self.axis} must be of length 1: give such a vector, for example [0, 0, 1]"
+            )
         history.check_times(self.times, self.history, name)
         if self.history is not None and np.ndim(self.history) == 2 and self.by is not None:
             raise InputError(f"{name} has both 'by' and a history of displacements: remove one of them")
