@@ -58,6 +58,11 @@ def pull(rng: np.random.Generator, seconds: float, dt: float = 0.5) -> joint.Tes
     return joint.through("pull", made[0], *readings(made[1], rng))
 
 
+def known(values: np.ndarray) -> list[float | None]:
+    """Return the values. Infinite values, of parameters that the data do not determine, become None."""
+    return [value if np.isfinite(value) else None for value in values.tolist()]
+
+
 def main(quick: bool) -> None:
     """Fit each combination of tests, and plot the intervals."""
     rng = np.random.default_rng(0)
@@ -71,10 +76,10 @@ def main(quick: bool) -> None:
             {
                 "tests": " + ".join(names),
                 "parameters": dict(zip(found.names, found.values.tolist(), strict=True)),
-                "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
-                "off_in_standard_errors": ((found.values - true) / found.standard_errors).tolist(),
-                "mesh_bias": None if found.mesh_bias is None else found.mesh_bias.tolist(),
-                "time_step_bias": None if found.time_step_bias is None else found.time_step_bias.tolist(),
+                "standard_errors": dict(zip(found.names, known(found.standard_errors), strict=True)),
+                "off_in_standard_errors": known((found.values - true) / found.standard_errors),
+                "mesh_bias": None if found.mesh_bias is None else known(found.mesh_bias),
+                "time_step_bias": None if found.time_step_bias is None else known(found.time_step_bias),
                 "chi2_per_reading": found.chi2 / found.components,
                 "readings": found.components,
                 "iterations": found.iterations,
@@ -91,7 +96,7 @@ def figure(rows: list[dict], true: np.ndarray) -> plt.Figure:
     fig, axis = plt.subplots(figsize=(8, 3.4), layout="constrained")
     shown = [r for r in rows if r["tests"] != "creep"]
     for k, (row, colour) in enumerate(zip(shown, COLOURS, strict=False)):
-        height = np.minimum(np.array(list(row["standard_errors"].values())) / true, 1.0)
+        height = np.fmin(np.array(list(row["standard_errors"].values()), float) / true, 1.0)
         label = f"{row['tests']} ({row['seconds']:.0f} s)"
         axis.bar(np.arange(len(true)) + 0.2 * (k - 1.5), height, 0.2, color=colour, label=label)
     names = ["G0", "g (30 s)", "g (1 s)", "g (0.05 s)", "30 s", "1 s", "0.05 s"]
