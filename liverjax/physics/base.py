@@ -55,7 +55,6 @@ class Tied(Protocol):
     @property
     def linear(self) -> bool:
         """Whether the positions of these nodes are a linear function of their unknowns."""
-        raise NotImplementedError
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
         """Project a nodal field (V, 3) onto the free motions of the nodes. For forces, x (V, 3) are the positions."""
@@ -138,7 +137,7 @@ class Step(NamedTuple):
     tolerance: Any  # tolerance of the residual, a constant in derivatives
     free: Free
     averaged: bool = False  # True (Newmark): the step uses the mean of the forces at its beginning and end
-    #: (V, 3) [m/s^2] acceleration at the end of the step in directions with a given motion; None: Newmark is not used
+    #: (V, 3) [m/s^2] acceleration at the end of the step where the motion is given (Newmark only); None: it is 0
     given: jax.Array | None = None
 
 

@@ -158,8 +158,9 @@ def _prescribed_acceleration(scene: Scene, physics: tuple[Physics, ...], step: S
 
     None if no motion is given, or for other methods, which do not need it.
     """
-    turned = any(nodes.linear for nodes in _with_tied(physics, step).free.tied)
-    if not step.averaged or not (scene.displaced or turned):
+    if not step.averaged:
+        return None
+    if not scene.displaced and not any(nodes.linear for nodes in _with_tied(physics, step).free.tied):
         return None
 
     def place(k: Number) -> jax.Array:

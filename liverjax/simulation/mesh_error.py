@@ -124,9 +124,9 @@ def mesh_error_of(
         scene: the scene that was run (`liverjax.simulation.run.prepared`).
         positions, reactions: positions [m] and reactions [N] of the run (T, V, 3) with T steps.
         pressure: pressures [Pa] of the run (T, V), if it has a fluid.
-        finer: function of a richer mesh (E elements with Q integration points) -> numbers by dotted name, (Q, E) each.
-            They replace the numbers of the scene, which vary less than they should within an element. The estimate then
-            contains this error, too.
+        finer: function of a richer mesh (E elements with Q integration points) -> numbers by dotted name, (Q, E) each,
+            or (E,) if Q = 1. They replace the numbers of the scene, which vary less than they should within an element.
+            The estimate then contains this error, too.
 
     Raises:
         InputError: the scene has another mesh than the run, or uses the one-step scheme, which has an additional error.
