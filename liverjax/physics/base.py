@@ -26,7 +26,7 @@ elements.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +58,12 @@ class Tied(Protocol):
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
         """Project a nodal field (V, 3) onto the free motions of the nodes. For forces, x (V, 3) are the positions."""
+
+    def at(self, x: jax.Array) -> "Tied":
+        """Return the same nodes with the directions of their motions at positions x (V, 3)."""
+
+    def turned(self, field: jax.Array, other: Self) -> jax.Array:
+        """Return `field` (V, 3), in which the motions of these nodes have the directions of `other`, the same nodes."""
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
         """Return `field` (V, 3), in which the rows of these nodes contain the unknowns of their motion to x (V, 3).

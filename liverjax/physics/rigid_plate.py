@@ -207,6 +207,14 @@ class Plate(NamedTuple):
         """Project a field (V, 3) onto the plate's free motions. For a field of forces, x (V, 3) are the positions."""
         return self.spread(field, *self.amplitudes(field, self._arms(self.carrier) if x is None else self.arms(x)))
 
+    def at(self, x: jax.Array) -> "Plate":
+        """Return the plate with the directions of its motions at positions x (V, 3)."""
+        return self._replace(carrier=x[self.plate.nodes])
+
+    def turned(self, field: jax.Array, other: "Plate") -> jax.Array:
+        """Return `field` (V, 3), in which the plate's motions have the directions of `other`, the same plate."""
+        return other.spread(field, *self.amplitudes(field, self._arms(self.carrier)))
+
     def given(self, s: Number) -> jax.Array:
         """Return the given angle [rad] or torque [N m] at fraction s of the step."""
         return self.before + s * (self.after - self.before)

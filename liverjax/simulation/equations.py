@@ -3,6 +3,7 @@
 Each physics object of the scene (elasticity, loads, contact, viscosity …) has at most one force term.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -298,6 +299,29 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
     return jnp.concatenate([q, pressure / e.mixed.unit])
 
 
+def in_directions_at(
+    e: Equations, x: jax.Array | None, make: Callable[[Equations], Callable[[jax.Array], jax.Array]]
+) -> Callable[[jax.Array], jax.Array]:
+    """Return the function of flat vectors (3 V,) that `make` returns for e, with the motions of rotating nodes at x.
+
+    Nodes that rotate together move along circles, so the directions of their motions change during a step. Vectors of
+    unknowns have the directions at the beginning of the step. At positions x (V, 3), the tangent has those at x.
+    """
+    if x is None or all(nodes.linear for nodes in e.free.tied):
+        return make(e)
+    there = tuple(nodes.at(x) for nodes in e.free.tied)
+    function = make(e._replace(free=e.free._replace(tied=there)))
+
+    def turned(vector: jax.Array, old: tuple, new: tuple) -> jax.Array:
+        n = 3 * e.mesh.number_of_nodes
+        field = jnp.stack(columns(vector[:n]), axis=-1)
+        for own, other in zip(old, new, strict=True):
+            field = own.turned(field, other)
+        return jnp.concatenate([flat(field), vector[n:]])
+
+    return lambda vector: turned(function(turned(vector, e.free.tied, there)), there, e.free.tied)
+
+
 @jax.jit  # so that JAX evaluates this function only once for all its calls in a compiled program
 def forces(
     e: Equations, q: jax.Array, s: Number, guess: Guess | None = None, pressure: jax.Array | None = None
@@ -357,7 +381,18 @@ def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.A
     """
     volume: Any = e.volume
     f = forces(e, q, jnp.ones((), q.dtype), None, volume.in_force(pressure))
-    return flat(e.free.vectors(f.total, f.x)), volume.balance(e.mesh, pressure, determinant(f.F))
+    return flat(_along_free(e, f)), volume.balance(e.mesh, pressure, determinant(f.F))
+
+
+def _along_free(e: Equations, f: Forces) -> jax.Array:
+    """Forces (V, 3) [N] in the directions in which the nodes can move.
+
+    The rounding of the first projection leaves a small part of each reaction in the directions that are not free. No
+    motion can balance this part, and a linear solve for a very small derivative would never converge. So the forces
+    are projected twice.
+    """
+    along = e.free.vectors(f.total, f.x)
+    return along if e.free.normals is None and not e.free.tied else e.free.vectors(along)
 
 
 def residual(
@@ -375,7 +410,7 @@ def residual(
         at_work = at_work + jnp.linalg.norm(force)
     if f.isochoric is not None:
         at_work = (1 - e.mixed.counted) * jnp.linalg.norm(f.isochoric) + e.mixed.counted * at_work
-    r, at_work = flat(e.free.vectors(f.total, f.x)), jax.lax.stop_gradient(e.noise + at_work)
+    r, at_work = flat(_along_free(e, f)), jax.lax.stop_gradient(e.noise + at_work)
     if e.mixed is not None:
         r = jnp.concatenate([r, e.mixed.unit * e.mixed.balance(e.mesh, f.pressure, determinant(f.F))])
     return r, at_work, f.pressure

@@ -22,15 +22,12 @@ from liverjax.laws.terms import invariant_terms
 from liverjax.mesh.adjacency import PAIRS
 from liverjax.physics.base import Free, VolumeStress
 from liverjax.simulation import mixed_system
-from liverjax.simulation.equations import Equations
+from liverjax.simulation.equations import Equations, in_directions_at
 from liverjax.solvers import attached, block_matrix, clusters, direct, point_matrix
 from liverjax.solvers.attached import Attached, Between
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.clusters import Inverses
-from liverjax.solvers.krylov import (
-    conjugate_gradients,
-    stabilised_biconjugate_gradients,
-)
+from liverjax.solvers.krylov import conjugate_gradients, stabilised_biconjugate_gradients
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.solvers.preconditioner import Coarse, coarse, coarse_of_product, corrected, correction, worthwhile
 from liverjax.tensors.matrices import (
@@ -154,7 +151,7 @@ class Tangent(NamedTuple):
     inverse: Inverses  # inverses of the diagonal blocks of the matrix
     vertices: Inverses | None  # for quadratic elements: `inverse` of linear elements with the same vertices
     slow: Coarse
-    x: jax.Array | None  # (V, 3) positions of the assembly, for non-conservative forces
+    x: jax.Array | None  # (V, 3) positions of the assembly; None: conservative forces, and no nodes rotate together
     s: Any  # fraction of the step at the assembly
     follows: jax.Array | None  # 1 if K contains the tangent of non-conservative forces, else 0
     attached: tuple[Between, ...] = ()  # stiffness between nodes that is not in the matrix
@@ -180,12 +177,10 @@ def tangent(
     name, taken = (kind, None) if isinstance(kind, str) else kind
     matrix, inverse, below, A, more = _assembled(e, pressure, (x, s), taken, name)
 
-    def new() -> Coarse:
-        return _coarse(e, A)
-
-    slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
-    # Non-conservative forces need the positions at which the tangent was assembled.
-    where, part, follows = (None, None, None) if e.conservative else (x, s, _true(kind, x.dtype))
+    slow = _coarse(e, A) if near is None else jax.lax.cond(near[0], lambda: near[1].slow, lambda: _coarse(e, A))
+    # Non-conservative forces and nodes that rotate together need the positions at which the tangent was assembled.
+    part, follows = (None, None) if e.conservative else (s, _true(kind, x.dtype))
+    where = None if e.conservative and all(nodes.linear for nodes in e.free.tied) else x
     eliminates = ~_true(kind, bool) if kind != "true" and eliminates_pressures(e) else None
     K = Tangent(matrix, inverse, below, slow, where, part, follows, more, eliminates=eliminates)
     if not _thin(e):
@@ -342,7 +337,7 @@ def _coarse_mask(free: Free) -> jax.Array:
 
 def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]:
     """Preconditioner as a function of flat vectors (3 V,): inverse diagonal blocks plus the coarse solution."""
-    return _with_pressures(e, K, _motions(e, K))
+    return in_directions_at(e, K.x, lambda e: _with_pressures(e, K, _motions(e, K)))
 
 
 def _motions(e: Equations, K: Tangent) -> Callable:
@@ -406,6 +401,10 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 
     If `exactly` is false, pressures that depend on the positions are computed approximately.
     """
+    return in_directions_at(e, K.x, lambda e: _product(e, K, exactly))
+
+
+def _product(e: Equations, K: Tangent, exactly: bool) -> Callable[[jax.Array], jax.Array]:
     A, volume, n = K.matrix, volume_with_pressures(e), 3 * e.mesh.number_of_nodes
 
     def apply(v: jax.Array) -> jax.Array:
