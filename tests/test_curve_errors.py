@@ -11,6 +11,7 @@ from fitting.fits import stress_stretch
 from fitting.fits.honesty.wrong_columns import structured_curves
 from fitting.methods.noise.uneven_noise import growing_root, uneven_root
 from fitting.readers import curves
+from fitting.reports import curves_report
 from liverjax.laws import homogeneous
 
 pytestmark = pytest.mark.quick_to_compile
@@ -154,6 +155,23 @@ def test_laws_that_tie_are_named_with_their_moduli():
     (told,) = stress_stretch.tied_laws([best, other, far], "curves")
     assert told.startswith("b fit the curves as well as neo_hookean does") and "with G0 from 7" in told
     assert "to 900 Pa" in told and not stress_stretch.tied_laws([best, far], "curves")
+
+
+def test_laws_with_too_many_parameters_for_the_points_are_told():
+    """Four points: the criterion of laws with two parameters is infinite, so a law with 20 % of error came first, and
+    the others were in the order of the registry, without a message."""
+    (candidate,) = stress_stretch.candidates("neo_hookean")
+    first = stress_stretch.fit(candidate, synthetic(KNOWN["neo_hookean"], 0.01))
+    best = first._replace(mean_relative_error=0.2, bic=-9.0)
+    near, far = (
+        first._replace(label=n, aicc=np.inf, bic=b, values=np.ones(2), mean_relative_error=0.001)
+        for n, b in (("near", -30.0), ("far", -5.0))
+    )
+    ordered = curves_report.best_first([far, near, best])
+    assert [f.label for f in ordered] == ["neo_hookean", "near", "far"]
+    (told,) = stress_stretch.too_few_points(ordered, 4)
+    assert told.startswith("4 points are too few to compare laws with 2 or more parameters by AICc, so neo_hookean")
+    assert "20 %, although near has 0.1 %" in told and not stress_stretch.too_few_points([best, far], 4)
 
 
 def test_a_factor_of_a_test_is_no_misfit_of_the_law():

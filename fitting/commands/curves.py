@@ -88,7 +88,9 @@ def run(options: argparse.Namespace) -> int:
     for fit in curves_report.best_first(fits):
         for sentence in fit.warnings:
             print(f"warning: {fit.label}: {sentence}", file=sys.stderr)
-    tied = stress_stretch.tied_laws(curves_report.best_first(fits), "curves")
+    ordered = curves_report.best_first(fits)
+    tied = stress_stretch.tied_laws(ordered, "curves")
+    tied += stress_stretch.too_few_points(ordered, sum(len(c.stress) for c in found))
     told = (*stress_stretch.unfollowed(found, fits), *stress_stretch.loaded_at_rest(found), *structured, *tied)
     for sentence in told:
         print(f"warning: {sentence}", file=sys.stderr)

@@ -415,3 +415,18 @@ def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
         f"to {max(moduli):.4g} Pa. The {data} cannot decide between these laws, which differ beyond the measured "
         "strains"
     ]
+
+
+def too_few_points(fits: Sequence[LawFit], points: int) -> list[str]:
+    """Return a warning if laws with more parameters may describe the curves better than the best law, but the curves
+    have too few points for the criterion of these laws. The best law comes first in `fits`."""
+    best = fits[0]
+    closer = [f for f in fits if not np.isfinite(f.aicc) and f.bic < best.bic]
+    if not closer:
+        return []
+    nearest = min(closer, key=lambda f: f.bic)
+    return [
+        f"{points} points are too few to compare laws with {min(len(f.values) for f in closer)} or more parameters by "
+        f"AICc, so {best.label} comes first with an error of {100 * best.mean_relative_error:.2g} %, although "
+        f"{nearest.label} has {100 * nearest.mean_relative_error:.2g} %: give more points"
+    ]

@@ -286,10 +286,12 @@ def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
 def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix and the right-hand side of a linear least-squares problem for the modulus of `apparent`, with
     relative residuals. The unknowns are the equilibrium modulus and the strengths of modes with the relaxation `times`
-    [s]."""
+    [s]. Responses below the lower bound of their scale are mostly noise and have less weight."""
     modulus, at = apparent(test)
+    rows = thinned(test)
+    weights = np.minimum(np.abs(test.answer[rows]) / _scales(test, rows), 1.0)
     A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
-    return A / modulus[:, None], np.ones(len(at))
+    return A * (weights / modulus)[:, None], weights
 
 
 def _starts(test: TimeTest, modes: int, kind: Kind) -> np.ndarray:

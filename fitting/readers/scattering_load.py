@@ -16,7 +16,7 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
     of a sensor as a change of the load.
     """
     size, noise = float(np.max(np.abs(driven))), noise_of_series(driven)
-    if not noise > QUIET * size:
+    if not min(noise, _from_neighbours(time, driven)) > QUIET * size:
         return driven, []
     level = np.median(driven[np.abs(driven) > size / 2])
     near = np.abs(driven - level) <= 5 * noise
@@ -46,6 +46,18 @@ def without_scatter(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np
     held[first:] = np.mean(driven[first:])
     held[:rest] = rest_level
     return held, [f"{told}: from {time[first]:.3g} s on, the load is constant, and its mean is used"]
+
+
+def _from_neighbours(time: np.ndarray, driven: np.ndarray) -> float:
+    """Return the scatter of the load, from the median distance of a row from the straight line between its neighbours.
+
+    Irregular times of a straight ramp do not count as scatter here, as they do in `noise_of_series`.
+    """
+    if len(time) < 3:
+        return 0.0
+    share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+    off = driven[1:-1] - (1 - share) * driven[:-2] - share * driven[2:]
+    return float(np.median(np.abs(off) / np.sqrt(1 + share**2 + (1 - share) ** 2))) / 0.6745
 
 
 #: A straight line replaces a ramp only if the ramp has _ROWS_OF_RAMP rows or more, and if the misfit of the line is

@@ -78,7 +78,7 @@ class TimeTest(NamedTuple):
         if self.rise == GIVEN:
             return np.zeros(0, int)
         shown = np.flatnonzero(np.isfinite(self.answer))  # added rows may have no response
-        return shown[_rows_of_jumps(self.driven[shown])]
+        return shown[_rows_of_jumps(self.time[shown], self.driven[shown])]
 
     @property
     def answers_at_once(self) -> bool:
@@ -204,7 +204,7 @@ def from_rest(
     Raises:
         InputError: `ramp` contradicts the rows: they already show how the load rose, or the rise took less time.
     """
-    size, rows = np.abs(driven), _rows_of_jumps(driven)
+    size, rows = np.abs(driven), _rows_of_jumps(time, driven)
     loaded = size[0] > AT_REST * np.max(size)
     still = loaded and bool(np.all(np.abs(driven[1:6] - driven[0]) <= _JUMP * np.max(size)))
     early = ramp is not None and loaded and (ramp == 0 or (still and 0 < ramp <= time[0]))  # complete at the first row
@@ -248,19 +248,27 @@ def with_known_rise(test: TimeTest, time: np.ndarray, driven: np.ndarray, ramp: 
     return test._replace(rise=BEFORE_ROWS) if before else test
 
 
-#: The load jumps between two rows if it changes by more than _JUMP times its largest value, and if the changes before
-#: and after are below _COMPLETE times this change.
+#: The load jumps between two rows if it changes by more than _JUMP times its largest value, and if its changes before
+#: and after are below _COMPLETE times this change. See `_rows_of_jumps` for irregular times.
 _JUMP, _COMPLETE = 0.05, 0.5
 #: Duration of a step, as a fraction of the time between two rows. It is so short that it resolves no relaxation time.
 AT_ONCE = 1e-4
 
 
-def _rows_of_jumps(driven: np.ndarray) -> np.ndarray:
-    """Return the indices (j,) of the rows at the ends of jumps. No row shows how the load changed in a jump."""
-    change = np.abs(np.diff(driven, prepend=driven[0], append=driven[-1]))
-    before, own, after = change[:-2], change[1:-1], change[2:]
-    least = _JUMP * np.max(np.abs(driven))
-    return 1 + np.flatnonzero((own > least) & (np.maximum(before, after) < _COMPLETE * own))
+def _rows_of_jumps(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
+    """Return the indices (j,) of the rows at the ends of jumps. No row shows how the load changed in a jump.
+
+    The changes before and after a jump are small within equal times, or both their sizes and their rates are small
+    between the neighbouring rows. So a straight ramp at irregular times has no jump.
+    """
+    begin, end = time[:-1], time[1:]
+    own, least = np.abs(np.diff(driven)), _JUMP * np.max(np.abs(driven))
+    before, after = np.interp(2 * begin - end, time, driven), np.interp(2 * end - begin, time, driven)
+    alone = np.maximum(np.abs(driven[:-1] - before), np.abs(after - driven[1:])) < _COMPLETE * own
+    sizes = np.stack([own, own / (end - begin)])
+    beside = np.pad(sizes, ((0, 0), (1, 1)))
+    alone |= np.all(np.maximum(beside[:, :-2], beside[:, 2:]) < _COMPLETE * sizes, axis=0)
+    return 1 + np.flatnonzero((own > least) & alone)
 
 
 def rows_before_jumps(rows: np.ndarray, ramp: float, time: np.ndarray, *columns: np.ndarray) -> tuple:

@@ -32,7 +32,7 @@ RAW_TORQUE_UNITS = {
 _PER_PA = {f"1/{unit}": 1 / factor for unit, factor in MODULUS_UNITS.items()} | {"Pa-1": 1.0, "Pa^-1": 1.0}
 #: Units of relaxation and creep tests; the first unit of each quantity is the default.
 TIME_TEST_UNITS = {
-    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "ms": 1e-3}
+    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "ms": 1e-3, "us": 1e-6}
     | {"sec": 1.0, "seconds": 1.0, "minutes": 60.0, "hr": 3600.0, "hours": 3600.0},
     "modulus": {"Pa": 1.0} | MODULUS_UNITS,
     "tensile modulus": {"Pa": 1.0} | MODULUS_UNITS,

@@ -29,8 +29,9 @@ _stress = jax.jit(partial(homogeneous.nominal_stress, constant=True))
 
 
 def best_first(fits: list[LawFit]) -> list[LawFit]:
-    """Sort the laws by Akaike's criterion, corrected for few points, with the best law first."""
-    return sorted(fits, key=lambda f: f.aicc)
+    """Sort the laws by Akaike's criterion, corrected for few points, with the best law first. Laws that have too many
+    parameters for this criterion are last."""
+    return sorted(fits, key=lambda f: (f.aicc, f.bic))
 
 
 def summary(fit: LawFit) -> Content:

@@ -32,7 +32,10 @@ def with_rise_of_load(fit: TimeFit, test: TimeTest, prony: TimeFit) -> TimeFit:
     own = prony if fit.parameters is not None else fit
     if not len(test.jumps) or not own.converged:
         return fit
-    step = time_tests.refitted(own, with_steps(test))
+    steps = with_steps(test)
+    if steps.used.sum() <= len(own.solution.u):
+        return fit
+    step = time_tests.refitted(own, steps)
     values, moved = own.uncertainty.values, step.uncertainty.values - own.uncertainty.values
     if not step.converged or not abs(moved[0]) > SHOWN * own.uncertainty.standard_errors[0]:
         return fit
@@ -63,8 +66,9 @@ def with_steps(test: TimeTest) -> TimeTest:
         last = shown[np.searchsorted(shown, row) - 1]
         driven[last + 1 : row] = driven[last]
     time, driven, answer = rows_before_jumps(jumps, 0.0, test.time, driven, test.answer)
-    used = np.isin(time, test.time[test.used])
-    return test._replace(time=time, driven=driven, answer=answer, used=used)
+    steps = test._replace(time=time, driven=driven, answer=answer, used=np.isin(time, test.time[test.used]))
+    # The load may begin later now. The responses between both starts then belong to rest.
+    return steps._replace(used=steps.used & ((time <= test.begun) | (time > steps.begun)))
 
 
 def _assumed_between_rows(test: TimeTest) -> str:
