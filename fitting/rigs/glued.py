@@ -96,7 +96,10 @@ def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
 
 def _changed_by_mesh(rig: Rig, run: lj.Result) -> jax.Array:
     assert run.mesh_error is not None
-    return run.mesh_error.change(lambda x, force: _reading(rig, x, force), run)[1]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="the mesh error is not reliable")  # then it is NaN
+        change = run.mesh_error.change(lambda x, force: _reading(rig, x, force), run)[1]
+    return jnp.where(run.mesh_error.found, change, jnp.nan)
 
 
 def reading_errors(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, np.ndarray]:

@@ -78,24 +78,28 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     size = float(np.linalg.norm(u, axis=1).max())
     error = float(np.linalg.norm(np.asarray(result.mesh_error.positions[-1]), axis=1).max())
     nothing = _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points))
-    if size <= nothing and error <= nothing and np.all(np.asarray(result.mesh_error.found)):
+    found = np.asarray(result.mesh_error.found)
+    if size <= nothing and error <= nothing and np.all(found):
         return "the mesh error is zero, because the body does not move"
     part = (
         f"{100 * error / size:.2g} % of the largest displacement ({size:.3g} m)"
         if size > nothing
         else "although the run shows no displacement"
     )
-    said = f"mesh error (estimate, last step{{}}): nodal positions are wrong by up to {error:.2g} m, {part}{{}}"
+    begin = "mesh error (estimate, last step{})"
+    if not found[-1]:
+        begin = (
+            "mesh error not reliable, because no estimate was found for the last step, or it inverts elements (rough "
+            "size{})"
+        )
+    said = f"{begin}: nodal positions are wrong by up to {error:.2g} m, {part}{{}}"
     said = said.format(*_pressure_errors(result))
     single = next((p.section for p in scene.physics if p.pulls_single_nodes()), None)
     if single is not None:
         said += f". Forces of [[{single}]] at single nodes depend on the mesh; the estimate does not include this"
-    if not np.all(np.asarray(result.mesh_error.found)):
-        return (
-            f"{said}; at some steps no estimate was found, or the estimate inverts elements: the mesh is too coarse "
-            "for a reliable estimate"
-        )
-    if error <= _SMALL * size:
+    if not np.all(found[:-1]):
+        said += f". At {int(np.sum(~found[:-1]))} earlier steps no estimate was found, or the estimate inverts elements"
+    if error <= _SMALL * size and found[-1]:
         return said
     return f"{said}: use {'order = 2 in [mesh], or a finer mesh' if scene.mesh.order == 1 else 'a finer mesh'}"
 

@@ -24,6 +24,7 @@ richer run. Each step of the richer run is linearised at its positions before th
 first run in this step.
 """
 
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -87,7 +88,10 @@ _HALVINGS = 4
 
 @struct
 class MeshError:
-    """Estimated mesh error of a run of T steps: how the result would change on an infinitely fine mesh."""
+    """Estimated mesh error of a run of T steps: how the result would change on an infinitely fine mesh.
+
+    The numbers of a step that was not `found` show at most the size of its error.
+    """
 
     positions: jax.Array = param("m", "(T, V, 3)")
     reactions: jax.Array = param("N", "(T, V, 3)")
@@ -99,13 +103,21 @@ class MeshError:
     def change(self, of: Callable[[jax.Array, jax.Array], Any], result: Any) -> tuple[Any, Any]:
         """Return a quantity of interest and its estimated change on an infinitely fine mesh.
 
-        The sum of both is the corrected quantity. The error bar is `BAR` times the absolute value of the change.
+        The sum of both is the corrected quantity. The error bar is `BAR` times the absolute value of the change. A
+        warning is given if a step was not `found` (not inside jit).
 
         Args:
             of: function (positions (T, V, 3), reactions (T, V, 3)) -> the quantity, as a pytree of numbers. The change
                 is the derivative of this function in the direction of the estimated error.
             result: `Result` of the run.
         """
+        if not isinstance(self.found, jax.core.Tracer) and not np.all(self.found):
+            steps = (1 + np.flatnonzero(~np.asarray(self.found))).tolist()
+            warnings.warn(
+                f"the mesh error is not reliable in {len(steps)} of {len(self.found)} steps (the first is step "
+                f"{steps[0]}), because its solves did not converge or it inverts elements: use a finer mesh",
+                stacklevel=2,
+            )
         return jax.jvp(of, (result.positions, result.reactions), (self.positions, self.reactions))
 
 
