@@ -232,6 +232,12 @@ def test_curves_of_any_encoding_are_read_below_their_title(encoding, tmp_path):
         ("test,shear,nominal_stress_Pa\n" + "".join(f"simple_shear,{k},{k}\n" for k in (0, 10, 30)), "2 % as 0.02"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,1,05,0,143\nuniaxial,1,1,0,3\n", "5 cells under 3 headings"),
         ("test,stretch,force_N\nuniaxial,1,1\n", "no column nominal_stress_Pa"),
+        ("test,stretch,stretch,nominal_stress_Pa\nuniaxial,1,2,1\n", "has two columns stretch: remove one"),
+        ("test,stretch,nominal_stress_Pa,nominal_stress_Pa\nuniaxial,1,2,1\n", "two columns nominal_stress_Pa"),
+        (
+            "test,stretch,nominal_stress_Pa,nominal_stress_kPa\nuniaxial,1,2,1\n",
+            "two columns of one stress, nominal_stress_Pa and nominal_stress_kPa: remove one",
+        ),
         ("test,stretch,nominal_stress_kPa\nuniaxial,0.9,1\nuniaxial,1.1,-1\nuniaxial,1.2,-2\n", "point against"),
     ],
 )

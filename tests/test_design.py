@@ -26,6 +26,8 @@ def test_unusable_designs_are_refused(tmp_path, capsys):
     for given, sentence in (
         (["law.mu=5"], "is not a range"),
         (["law.mu=5:1"], "does not rise"),
+        (["law.mu=-1e308:1e308"], "too wide"),
+        (["a,b=1:2"], "contains no dotted name"),
         (["a=1:2", "a=1:2"], "two"),
         (["a=1:2", "--seed", "-1"], "--seed -1 is negative"),
         (["a=1:2", "b=1:2", "--kind", "grid", "--rows", "3"], "too few for a grid of 2 parameters: give 4"),

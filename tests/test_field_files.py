@@ -33,6 +33,7 @@ _BAD = {
     "node,ux,uy,uz\n5,1e-3,0,O.001\n6,1e-3,,0": "row 1: uz = 'O.001' is not a number; correct this cell, or",
     "node,ux,uy,uz\n# points\n5,1e-3,,0\n\n6,0.001mm,0,0": "row 2: ux = '0.001mm' is not a number",
     "node,ux,uy,uz\n5,1e-3,,0\n6,1e-3,0,0\n5,1e-3,,0\n6,1e-3,0,0": "row 3 repeats row 1 (2 of 4 rows are copies)",
+    "x,y,z,ux,ux,uy,uz\n0.01,0.02,0.02,0,0,0,0": "has two columns ux: remove one of them",
     "": "is empty: export the file again",
     "node;ux;uy;uz\n5;1e-3;0;0;7": "row 1 has 5 cells under 4 headings",
 }
@@ -58,6 +59,8 @@ def test_bad_displacements_are_one_sentence(tmp_path, content, capsys):
         (["--noise", "1e-4", "--name", "body.gravity"], "can multiply only one number"),
         (["--noise", "1e-4", "--unit", "mile"], "--unit 'mile' is not known"),
         (["--noise", "1e-4", "--length", "-1"], "--length -1 must be a finite number above 0"),
+        (["--noise", "1e-4", "--parameters", "law.mu", "--sphere"], "--sphere is for maps and cannot be used with"),
+        (["--noise", "1e-4", "--parameters", "law.mu", "--iterations", "9"], "--iterations is for maps"),
     ],
 )
 def test_bad_options_are_one_sentence(tmp_path, more, words, capsys):

@@ -132,8 +132,10 @@ def test_what_moves_in_time_is_no_harmonic_motion(tmp_path, capsys, part, words)
         ('frequencies = [60.0]\nreduced = "model.h5"\n', [], "reduced cannot be used with kind = 'harmonic'"),
         ("frequencies = [-60.0]\n", [], "frequencies"),
         ("frequencies = [60.0]\n", ["--png"], "--png cannot be used with [solve] kind = 'harmonic'"),
+        ("frequencies = [60.0]\n", ["--every", "0"], "--every cannot be used with [solve] kind = 'harmonic'"),
         ("frequencies = [60.0]\ndt = 0.01\n", [], "[solve] dt cannot be used with [solve] kind = 'harmonic'"),
-        ("frequencies = [60.0]\n", ["--about", "none.h5"], "contains no positions"),
+        ("frequencies = [60.0]\n", ["--about", "none.h5"], "none.h5 does not exist"),
+        ("frequencies = [60.0]\n", ["--about", __file__], "contains no positions"),
     ],
 )
 def test_bad_scene_files_are_refused(tmp_path, capsys, line, more, words):

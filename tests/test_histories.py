@@ -159,6 +159,8 @@ def test_bad_histories_are_refused(table, words):
         (b"time\tfactor\n0\t1\n1\t2\n", "has one column"),
         (b"\xff\xfe\x00", "is not a text file"),
         (b"time,force\n0,0\n1,1\n", "has the columns"),
+        (b"time,factor,factor\n0,0,1\n1,1,0\n", "has two columns factor: remove one"),
+        (b"time,factor,x,y,z\n0,0,1,1,1\n1,1,0,0,0\n", "has both time,factor and time,x,y,z: give one"),
         (b"time,factor\n0,zero\n1,1\n", "must have finite numbers"),
         (None, r"cannot be read \(No such file or directory\): give a CSV file with columns"),
     ],

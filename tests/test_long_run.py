@@ -230,3 +230,34 @@ def test_a_killed_process_loses_no_finished_part(scene, tmp_path):
     process.wait()
     assert subprocess.run([*command, "--resume"]).returncode == 0
     assert len(_numbers(tmp_path / "result.h5")["times"]) == 10
+
+
+def test_a_kill_while_parts_are_removed_leaves_no_parts_of_unknown_input(tmp_path, monkeypatch):
+    """The file with the input went first, and --resume put the remaining parts into the run of another scene."""
+    folder = tmp_path / "result.h5.parts"
+    for kept in range(4):
+        resumable_parts.make_folder(folder)
+        resumable_parts.same({"scene": "first"}, folder / "run.json")
+        for k in range(3):
+            resumable_parts.write(resumable_parts.part(folder, k), {"x": np.zeros(1)})
+        unlink, left = Path.unlink, 4 - kept
+
+        def killed(file, missing_ok=False, unlink=unlink):
+            nonlocal left
+            if not left:
+                raise KeyboardInterrupt
+            left -= 1
+            unlink(file, missing_ok)
+
+        with monkeypatch.context() as patched, pytest.raises((KeyboardInterrupt, OSError)):
+            patched.setattr(Path, "unlink", killed)
+            resumable_parts.remove(folder)
+            raise OSError  # all files were removed
+        if folder.exists():
+            with pytest.raises(lj.InputError, match="not the same scene"):
+                resumable_parts.same({"scene": "second"}, folder / "run.json")
+            resumable_parts.remove(folder)
+    folder.mkdir()
+    resumable_parts.write(resumable_parts.part(folder, 0), {"x": np.zeros(1)})
+    with pytest.raises(lj.InputError, match=r"contains parts, but not the file run\.json with their input"):
+        resumable_parts.same({"scene": "second"}, folder / "run.json")

@@ -357,6 +357,8 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
     assert main(command(files, "--resume")) == 0  # nothing was lost
     assert main(command(files)) == 2
     assert "exists already" in capsys.readouterr().err
+    assert main(["sweep", *command(files)[1:3], "--out", str(files)]) == 2
+    assert "is a folder: name a file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,8 @@ from liverjax.simulation import gradients
 
 #: A note is given if the error of the mesh or of the time steps, divided by the noise, exceeds this value.
 _TOLD = 0.3
+#: Defaults of --name and --iterations.
+_NAME, _ITERATIONS = "law.mu", 60
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
@@ -39,7 +41,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="SCENE.toml DISPLACEMENTS.csv",
         help="scene, and CSV file with the columns x,y,z (or node),ux,uy,uz[,time][,sd]",
     )
-    command.add_argument("--name", default="law.mu", metavar="NAME", help="parameter to map (default law.mu)")
+    command.add_argument("--name", metavar="NAME", help=f"parameter to map (default {_NAME})")
     command.add_argument(
         "--length", type=float, metavar="M", help="correlation length [m] (default: length of the body / 10)"
     )
@@ -52,7 +54,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--noise", type=float, metavar="M", help="standard deviation [m] if a file has no column sd")
     command.add_argument("--unit", default="m", help="unit of the lengths in the displacement files (default m)")
     command.add_argument(
-        "--iterations", type=int, default=60, help="maximum number of iterations for each prior (default 60)"
+        "--iterations", type=int, help=f"maximum number of iterations for each prior (default {_ITERATIONS})"
     )
     command.add_argument("--resume", action="store_true", help="continue from the last iteration written to --out")
     command.add_argument(
@@ -86,6 +88,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
     names = options.parameters.split(",")
+    for option in ("name", "length", "iterations", "sphere", "resume"):
+        if getattr(options, option):
+            raise InputError(f"--{option} is for maps and cannot be used with --parameters: remove one of both")
     for name in names:
         numbers_at(problem.scenes[0], name)
         if names.count(name) > 1:
@@ -102,12 +107,12 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
 
 
 def _map(options: argparse.Namespace, problem: Problem) -> int:
-    mesh = problem.scenes[0].mesh
-    field.start_of(problem, options.name)
-    given = int(field.given_by_regions(problem, options.name)[0].sum())
+    mesh, name = problem.scenes[0].mesh, options.name or _NAME
+    field.start_of(problem, name)
+    given = int(field.given_by_regions(problem, name)[0].sum())
     if given:
         print(
-            f"note: {given} of {mesh.number_of_elements} elements keep the {options.name} of their [[region]]: the map "
+            f"note: {given} of {mesh.number_of_elements} elements keep the {name} of their [[region]]: the map "
             "has no value there; to map these elements too, remove this parameter from the region",
             file=sys.stderr,
         )
@@ -117,12 +122,14 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     length = options.length or float(np.ptp(np.asarray(mesh.points), axis=0).max()) / 10
     file = options.out / "progress.h5"
     bar, told = cost_bar("iterations")
-    how = field.MapOptions(max_iterations=options.iterations, file=file, resume=options.resume, progress=told)
+    how = field.MapOptions(
+        max_iterations=options.iterations or _ITERATIONS, file=file, resume=options.resume, progress=told
+    )
     problem, beside = scene_numbers.with_discretisation_as_noise(problem)
     _tell_sizes(problem, beside)
     with bar, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="the effect of the (mesh error|time step)")  # a second time
-        found = field.estimate(problem, options.name, length, how)
+        found = field.estimate(problem, name, length, how)
     good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR
     print(field_report.table_of_field(mesh, found))
     kinds = dict.fromkeys(("mesh", *beside[0]))
@@ -134,7 +141,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     for sentence in field.map_bias_sentences(found):
         _warn(sentence)
     if options.sphere:
-        sphere = inclusion.estimate(problem, options.name, inclusion.start_from(problem, found))
+        sphere = inclusion.estimate(problem, name, inclusion.start_from(problem, found))
         print(field_report.table_of_numbers(sphere))
         with_mesh = any(size > _TOLD for each in beside for size in each.values())
         small = inclusion.size_sentence(mesh, sphere)

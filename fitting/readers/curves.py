@@ -105,6 +105,10 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
     return curves, notes
 
 
+#: Headings of columns that are read.
+_USED = re.compile(r"(?i)(F|P)[1-3]{2}|(test|stretch|shear)$|nominal_stress")
+
+
 def _rows_of_curves(file: Path) -> tuple[list[dict[str, str]], list[tuple[int, str]]]:
     """Return the measured rows of a file. Also return numbers and labels of excluded rows such as "Mean"."""
     text = text_of(file, "curves")
@@ -115,6 +119,9 @@ def _rows_of_curves(file: Path) -> tuple[list[dict[str, str]], list[tuple[int, s
     if end < first + 2:
         raise InputError(f"{file} contains no rows: give a CSV file of curves")
     names, between = _documented(cells[first]), _delimiter_of_curves(lines[first])
+    twice = [name for name in names if names.count(name) > 1 and _USED.match(name)]
+    if twice:
+        raise InputError(f"{file} has two columns {twice[0]}: remove one of them")
     every = cells[first + 1 : end]
     tests = [k for k, name in enumerate(names) if name == "test"]  # cells of this column are never numbers
     labelled = [[cell for k, cell in enumerate(own) if k not in tests or is_summary(cell)] for own in every]
@@ -203,12 +210,16 @@ def _column(file: Path, rows: list[dict], name: str, default: float | None = Non
 
 def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str, float, bool] | None:
     """Return the name of the stress column, its factor to Pa, and whether its heading names the unit. Returns None if
-    there is no such column."""
-    for name in row:
-        match = re.fullmatch(pattern + r"(?:[_ ]*[\[(]?(Pa|kPa|MPa)[\])]?)?", name)
-        if match:
-            return name, STRESS_UNITS[match[1] or unit], match[1] is not None
-    return None
+    there is no such column.
+
+    Raises:
+        InputError: there are two such columns.
+    """
+    named = [(name, re.fullmatch(pattern + r"(?:[_ ]*[\[(]?(Pa|kPa|MPa)[\])]?)?", name)) for name in row]
+    found = [(name, match[1]) for name, match in named if match]
+    if len(found) > 1:
+        raise InputError(f"{file} has two columns of one stress, {found[0][0]} and {found[1][0]}: remove one of them")
+    return (found[0][0], STRESS_UNITS[found[0][1] or unit], found[0][1] is not None) if found else None
 
 
 #: A stress component below this fraction of the largest component was not measured. Programs write roundoff instead of

@@ -152,6 +152,8 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
     for name in names:
         if name not in _COLUMNS:
             raise InputError(f"{path}: column {name!r} is not known; use {', '.join(_COLUMNS)}")
+        if names.count(name) > 1:
+            raise InputError(f"{path} has two columns {name}: remove one of them")
     for needed in ("ux", "uy", "uz"):
         if needed not in names:
             raise InputError(f"{path} has no column {needed}: give x,y,z (or node) and ux,uy,uz")

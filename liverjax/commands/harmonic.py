@@ -41,7 +41,7 @@ def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
 
 def _refuse_options(options: argparse.Namespace) -> None:
     given = {"fields": options.fields, "reactions": options.reactions, "png": options.png, "resume": options.resume}
-    for name, value in given.items():
+    for name, value in (given | {"every": options.every is not None}).items():
         if value:
             raise InputError(f"--{name} cannot be used with [solve] kind = 'harmonic': remove this option")
 

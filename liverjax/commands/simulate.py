@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from liverjax.scenes.scene import Scene
     from liverjax.simulation.run import Result
 
+#: Default of --every.
+_EVERY = 50
+
 
 def add(parsers: argparse._SubParsersAction) -> None:
     """Add the command to the parser."""
@@ -23,7 +26,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("--vtu", action="store_true", help="also write a series of files for ParaView")
     command.add_argument("--png", action="store_true", help="also draw the last state")
     command.add_argument(
-        "--every", type=int, default=50, metavar="N", help="write the results after each N steps (default 50)"
+        "--every", type=int, metavar="N", help=f"write the results after each N steps (default {_EVERY})"
     )
     command.add_argument("--resume", action="store_true", help="continue a run that was stopped")
     command.add_argument(
@@ -73,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
         ran, scene = _reduced(scene)
         in_parts = ran is None
         if ran is None:
-            ran = long_run.run(scene, text, target, options.every, options.resume, report)
+            ran = long_run.run(scene, text, target, _steps_per_part(options), options.resume, report)
     except OSError as error:
         print(
             f"stopped, because {target} cannot be written ({error.strerror}): free disk space, then use --resume",
@@ -131,6 +134,10 @@ def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:
     ran, said = reduction.tried(scene)
     print(said)
     return ran, replace(scene, solve=replace(scene.solve, reduced=""))
+
+
+def _steps_per_part(options: argparse.Namespace) -> int:
+    return _EVERY if options.every is None else options.every
 
 
 def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":

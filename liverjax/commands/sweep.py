@@ -71,6 +71,8 @@ def run(options: argparse.Namespace) -> int:
             f"{options.scene}: [solve] {own} cannot be used in a sweep; use python -m liverjax simulate for each row"
         )
     out = options.out or options.parameters.with_suffix(".h5")
+    if out.is_dir():
+        raise InputError(f"--out {out} is a folder: name a file for the results, e.g. {out / 'sweep.h5'}")
     bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # shown only on a terminal
     try:
         done = sweep.run(table, out, options.resume, process, bar.update)

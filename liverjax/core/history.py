@@ -63,7 +63,7 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     except UnicodeDecodeError:
         raise InputError(f"{name} history {path} is not a text file: give a CSV file with columns {wanted}") from None
     # NumPy would read a comment on the first line as the names of the columns.
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    lines = [line for line in text.replace('"', "").splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
         raise InputError(f"{name} history {path} is empty: give a CSV file with columns {wanted}")
     commas = {line.count(",") for line in lines}
@@ -72,8 +72,15 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
         raise InputError(
             f"{name} history {path} {why}: give columns {wanted}, separated by commas, with decimal points"
         )
+    heads = [cell.strip() for cell in lines[0].split(",")]
+    twice = next((head for head in heads if heads.count(head) > 1), None)
+    if twice is not None:
+        raise InputError(f"{name} history {path} has two columns {twice}: remove one of them")
     data = np.atleast_1d(np.genfromtxt(lines, delimiter=",", names=True))
-    found = next((kind for kind in kinds if set(kind) <= set(data.dtype.names or ())), None)
+    every = [kind for kind in kinds if set(kind) <= set(data.dtype.names or ())]
+    if len(every) > 1:
+        raise InputError(f"{name} history {path} has both {wanted.replace(' or ', ' and ')}: give one of these")
+    found = next(iter(every), None)
     if found is None:
         raise InputError(f"{name} history {path} has the columns {data.dtype.names}: give the columns {wanted}")
     return np.stack([data[column] for column in found], axis=1)

@@ -1,5 +1,6 @@
 """Make tables of parameters for a sweep: a grid, a Latin hypercube or a Sobol sequence."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -36,10 +37,12 @@ def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
             low, high = (number_of(v) for v in span.split(":"))
         except ValueError:
             raise InputError(f"{text!r} is not a range: write name=low:high, e.g. law.mu=500:1000") from None
-        if not (np.isfinite(low) and np.isfinite(high) and low < high):
-            raise InputError(f"{text!r} does not rise from low to high: write name=low:high, e.g. law.mu=500:1000")
-        if not name.strip():
-            raise InputError(f"{text!r} contains no name: write name=low:high, e.g. law.mu=500:1000")
+        if not (np.isfinite(high - low) and low < high):
+            raise InputError(
+                f"{text!r} does not rise from low to high, or is too wide: write name=low:high, e.g. law.mu=500:1000"
+            )
+        if not re.fullmatch(r"[\w.]+", name.strip()):
+            raise InputError(f"{text!r} contains no dotted name: write name=low:high, e.g. law.mu=500:1000")
         if name in ranges:
             raise InputError(f"{name} has two ranges: remove one of them")
         ranges[name] = (low, high)

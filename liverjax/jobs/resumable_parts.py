@@ -92,10 +92,15 @@ def same(identity: Mapping[str, object], file: Path) -> None:
     """Store the input that determines the results, or compare it with the stored input of the parts on disk.
 
     Raises:
-        InputError: the parts next to `file` were made with other input.
+        InputError: the parts next to `file` were made with other input, or their input is unknown.
     """
     identity = json.loads(json.dumps(identity))
     if not file.exists():
+        if any(file.parent.glob("part_*.h5")):
+            raise InputError(
+                f"{file.parent} contains parts, but not the file {file.name} with their input: give another --out, or "
+                "remove this folder"
+            )
         with whole(file, f".{os.getpid()}") as new:
             new.write_text(json.dumps(identity))
         return
@@ -108,8 +113,8 @@ def same(identity: Mapping[str, object], file: Path) -> None:
 
 
 def remove(folder: Path) -> None:
-    """Remove the folder and all of its files."""
-    for file in folder.iterdir():
+    """Remove the folder and all of its files. The parts go first, so that a kill leaves no parts of unknown input."""
+    for file in sorted(folder.iterdir(), key=lambda file: file.suffix == ".json"):
         file.unlink(missing_ok=True)
     folder.rmdir()
 

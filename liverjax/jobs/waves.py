@@ -78,6 +78,8 @@ def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
         with h5py.File(file) as given:
             x, reactions = (np.asarray(given[name][-1]) for name in ("positions", "reactions"))
             code = int(np.ravel(read_by_step(given, "status"))[-1])
+    except FileNotFoundError:
+        raise InputError(f"--about {file} does not exist: give the result.h5 of a run of this scene") from None
     except (OSError, KeyError, IndexError) as error:
         raise InputError(f"--about {file} contains no positions: give the result.h5 of a run of this scene") from error
     if x.shape != scene.mesh.points.shape:

@@ -75,7 +75,8 @@ def reduce_scene(
     count = len(next(iter(values.values()), ()))
     runs = count if runs is None else runs
     if not FEWEST_RUNS <= runs <= count and runs != count:
-        raise InputError(f"runs = {runs} must be from {FEWEST_RUNS} to {count} (the number of rows)")
+        allowed = f"from {FEWEST_RUNS} to {count}" if count > FEWEST_RUNS else f"{count}"
+        raise InputError(f"runs = {runs} must be {allowed} (the number of rows)")
     if runs == count:
         return _model_of(scene, _full_runs(scene, values), tolerance, most_modes, point_tolerance)
     first = 2 * runs // 3
