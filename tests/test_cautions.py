@@ -346,7 +346,7 @@ def test_a_body_whose_estimate_is_not_found_is_not_said_to_be_at_rest():
     two = MeshError(positions=np.full((2, 8, 3), 1e-4), reactions=np.zeros((2, 8, 3)), found=np.array([False, True]))
     done = np.full(2, status.CONVERGED)
     said = mesh_sentence(scene(BOX), replace(run(BOX, [np.eye(3)] * 2, [1.0, 2.0]), mesh_error=two, status=done))
-    assert said.startswith("mesh error (estimate, last step)") and "At 1 earlier steps no estimate was found" in said
+    assert said.startswith("mesh error (estimate, last step)") and "At 1 earlier step no estimate was found" in said
     with pytest.warns(UserWarning, match="not reliable in 1 of 2 steps .the first is step 1."):
         two.change(lambda x, _: x[-1, 0, 0], replace(result, positions=two.positions, reactions=two.reactions))
     nothing = replace(error, positions=np.zeros((1, 8, 3)), found=np.array([True]))

@@ -98,3 +98,6 @@ def test_numbers_that_no_mesh_determines_are_not_blamed_on_the_mesh():
     (said,) = bias_sentences(SimpleNamespace(**found, standard_errors=np.array([10.0, 10.0])))
     assert "by more than 30%" in said
     assert bias_sentences(SimpleNamespace(**found, standard_errors=np.array([5e3, 5e3]))) == []
+    unknown = found | {"mesh_bias": np.full(2, np.nan)}
+    (said,) = bias_sentences(SimpleNamespace(**unknown, standard_errors=np.array([5e3, 5e3])))
+    assert said.startswith("the effect of the mesh on the fit is unknown")

@@ -174,6 +174,14 @@ def test_files_that_are_no_table_are_one_sentence(tmp_path, content, words):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("more", [",,", ",note,note"])
+def test_further_columns_are_left_out(tmp_path, more):
+    file = tmp_path / "h.csv"
+    file.write_text(f"time,factor{more}\n0,0,,\n1,2,,\n")
+    times, factors = history.read_history(str(file), "traction.0")
+    assert times.tolist() == [0, 1] and factors.tolist() == [0, 2]
+
+
 def test_a_file_of_a_spreadsheet_is_read(tmp_path):
     """The file begins with a byte-order mark and has empty lines."""
     (tmp_path / "h.csv").write_bytes(b"\xef\xbb\xbftime,factor\r\n0,0\r\n\r\n1,2\r\n")

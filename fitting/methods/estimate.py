@@ -208,6 +208,8 @@ def _sentences_of(estimate: Estimate, bias: np.ndarray | None, source: tuple[str
             "another mesh or step does not help. Displacements without a force determine only ratios of moduli. Give a "
             "traction or a measured force, or fit fewer parameters"
         ]
+    if np.any(np.isnan(bias)):
+        return [f"the effect of {what} on the fit is unknown, because a run or its estimate failed: {remedy}"]
     lost = np.flatnonzero(~(np.abs(bias) <= LARGEST_BIAS * np.abs(values)) & ~(np.abs(bias) <= errors))
     if len(lost):
         names = ", ".join(estimate.names[k] for k in lost)

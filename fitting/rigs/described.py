@@ -282,12 +282,18 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
             )
         left_out = np.asarray(glued.mesh_error(rig, law, None)) / 1e3
     found = np.asarray(force) / 1e3
-    left_out = np.where(np.isfinite(left_out), left_out, 0.0)
-    secant = np.abs(found + left_out) / at
     notes = [f"{w.message}" for w in said if issubclass(w.category, UserWarning)]
+    share, known = left_out / found, np.isfinite(left_out)
+    if not known.all():
+        notes.append(
+            f"the error of the mesh is unknown at {np.sum(~known)} of {len(at)} displacements: "
+            + ("the correction of the nearest other one is used" if known.any() else "no correction is made")
+        )
+    share = np.interp(at, at[known], share[known]) if known.any() else np.zeros(len(at))
+    secant = np.abs(found * (1 + share)) / at
     notes.append(
         f"the stiffness of the sample, divided by the shear modulus, is {secant[0]:.4g} m; "
-        f"{100 * left_out[0] / found[0]:.2g} % of this value is a correction for the error of the mesh"
+        f"{100 * share[0]:.2g} % of this value is a correction for the error of the mesh"
     )
     if abs(secant[-1] / secant[0] - 1) > _CURVED:
         notes.append(

@@ -73,7 +73,7 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
             f"{name} history {path} {why}: give columns {wanted}, separated by commas, with decimal points"
         )
     heads = [cell.strip() for cell in lines[0].split(",")]
-    twice = next((head for head in heads if heads.count(head) > 1), None)
+    twice = next((head for head in heads if head in (*_FACTOR, *_VECTOR) and heads.count(head) > 1), None)
     if twice is not None:
         raise InputError(f"{name} history {path} has two columns {twice}: remove one of them")
     data = np.atleast_1d(np.genfromtxt(lines, delimiter=",", names=True))

@@ -98,7 +98,8 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     if single is not None:
         said += f". Forces of [[{single}]] at single nodes depend on the mesh; the estimate does not include this"
     if not np.all(found[:-1]):
-        said += f". At {int(np.sum(~found[:-1]))} earlier steps no estimate was found, or the estimate inverts elements"
+        count = int(np.sum(~found[:-1]))
+        said += f". At {count} earlier step{'s' * (count > 1)} no estimate was found, or the estimate inverts elements"
     if error <= _SMALL * size and found[-1]:
         return said
     return f"{said}: use {'order = 2 in [mesh], or a finer mesh' if scene.mesh.order == 1 else 'a finer mesh'}"

@@ -112,9 +112,10 @@ class MeshError:
             result: `Result` of the run.
         """
         if not isinstance(self.found, jax.core.Tracer) and not np.all(self.found):
-            steps = (1 + np.flatnonzero(~np.asarray(self.found))).tolist()
+            found = np.asarray(self.found)
+            steps = 1 + np.flatnonzero(~found.reshape(-1, found.shape[-1]).all(axis=0))  # of any member of a batch
             warnings.warn(
-                f"the mesh error is not reliable in {len(steps)} of {len(self.found)} steps (the first is step "
+                f"the mesh error is not reliable in {len(steps)} of {found.shape[-1]} steps (the first is step "
                 f"{steps[0]}), because its solves did not converge or it inverts elements: use a finer mesh",
                 stacklevel=2,
             )
@@ -275,8 +276,9 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
         begin = q + unknowns(e, state.x) - unknowns(e, rich.padded(before))
     near, (dq, iterations, positive) = _found_near(scene, e, begin)
     f, along = jax.linearize(lambda q: forces(e, q, one), near)
-    whole, _ = reported_forces(e, f.total + along(dq).total, positions(e, near + dq, one))
-    reaction = whole - e.free.vectors(whole)
+    there = positions(e, near + dq, one)
+    whole, _ = reported_forces(e, f.total + along(dq).total, there)
+    reaction = whole - e.free.vectors(whole, there)
     dq = near + dq - q
     # If the change dq inverts elements, the richer run continues from the positions of the first run.
     sound = jnp.all(volume_ratios(e.mesh, positions(e, q + dq, one)) > 0) & jnp.all(jnp.isfinite(dq))

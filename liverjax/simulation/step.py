@@ -64,7 +64,7 @@ def problem_of(e: Equations) -> Problem:
         # If nodes rotate together by an unknown angle, the tangent is exact only for small rotations. So it cannot be
         # used for derivatives.
         adjoint=partial(adjoint, e) if e.conservative and all(nodes.linear for nodes in e.free.tied) else None,
-        symmetric=e.conservative,
+        symmetric=e.conservative and e.mixed is None,  # the preconditioner of pressure unknowns is not symmetric
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
         roundoff=e.roundoff,
         kinks=any(a.kinked for a in e.nodal),

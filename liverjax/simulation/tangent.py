@@ -234,8 +234,7 @@ def _true(kind: Kind, dtype: Any) -> jax.Array:
     return jnp.asarray(kind == "true" if isinstance(kind, str) else ~kind[1], dtype)
 
 
-#: The fields `matrix`, `inverse` and `vertices` of a `Tangent`, the matrix from which its coarse space is made, and the
-#: stiffness between nodes that is not in the matrix.
+#: `matrix`, `inverse`, `vertices` of a `Tangent`, matrix of its coarse space, and the other stiffness between nodes.
 _Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Between, ...]]
 
 # The functions below are called several times in a compiled program. With jit, JAX traces them only once.
@@ -461,18 +460,20 @@ def _one_of_both(
     e: Equations, K: Tangent, flag: jax.Array, b: jax.Array, limits: tuple[Number, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Solve K dq = b. Pressures are eliminated if `flag` is true. The unused solve has b = 0 and does no iterations."""
-    n, A, motions = 3 * e.mesh.number_of_nodes, K.matrix, _motions(e, K)
+    n, A = 3 * e.mesh.number_of_nodes, K.matrix
     assert isinstance(A, PointMatrix)
 
-    def apply(v: jax.Array) -> jax.Array:
+    def forces(e: Equations, v: jax.Array) -> jax.Array:
         motion = e.free.columns(block_matrix.columns(v))
         force = mixed_system.without_pressures(e.mesh, e.mixed, A, motion)
         return flat_free(e, with_nodal_products(e, K, motion, force))
 
-    def fine(r: jax.Array) -> jax.Array:
-        return flat_free(e, motions(block_matrix.columns(r)))
+    def fine(e: Equations) -> Callable[[jax.Array], jax.Array]:
+        motions = _motions(e, K)
+        return lambda r: flat_free(e, motions(block_matrix.columns(r)))
 
-    alone, s = conjugate_gradients(apply, jnp.where(flag, b[:n], 0.0), fine, *limits)
+    apply, smooth = in_directions_at(e, K.x, lambda e: partial(forces, e)), in_directions_at(e, K.x, fine)
+    alone, s = conjugate_gradients(apply, jnp.where(flag, b[:n], 0.0), smooth, *limits)
     load = jnp.where(flag, 0.0, b)
     both, t = stabilised_biconjugate_gradients(product(e, K), load, preconditioner(e, K), *limits)
     dq = both + jnp.concatenate([alone, jnp.zeros_like(b[n:])])
