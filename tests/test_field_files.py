@@ -61,6 +61,7 @@ def test_bad_displacements_are_one_sentence(tmp_path, content, capsys):
         (["--noise", "1e-4", "--length", "-1"], "--length -1 must be a finite number above 0"),
         (["--noise", "1e-4", "--parameters", "law.mu", "--sphere"], "--sphere is for maps and cannot be used with"),
         (["--noise", "1e-4", "--parameters", "law.mu", "--iterations", "9"], "--iterations is for maps"),
+        (["--noise", "1e-4", "--parameters", "solve.dt"], "solve.dt belongs to the solver, and not to the body"),
     ],
 )
 def test_bad_options_are_one_sentence(tmp_path, more, words, capsys):

@@ -265,6 +265,28 @@ def test_the_zero_of_the_force_is_fitted_with_its_error(offset):
     assert np.all(np.mean(hits, axis=0) >= 0.88), np.mean(hits, axis=0)  # 95 % of 40: 35 or more in 97 % of cases
 
 
+def test_a_large_offset_is_fitted_whatever_the_noise_before_contact():
+    """By chance, the noise before contact rises by more than two standard errors in one of twenty curves. The offset
+    then became a contact force, and the modulus was half of the true one."""
+    layer, depth = Layer(Indenter("sphere", 1.0, 0.5, R)), np.linspace(-5e-4, 1e-3, 200)
+    force = E * layer.force(depth)
+    for seed in range(40):
+        noise = 0.01 * np.random.default_rng(seed).standard_normal(200)
+        found = fit_with_offset(depth, force + force.max() * (0.3 + noise), layer.force)
+        assert abs(found.modulus - E) < 0.1 * E
+
+
+def test_a_negative_offset_that_is_fitted_is_no_adhesion(tmp_path, capsys):
+    force = hertz(DEPTH - START) * (1 + 0.003 * np.random.default_rng(0).normal(size=80))
+    rng = np.random.default_rng(1)
+    rows = np.column_stack([DEPTH, force - 0.3 * force.max() + 0.02 * force.max() * rng.normal(size=80)])
+    np.savetxt(tmp_path / "c.csv", rows, "%.9g", ",", header="depth_m,force_N", comments="")
+    command = ["indentation", str(tmp_path / "c.csv"), "--radius", str(R), "--thickness", "10", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert json.loads((tmp_path / "fit.json").read_text())["force_offset_N"] < -0.2 * force.max()
+    assert "adhesion" not in capsys.readouterr().err
+
+
 def test_without_an_approach_the_zero_is_taken_as_it_is():
     layer = Layer(Indenter("sphere", 1e3 * H, 0.5, R))
     depth = np.linspace(2e-5, 5e-4, 60)

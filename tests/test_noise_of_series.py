@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from fitting.fits import time_tests
-from fitting.readers.noise_of_series import far_values, noise_of_series, sizes_of_series, told_of_far_values
+from fitting.readers.noise_of_series import (
+    far_values,
+    noise_of_series,
+    off_the_line,
+    sizes_of_series,
+    told_of_far_values,
+)
 from fitting.readers.time_tests import read_time_test
 
 pytestmark = pytest.mark.quick_to_compile
@@ -35,6 +41,22 @@ def test_true_courses_have_no_wrong_values():
         assert far_values(series).size == 0
         assert np.all(sizes_of_series(series) >= np.abs(series))
     assert np.array_equal(sizes_of_series(steps), steps)
+
+
+def test_a_wrong_value_of_a_rising_curve_is_found():
+    """The neighbours of a row in a stress-stretch curve differ much, so it is compared with the line between them."""
+    stretch, missed = np.linspace(1, 1.4, 30), []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        stress = (stretch - stretch**-2) * np.exp(2 * stretch) * (1 + 0.02 * rng.standard_normal(30))
+        assert off_the_line(stress).size == 0
+        row = int(rng.integers(15, 27))
+        stress[row] *= rng.choice([0.1, 10.0])
+        missed.append(off_the_line(stress).tolist() != [row])
+    assert sum(missed) <= 5
+    triangle = np.abs((np.linspace(0, 5, 101) + 1) % 2 - 1)
+    for series in (triangle, np.repeat([0.0, 1.0, 0.4, 2.0], 8), np.sin(np.linspace(0, 20, 60)), np.zeros(20)):
+        assert off_the_line(series).size == 0
 
 
 def test_a_peak_at_a_change_of_the_load_is_no_fault():

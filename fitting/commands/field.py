@@ -92,6 +92,8 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
         if getattr(options, option):
             raise InputError(f"--{option} is for maps and cannot be used with --parameters: remove one of both")
     for name in names:
+        if name.startswith("solve."):
+            raise InputError(f"--parameters {name} belongs to the solver, and not to the body: give e.g. law.mu")
         numbers_at(problem.scenes[0], name)
         if names.count(name) > 1:
             raise InputError(f"--parameters names {name} twice: remove one")

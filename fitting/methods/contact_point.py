@@ -127,6 +127,8 @@ _FREE, _FEWEST = 0.7, 8
 #: A tilt is used only if |tilt| / standard error exceeds _SEEN in a fit of the approach alone and _CLEAR in the fit of
 #: the whole curve.
 _SEEN, _CLEAR = 2.0, 4.0
+#: The force before contact also counts as constant if it rises or falls by less than this fraction of the offset.
+_LEVEL = 0.1
 
 
 def fit_with_offset(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray]) -> ContactFit:
@@ -142,7 +144,8 @@ def fit_with_offset(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[
     # In this case, the offset is used only if the fit becomes clearly better and the force before contact is constant.
     better = np.sum(plain.residuals**2) - np.sum(free.residuals**2) > _CLEAR**2 * free.noise**2
     slope, error = _slope_and_error(depth[depth <= free.contact_point], force[depth <= free.contact_point])
-    flat = abs(slope) < _SEEN * error
+    before = depth[depth <= free.contact_point]
+    flat = abs(slope) < max(_SEEN * error, _LEVEL * abs(free.offset) / max(float(np.ptp(before)), 1e-300))
     return free if plain.before >= _FEWEST or (better and flat) else plain
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fitting.readers.noise_of_series import off_the_line
 from fitting.readers.tables.text_tables import (
     EMPTY,
     decimal_sign,
@@ -36,6 +37,7 @@ class Curve(NamedTuple):
     stress: np.ndarray  # (n,) [Pa]
     returns: int = 0  # how often the deformation reverses and repeats earlier deformations
     sample: str = ""  # name of the sample, the same for all components of one test; if empty, `label`
+    law_scale: float | None = None  # [Pa] root mean square of the stress of a fitted law; None: no law is fitted
 
     @property
     def driven(self) -> np.ndarray:
@@ -49,6 +51,11 @@ class Curve(NamedTuple):
         """Whether the stress of a stable material must rise with `driven`. It is False in a general test. It is also
         False if the component of F that belongs to the measured stress is constant."""
         return self.test != "general" and np.ptp(self.F[:, *self.component]) > 0
+
+    @property
+    def divisor(self) -> float:
+        """Divisor [Pa] of the residuals: the root mean square of the law's stress if it is known, or else `scale`."""
+        return self.scale if self.law_scale is None else self.law_scale
 
     @property
     def scale(self) -> float:
@@ -90,6 +97,7 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
                 f"{file.name}: the stress column names no unit; {unit} is assumed (to change this, give --unit Pa, kPa "
                 "or MPa)"
             )
+    notes += [note for curve in curves for note in _of_faults(curve)]
     for curve in (c for c in curves if c.returns):
         times = "once" if curve.returns == 1 else f"{curve.returns} times"
         notes.append(
@@ -103,6 +111,14 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
         if seen[curve.label] > 1:
             curves[k] = curve._replace(label=f"{curve.label} ({seen[curve.label]})")
     return curves, notes
+
+
+def _of_faults(curve: Curve) -> list[str]:
+    return [
+        f"{curve.label}: the stress {curve.stress[k]:.4g} Pa at {curve.driven[k]:.4g} is far from its neighbours "
+        f"{curve.stress[k - 1]:.4g} and {curve.stress[k + 1]:.4g} Pa: if this value is a fault, remove this row"
+        for k in off_the_line(curve.stress)
+    ]
 
 
 #: Headings of columns that are read.

@@ -44,6 +44,19 @@ def far_values(values: np.ndarray) -> np.ndarray:
     return 2 + np.flatnonzero(off > np.maximum(_FAR * beside, least))
 
 
+def off_the_line(values: np.ndarray) -> np.ndarray:
+    """Return the indices of single values that lie far from the line between their neighbours. Unlike `far_values`, the
+    values (n,) may rise steeply. A corner or a jump of the series has another pattern of second differences."""
+    if len(values) < 7:
+        return np.zeros(0, int)
+    off = values[1:-1] - 0.5 * (values[:-2] + values[2:])
+    own, size = off[2:-2], np.abs(off[2:-2])
+    beside = np.minimum(-off[1:-3] * np.sign(own), -off[3:-1] * np.sign(own))
+    far = size > _FAR * np.maximum(np.abs(off[:-4]), np.abs(off[4:]))
+    least = max(_NOISES * noise_of_series(values), _OF_LARGEST * float(np.max(np.abs(values))))
+    return 3 + np.flatnonzero(far & (beside > 0.3 * size) & (size > least))
+
+
 def told_of_far_values(time: np.ndarray, load: np.ndarray, values: np.ndarray) -> list[str]:
     """Return a note for each of the `far_values` of the response (n,) to a `load` (n,), at the times `time` (n,) [s].
     No note is given beside a change of the load, because there the value may be a true peak."""

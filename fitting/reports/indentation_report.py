@@ -119,7 +119,7 @@ def indentation_warnings(
             "points; the standard errors include this effect"
         )
     # The noise is estimated from neighbouring points, because the residuals contain the adhesion.
-    if curve.force.min() < -5 * noise_of_series(curve.force):
+    if curve.force.min() - min(fit.offset, 0.0) < -5 * noise_of_series(curve.force):
         told.append(
             "some forces are clearly negative: this is probably adhesion, which the model does not contain, or an "
             "error of the zero of the force"

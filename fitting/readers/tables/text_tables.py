@@ -70,6 +70,8 @@ _HEAD = 200
 
 
 def _decoded(path: Path, data: bytes) -> str:
+    if data.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
+        return data.decode("utf-32", errors="replace")
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
     start = data[:200]  # UTF-16 without a byte order mark: every second byte of plain text is 0
