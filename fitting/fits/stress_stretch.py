@@ -174,7 +174,7 @@ def assessed(
     n, p = sum(len(c.stress) for c in curves), len(u)
     misfit, k = r[:n], p + 1
     split = _relative_to_measured(curves, misfit)
-    off = np.concatenate(split)
+    square = max(float(np.mean(np.concatenate(split) ** 2)), 1e-300)
     values = np.asarray(jax.jit(candidate.values)(u, scale))
     noise = noise_factor(misfit, n - p, deviations_given=False)
     slope = np.asarray(jax.jit(jax.jacfwd(candidate.values))(u, scale))
@@ -192,7 +192,6 @@ def assessed(
     if np.all(np.isfinite(half)):
         correlation[np.ix_(known, known)] = its_correlation
     law = candidate.law(jnp.asarray(values))
-    criterion = n * np.log(max(np.sum(off**2) / n, 1e-300))
     result = LawFit(
         label=candidate.label,
         names=candidate.names,
@@ -204,9 +203,9 @@ def assessed(
         shear_modulus=ground_state_modulus(law),
         cost=float(costs[best]),
         curve_errors={c.label: float(np.sqrt(np.mean(v**2))) for c, v in zip(curves, split, strict=True)},
-        mean_relative_error=float(np.sqrt(np.mean(off**2))),
-        aicc=float(criterion + 2 * k + 2 * k * (k + 1) / (n - k - 1)) if n > k + 1 else np.inf,
-        bic=float(criterion + k * np.log(n)),
+        mean_relative_error=float(np.sqrt(square)),
+        aicc=float(n * np.log(square) + 2 * k + 2 * k * (k + 1) / (n - k - 1)) if n > k + 1 else np.inf,
+        bic=float(n * np.log(square) + k * np.log(n)),
         converged=bool(found.converged[best]),
         iterations=int(found.iterations[best]),
         starts_at_minimum=int(np.sum(costs <= lowest)),
