@@ -251,7 +251,7 @@ def test_laws_that_follow_a_sweep_as_well_are_named(tmp_path, tanned):
         best._replace(law=best.law._replace(aicc=best.law.aicc + d, label=n)) for n, d in (("b", 3), ("c", 9))
     )
     told = law_fit.said_of(sweep, [best, other, far])
-    assert any(t.startswith("b fit the sweep as well as") for t in told)
+    assert any(t.startswith("b fits the sweep as well as") for t in told)
     assert not any("as well as" in t for t in law_fit.said_of(sweep, [best, far]))
 
 

@@ -153,7 +153,7 @@ def test_laws_that_tie_are_named_with_their_moduli():
         best._replace(aicc=best.aicc + d, label=n, shear_modulus=m) for d, n, m in ((2, "b", 900.0), (9, "c", 5.0))
     )
     (told,) = stress_stretch.tied_laws([best, other, far], "curves")
-    assert told.startswith("b fit the curves as well as neo_hookean does") and "with G0 from 7" in told
+    assert told.startswith("b fits the curves as well as neo_hookean does") and "with G0 from 7" in told
     assert "to 900 Pa" in told and not stress_stretch.tied_laws([best, far], "curves")
 
 

@@ -454,7 +454,8 @@ def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
     which = ", ".join(f.label for f in others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
     moduli = [f.shear_modulus for f in (best, *others)]
     return [
-        f"{which} fit the {data} as well as {best.label} does (AICc within {TIE:g}), with G0 from {min(moduli):.4g} "
+        f"{which} {'fit' if len(others) > 1 else 'fits'} the {data} as well as {best.label} does (AICc within "
+        f"{TIE:g}), with G0 from {min(moduli):.4g} "
         f"to {max(moduli):.4g} Pa. The {data} cannot decide between these laws, which differ beyond the measured "
         "strains"
     ]

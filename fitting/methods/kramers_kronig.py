@@ -61,11 +61,11 @@ def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
 
 
 def without_instrument(sweep: Sweep) -> Sweep:
-    """Return the sweep without the points at high frequencies that show the inertia of the instrument (the mark of the
-    instrument). These points are moved to `grey`, and a note reports them.
+    """Return the sweep without the points at high frequencies that show the inertia of the instrument. These points
+    are moved to `grey`, and a note reports them.
 
-    The search is repeated with the remaining points until no mark is found. Only the last half decade of the sweep is
-    searched.
+    The search is repeated with the remaining points until the inertia is no longer found. Only the last half decade of
+    the sweep is searched.
     """
     here, end = sweep, sweep.angular_frequency[-1] / math.sqrt(10)
     told = ""

@@ -90,10 +90,10 @@ def times_of_modes(low: float, high: float) -> np.ndarray:
 def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwell:
     """Return many Prony modes that represent the relaxation spectrum of the model, for responses in the time domain.
 
-    The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converts the
-    spectrum to modes, and converges exponentially. An equilibrium modulus replaces the modes that are slower than
-    `times`. One fast mode replaces the modes that are faster. Both are chosen so that G* is exact at one small and one
-    large real s.
+    The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converts
+    the spectrum to modes, and converges exponentially. An equilibrium modulus replaces the modes that are slower
+    than `times`. One fast mode replaces the modes that are faster than `times`. Both are chosen so that G* is exact
+    at one small and one large real s.
 
     Args:
         u, switches: see `moduli`.

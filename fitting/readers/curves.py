@@ -397,7 +397,7 @@ _TURN = 0.05
 
 
 def _returns(driven: np.ndarray, F: np.ndarray) -> int:
-    """Return how often the deformation reverses and the rows repeat earlier deformations.
+    """Return the number of reversals of the deformation after which the rows repeat earlier deformations.
 
     Args:
         driven: (n,) the component of the deformation that the test changes.

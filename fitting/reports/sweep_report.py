@@ -158,7 +158,7 @@ def spectrum_rows(details: Content) -> list[str]:
     return [
         f"{len(times)} strengths from {times[-1]:.2g} to {times[0]:.2g} s,",
         f"on a grid of {found['times_per_decade']} times per decade;",
-        f"the data determine {found['decades_carried']:.2g} decades of them,",
+        f"the data determine the strengths over {found['decades_carried']:.2g} decades,",
         f"{found['effective_parameters']:.2g} effective parameters",
     ]
 

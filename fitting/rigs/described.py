@@ -196,7 +196,7 @@ def _description(path: Path) -> Described:
     own = _LAYER if "thickness" in needed else _GLUED
     poisson = _number_of(path, "poisson", table.get("poisson", own))
     if not 0 <= poisson <= own:
-        raise InputError(f"{path}: poisson = {poisson:g} must be from 0 to {own:g}; remove poisson for a soft tissue")
+        raise InputError(f"{path}: poisson = {poisson:g} must be from 0 to {own:g}; leave it out for soft tissue")
     if not isinstance(table["data"], str):
         raise InputError(f"{path}: data = {table['data']!r} must name a file; write data = 'test.csv'")
     drive = table.get("drive", "displacement")

@@ -56,8 +56,8 @@ class Dispersion(NamedTuple):
     @property
     def scales(self) -> np.ndarray:
         """Values of smooth curves through the measured values, so errors divided by these scales are relative. If the
-        attenuation scatters much more than the velocity, or much less, its scales are larger or smaller by this
-        factor."""
+        relative scatter of the attenuation differs much from that of the velocity, the scales of the attenuation are
+        multiplied by the ratio of the two."""
         smooth = smooth_curve(self.angular_frequency, self.velocity)
         if self.attenuation is None:
             return smooth

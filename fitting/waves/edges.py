@@ -65,7 +65,7 @@ class RegionMatrices(NamedTuple):
 
     def by_edges(self, here: balance.Balanced, G: np.ndarray, omega: float) -> np.ndarray:
         """Return the derivatives (I, P) of the unbalanced forces with respect to the outward shift [voxels] of each of
-        the P patches of the edges."""
+        the P patches into which the edges of the regions are divided."""
         out = np.zeros((len(self.patch), len(self.patches.region)), complex)
         if self.farther is not None:
             p = self.forces.T @ here.multipliers

@@ -49,7 +49,8 @@ DEVIATIONS = (0.2, 0.4, 0.8)
 #: Prior standard deviation of the real and of the imaginary part of l_f (the level: one complex unknown per frequency).
 LEVEL = 0.5
 #: STEPS: maximum number of Gauss-Newton steps for each of `DEVIATIONS`. NEAR: a search ends if the next step is shorter
-#: than this. FAR: a map has converged if the next step is shorter than this (both in standard deviations of the map).
+#: than this. FAR: a map has converged if the next step is shorter than this. The unit of NEAR and FAR is one standard
+#: deviation of the map.
 STEPS, NEAR, FAR = 40, 0.1, 0.2
 #: The Hessian is computed again if a step is longer than this fraction of the step before. The search is then too far
 #: from the point at which the last Hessian was computed.

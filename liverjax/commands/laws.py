@@ -16,7 +16,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print every law."""
-    print(f"option of every law with bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
+    print(f"option of every law with the parameter bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
     print("option of every law of I1, I2 and J: continued_below = 0.1, for a finite energy below this J (default off)")
     for name, cls in laws.LAWS.items():
         energy = (cls.__doc__ or name).split("\n\n")[0].splitlines()

@@ -75,7 +75,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
     functions, widest = _patch_functions(jax.lax.stop_gradient(points) if traced else points, near)
     tets = np.asarray(tetrahedra, dtype=int).reshape(-1, 4)
     if tets.size and (tets.min() < 0 or tets.max() >= number_of_nodes):
-        tets = tets[:0]  # no pattern; `check_mesh` raises an error for this mesh
+        tets = tets[:0]  # an empty pattern; `check_mesh` raises an error for this mesh
     both = np.stack([np.sort(tets[:, p], axis=1) for p in PAIRS])  # (6, E, 2)
     code, inverse = np.unique(both[..., 0].astype(np.int64) * number_of_nodes + both[..., 1], return_inverse=True)
     low, high = np.divmod(code, number_of_nodes)

@@ -315,7 +315,8 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
         # The coordinates are predicted by a parabola or a cubic through the last coordinates. The one that would have
-        # predicted the last step better is used. Newmark's accelerations oscillate, so they are not used here.
+        # predicted the last step better is used. Newmark's accelerations oscillate, so this prediction is not made
+        # with them.
         more = jnp.where(e.motion.steady, e.motion.change, 0.0)
         start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = gradients_at(e, start), jnp.zeros((), jnp.int32)

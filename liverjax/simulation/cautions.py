@@ -223,7 +223,7 @@ def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
 
 
 def _gives_no_energy(physics: Physics) -> bool:
-    """Whether a physics object (support, obstacle, …) without a history is passive.
+    """Return whether a physics object (support, obstacle, …) is passive. The object has no history.
 
     A passive object stores no energy at the beginning of the run. Later it gives the body only energy that it has taken
     from the body.

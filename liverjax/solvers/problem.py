@@ -94,7 +94,7 @@ class Problem(NamedTuple):
     #: then what remains of b after the elimination of the additional unknowns; otherwise it is b. None: derivatives use
     #: products with dr/dq.
     adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
-    #: Whether dr/dq is symmetric.
+    #: Whether dr/dq and its preconditioner are symmetric.
     symmetric: bool = True
     #: Whether r may depend on s.
     moved: bool = True

@@ -2,7 +2,7 @@
 
 With the principal stretches lambda_m, the sum Xi(alpha) = sum_m lambda_m^alpha = tr C^(alpha/2) is a smooth function of
 C, although the eigenvectors of C are not. So the eigenvectors are constant in derivatives. In the axes of the
-eigenvectors, C = diag(c) + X. The value of X is zero, but X has derivatives. Then
+eigenvectors, C = diag(c) + X. The value of X is zero, but its derivatives are not. Then
 
     tr C^q = sum f(c_i) + sum g[c_i] X_ii + 1/2 sum g[c_i, c_j] X_ij^2 + 1/3 sum g[c_i, c_j, c_k] X_ij X_jk X_ki
 

@@ -13,7 +13,7 @@ from fitting.methods.uncertainty import NO_REST, equilibrium_error
 
 #: The program warns if a difference exceeds this many standard errors.
 TOLD = 2.0
-#: Limit for the decrease of G' in the lowest half decade of the band, divided by its decrease in the next half decade.
+#: Limit for a ratio: the decrease of G' in the lowest half decade of the band, divided by that in the next half decade.
 #: Above this limit, the material may relax much more at lower frequencies. One relaxation time well inside the band
 #: gives 0.1. A modulus that falls by the same amount in each half decade gives 1.
 SLOWING = 0.5

@@ -213,7 +213,7 @@ def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
 
 
 def _outwards(centre: np.ndarray, r: _Rings, real: np.ndarray, a: int, own: int) -> np.ndarray:
-    """Return the unit direction (3,) of the centre line from the last ring a of a branch to the end of the surface.
+    """Return the unit direction (3,) of the centre line from ring a, the last one of a branch, to the surface's end.
 
     The direction is that from the previous ring to ring a. If there is no previous ring, it is the normal of ring a.
     """

@@ -102,7 +102,7 @@ class Obstacle(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), shape=shape, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Raise InputError if numbers do not define the shape, or if triangles are not in the mesh."""
+        """Raise InputError if a value is wrong or contradicts another value, or if triangles are not in the mesh."""
         selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
         for key in ("radius", "half_angle", "friction"):
             if np.ndim(getattr(self, key, 0.0)):
