@@ -168,6 +168,10 @@ def test_soft_samples_have_no_larger_weight():
     assert np.isclose(found.values[0], 1000.0, rtol=2e-3)
     # The errors of the table are relative to the measured stress.
     assert np.isclose(found.curve_errors["0"], 1000 / 700 - 1, rtol=0.02)
+    told = stress_stretch.unfollowed(same, [found])
+    assert told[0].startswith(
+        "0: the stress is 0.7 times that of neo_hookean, with the same course. If this is not another"
+    )
 
 
 def test_laws_with_too_many_parameters_for_the_points_are_told():

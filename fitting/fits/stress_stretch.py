@@ -431,13 +431,33 @@ def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
     told = []
     for curve in curves:
         best = min(fits, key=lambda f: f.curve_errors[curve.label])
-        error = best.curve_errors[curve.label]
-        if not error < HOPELESS:
+        error, factor = best.curve_errors[curve.label], _only_a_factor(best.law, curve, curves)
+        if not error < HOPELESS and factor is not None:
+            told.append(
+                f"{curve.label}: the stress is {factor:.2g} times that of {best.label}, with the same course. "
+                "If this is not another sample, check the unit and the size of the sample"
+            )
+        elif not error < HOPELESS:
             told.append(
                 f"{curve.label}: no law fits this curve. The nearest law ({best.label}) misses the curve by "
                 f"{100 * error:.0f} % of the stress; check unit, signs and axes, or fit this curve alone"
             )
     return told
+
+
+#: The stress of a curve has the same course as that of a law if a factor reduces the misfit below this value.
+_SAME_COURSE = 0.1
+
+
+def _only_a_factor(law: laws.Law, curve: Curve, curves: list[Curve]) -> float | None:
+    """Return the factor between the measured stress of a curve and that of a law. Return None if they also differ in
+    their course, or if no other of the `curves` belongs to the same test."""
+    if sum((c.test, c.component) == (curve.test, curve.component) for c in curves) == 1:
+        return None
+    model = np.asarray(homogeneous.nominal_stress(law, jnp.asarray(curve.F), constant=True))[:, *curve.component]
+    factor = float(model @ curve.stress) / max(float(model @ model), 1e-300)
+    off = float(np.sqrt(np.mean((curve.stress - factor * model) ** 2)))
+    return factor if factor > 0 and off < _SAME_COURSE * curve.scale else None
 
 
 #: Two laws describe the data equally well if their AICc differs by less than this value.
