@@ -189,6 +189,8 @@ def test_laws_with_too_many_parameters_for_the_points_are_told():
     (told,) = stress_stretch.too_few_points(ordered, 4)
     assert told.startswith("4 points are too few to compare laws with 2 or more parameters by AICc, so neo_hookean")
     assert "20 %, although near has 0.1 %" in told and not stress_stretch.too_few_points([best, far], 4)
+    exact = near._replace(values=np.ones(4))
+    assert not stress_stretch.too_few_points([best, exact], 4)
 
 
 def test_a_factor_of_a_test_is_no_misfit_of_the_law():

@@ -483,9 +483,10 @@ def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
 
 def too_few_points(fits: Sequence[LawFit], points: int) -> list[str]:
     """Return a warning if laws with more parameters may describe the curves better than the best law, but the curves
-    have too few points for the criterion of these laws. The best law comes first in `fits`."""
+    have too few points for the criterion of these laws. The best law comes first in `fits`. Laws with as many
+    parameters as points do not count, because they follow any data."""
     best = fits[0]
-    closer = [f for f in fits if not np.isfinite(f.aicc) and f.bic < best.bic]
+    closer = [f for f in fits if not np.isfinite(f.aicc) and f.bic < best.bic and len(f.values) < points]
     if not closer:
         return []
     nearest = min(closer, key=lambda f: f.bic)
