@@ -8,7 +8,7 @@ import sys
 
 from liverjax.commands import check, design, fit, laws, play, plot, reduce, simulate, sweep
 from liverjax.commands.arguments import with_joined_numbers
-from liverjax.commands.exit_codes import exit_code, show_unknown_letters
+from liverjax.commands.exit_codes import end_if_stopped, exit_code, show_unknown_letters
 
 
 def _parser(prog: str) -> argparse.ArgumentParser:
@@ -26,11 +26,15 @@ def _parser(prog: str) -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None, prog: str = "liverjax") -> int:
     """Run one command. Return its exit code: 0 (done), 1 (failed), 2 (unusable input) or 130 (Ctrl-C)."""
     show_unknown_letters()
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments[:1] == ["fit"]:
-        return fit.run(arguments[1:], f"{prog} fit")
-    options = _parser(prog).parse_args(with_joined_numbers(arguments))
-    return exit_code(options.run, options, resumable="resume" in options)
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["fit"]:
+        code = fit.run(given[1:], f"{prog} fit")
+    else:
+        options = _parser(prog).parse_args(with_joined_numbers(given))
+        code = exit_code(options.run, options, resumable="resume" in options)
+    if arguments is None:
+        end_if_stopped(code)
+    return code
 
 
 if __name__ == "__main__":

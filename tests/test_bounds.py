@@ -339,6 +339,14 @@ MEANINGLESS = (
         "obstacle.0.shape",
     ),
     (
+        {"physics": (Obstacle(triangles=jnp.array([[0, 1, 3]]), axis=jnp.array([0, 0, 2.0])),)},
+        "obstacle.0 axis = [0. 0. 2.] must be of length 1",
+    ),
+    (
+        {"region": (lj.Region(elements=np.array([0, 1]), law=PULLED.law), lj.Region(elements=[1], law={"mu": 3.0}))},
+        "region.1 changes parameters of elements whose whole law is given by region.0",
+    ),
+    (
         {"physics": (SlidingSupport(nodes=jnp.array([0]), axis="Z"),)},
         "support.0.axis = 'Z' is not known: use x, y or z",
     ),

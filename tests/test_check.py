@@ -113,6 +113,15 @@ MISTAKES = {
         """,
         "ground-state shear modulus",
     ),
+    "negative bulk modulus": (
+        """
+        isochoric_energy = isochoric_derivatives = None
+
+        def strain_energy(self, m):
+            return self.mu / 2 * (m.I1 - 3) - self.mu * jnp.log(m.J) - 0.45 * self.mu * jnp.log(m.J) ** 2
+        """,
+        "stiffness at rest",
+    ),
     "unstable at rest": (
         """
         def isochoric_energy(self, I1, I2):

@@ -241,6 +241,7 @@ SCENE = {
         ({"shape": "sphere", "position": [0, 0, 1]}, "is a sphere without radius: add this key"),
         ({"shape": "sphere", "radius": 0.1}, "is a sphere without position: add this key"),
         ({"shape": "sphere", "radius": 0.0, "position": [0, 0, 1]}, "must be above 0"),
+        ({"shape": "sphere", "radius": -0.1, "position": [0, 0, 1]}, "must be at least 0 m: give e.g. 0.01"),
         (
             {"shape": "sphere", "radius": 0.1, "position": [0, 0, 0.15]},
             "the obstacle overlaps the body by 0.0[0-9]* m; move the obstacle out of the body",

@@ -131,6 +131,23 @@ def test_files_keep_geometry_and_node_sets(tmp_path, suffix):
     assert np.array_equal(back.node_sets["z_max"], mesh.node_sets["z_max"])
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_nodes_of_a_file_without_a_tetrahedron_are_left_out(tmp_path, order):
+    mesh = SHAPES["box"]() if order == 1 else lj.quadratic(SHAPES["box"]())
+    kind, cells = meshio_cells(mesh)
+    points = np.insert(np.asarray(mesh.points), 2, [[9.0, 9.0, 9.0]], axis=0)  # as the centre of an arc
+    cells = np.where(cells >= 2, cells + 1, cells)
+    top = np.flatnonzero(points[:, 2] == np.asarray(mesh.points)[:, 2].max())
+    sets = {"set:top": np.isin(np.arange(len(points)), [2, *top]).astype(int), "set:arc": np.eye(len(points))[2]}
+    meshio.Mesh(points, [(kind, cells)], point_data=sets).write(tmp_path / "mesh.vtu")
+    with pytest.warns(UserWarning, match="1 nodes belong to no tetrahedron"):
+        back = lj.read_mesh(tmp_path / "mesh.vtu")
+    assert np.array_equal(back.points, mesh.points)
+    assert np.array_equal(back.element_nodes_on_host, mesh.element_nodes_on_host)
+    assert np.array_equal(back.node_sets["top"], np.where(top > 2, top - 1, top))
+    assert len(back.node_sets["arc"]) == 0
+
+
 def _refused(match, make):
     with pytest.raises(lj.InputError, match=match) as caught:
         make()
@@ -153,6 +170,7 @@ def test_refusals(tmp_path):
     _refused("cannot be read by meshio", lambda: lj.read_mesh(tmp_path / "junk.xyz"))
     _refused("radius = -1", lambda: lj.shapes.cylinder(-1.0, 1.0, 0.1))
     _refused("cells", lambda: lj.shapes.box((1.0, 1.0, 1.0), (1, 0, 1)))
+    _refused("give fewer cells", lambda: lj.shapes.box((1.0, 1.0, 1.0), (10**300,) * 3))
     import meshio
 
     meshio.Mesh(points, [("triangle", tets[:, :3])]).write(tmp_path / "surface.vtu")
@@ -416,6 +434,6 @@ def test_gmsh_groups_without_their_entities_are_named(tmp_path):
     data.point_data["gmsh:dim_tags"] = np.tile([3, 3], (len(points), 1))
     data.write(tmp_path / "groups.msh", file_format="gmsh", binary=False)
     with pytest.raises(
-        lj.InputError, match=r"\(the entry 1 is missing in the file\); export the mesh as VTU or Gmsh 2.2"
+        lj.InputError, match=r"\(it does not know or does not find the entry 1\); export the mesh as VTU or Gmsh"
     ):
         lj.read_mesh(tmp_path / "groups.msh")

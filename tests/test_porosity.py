@@ -8,8 +8,9 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import in_precision, replace
 from liverjax.physics import darcy, porosity
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation.cautions import cautions_of_run
+from liverjax.simulation.cautions import cautions_of_run, of_drained_layer
 from liverjax.simulation.equations import initial_state
 from liverjax.tensors.matrices import deformation_gradient
 from liverjax.waves.cautions import cautions_of_waves
@@ -327,6 +328,26 @@ def test_a_drained_layer_thinner_than_the_elements_is_told():
     assert 1.04 < moves / undrained < 1.2  # the effect that the warning is about
     slow = column(6, 3, 1.0)
     assert not any("the fluid leaves a layer" in s for s in cautions_of_run(slow, lj.simulate(slow)))
+
+
+def test_warnings_about_the_drained_face_use_the_region_there():
+    """The permeability of the whole body was used. The advised time step was twenty times too short."""
+    scene = column(6, 3, 1e-9 * DIFFUSION_TIME)
+    drained = np.isin(np.asarray(scene.mesh.tetrahedra), np.asarray(scene.porosity.drained)).any(axis=1)
+    own = {"permeability": 1e-6, "bulk": 300.0, "limit_bulk": 2000.0}
+    there = lj.Region(elements=np.flatnonzero(drained), porosity=own, law={"mu": 500.0})
+    seconds = 1e-6 * DIFFUSION_TIME
+    everywhere = replace(scene, porosity=replace(scene.porosity, **own), law=replace(scene.law, mu=500.0))
+    (said,) = of_drained_layer(replace(scene, region=(there,)), seconds, "in {:.3g} s")
+    assert [said] == of_drained_layer(everywhere, seconds, "in {:.3g} s")
+    assert [said] != of_drained_layer(scene, seconds, "in {:.3g} s")
+    whole = replace(there, law=replace(scene.law, mu=500.0))
+    assert [said] == of_drained_layer(replace(scene, region=(whole,)), seconds, "in {:.3g} s")
+    each = np.where(drained, 1e-6, scene.porosity.permeability)
+    by_hand = replace(everywhere, porosity=replace(everywhere.porosity, permeability=each))
+    assert [said] == of_drained_layer(by_hand, seconds, "in {:.3g} s")
+    sponge = by_element(replace(scene, region=(there,)))
+    assert "300 to 400 Pa (it differs between regions)" in porosity.bulk_in_force(sponge.porosity, sponge.law)
 
 
 @pytest.mark.parametrize(("part", "told"), [(0.3, True), (2.0, False)])

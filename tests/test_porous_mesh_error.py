@@ -92,17 +92,37 @@ def test_error_of_a_run_against_twice_refined_meshes(order, time):
     assert "; pressures are wrong by up to" in mesh_sentence(scene, found)
 
 
+def inside_column(mesh, stiffness):
+    """A bent vessel in the column of 3 cells. It becomes thinner towards the top."""
+    line = HEIGHT * (np.array([[0, 0, 0.2], [0.05, 0, 0.5], [0, 0.1, 0.8]]) + np.array([1, 1, 0]) / 12)
+    law = lj.laws.NeoHookean(mu=stiffness, bulk=2 * stiffness)
+    return vessel.along(mesh, line, 1e-4 * np.array([3.0, 2.0, 1.0]), law, wall=5e-5)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_vessel_is_cut_at_the_elements_of_the_refined_mesh(order):
+    mesh = column(3, order).mesh
+    own, fine = inside_column(mesh, SHEAR), refined(mesh)
+    again, parts = inside_column(fine, SHEAR), own.in_parts()
+    assert sorted(np.asarray(parts.element)) == sorted(np.asarray(again.element))
+    lengths = [each.freeze(None, None)._lengths(of) for each, of in ((own, mesh), (parts, fine))]
+    assert np.isclose(lengths[0].sum(), lengths[1].sum(), rtol=1e-12)
+    volumes = [(each.area() * length).sum() for each, length in zip((own, parts), lengths, strict=True)]
+    assert np.isclose(*volumes, rtol=1e-12)
+
+
 @pytest.mark.slow
-def test_a_vessel_leaves_the_pressures_out_of_the_error():
-    """A vessel's elements have no counterpart on the refined mesh. The message says what is missing."""
-    scene = column(3, 1, dt=1.0)
-    line = np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.8]]) * HEIGHT + HEIGHT / 12
-    own = vessel.along(scene.mesh, line, 1e-4, lj.laws.NeoHookean(mu=SHEAR, bulk=BULK))
-    scene = replace(scene, physics=(own,))
-    assert not can_be_refined(scene)
-    found = lj.simulate(scene, mesh_error=True)
-    assert found.mesh_error.pressure is None
-    assert "without the error of the fluid's pressures" in mesh_sentence(scene, found)
+@pytest.mark.parametrize("order", [1, 2])
+def test_error_of_a_run_with_a_vessel_against_twice_refined_meshes(order):
+    scene = column(3, order, dt=1e-2 * LONG, steps=3)
+    scene = replace(scene, physics=(inside_column(scene.mesh, 300 * SHEAR),))
+    assert can_be_refined(scene)
+    found = lj.simulate(scene, mesh_error=True).check()
+    fine = lj.simulate(on_refined_mesh(on_refined_mesh(scene)[0])[0]).check()
+    for name, value in (("positions", found.positions), ("pressure", found.pressure)):
+        truth = np.asarray(getattr(fine, name))[-1, : value.shape[1]] - np.asarray(value)[-1]
+        assert 0.5 < np.linalg.norm(getattr(found.mesh_error, name)[-1]) / np.linalg.norm(truth) < 2
+    assert "; pressures are wrong by up to" in mesh_sentence(scene, found)
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -209,6 +229,18 @@ def test_only_numbers_by_element_are_given_to_the_parts():
     assert len(on_refined_mesh(scene)[0].porosity.inlet[0].triangles) == 4 * len(whole)
     each = replace(flux, flux=jnp.full(len(whole), 1e-6))
     assert can_be_refined(scene) and not can_be_refined(replace(scene, porosity=replace(sponge, inlet=(each,))))
+
+
+@pytest.mark.slow
+def test_a_first_pressure_of_each_node_leaves_the_pressures_out_of_the_error():
+    """Such pressures are not converted to the refined mesh. The message says what is missing."""
+    scene = column(3, 1, dt=1.0)
+    first = jnp.zeros(scene.mesh.number_of_nodes)
+    scene = replace(scene, porosity=replace(scene.porosity, initial_pressure=first))
+    assert not can_be_refined(scene)
+    found = lj.simulate(scene, mesh_error=True)
+    assert found.mesh_error.pressure is None
+    assert "without the error of the fluid's pressures" in mesh_sentence(scene, found)
 
 
 @pytest.mark.slow

@@ -32,6 +32,31 @@ def _bar(cells: tuple, order: int = 1, **changes) -> lj.Scene:
     return lj.Scene(mesh=mesh, law=law, fixed=(lj.Fixed(nodes=held),), body=body, **changes)
 
 
+def test_the_error_of_a_body_that_is_about_to_buckle():
+    """The stiffness of the shape at rest gave an error of 0.2 %, where the true error was 4 %."""
+    mesh = lj.shapes.box([0.1, 0.02, 0.02], [6, 1, 1])
+    faces = lj.boundary.boundary_triangles(mesh, mesh.node_sets["x_max"])
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=750.0, bulk=2200.0),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+        traction=(lj.Traction(triangles=faces, value=jnp.array([-45.0, 0.0, -0.2])),),
+        solve=lj.Solve(steps=4),
+    )
+    model = lj.reduce_scene(scene, {"traction.0.value.0": np.linspace(-45, 0, 8)}, 1e-4)
+    pressed = lj.with_parameters(scene, {"traction.0.value.0": -55.0})
+    run = lj.simulate_reduced(model, pressed)
+    away = np.asarray(lj.reduced_positions(model, pressed, run) - lj.simulate(pressed).check().positions)
+    true = np.linalg.norm(away, axis=-1).max()
+    assert 0.5 < float(lj.reduced_error(model, pressed, run).error.max()) / true < 2
+
+
+def test_failed_training_runs_are_told():
+    scene = _bar((3, 1, 1), solve=lj.Solve(newton_iterations=8))
+    with pytest.warns(UserWarning, match=r"1 of 3 training runs failed .*body.gravity.2 = -300"):
+        lj.reduce_scene(scene, {"body.gravity.2": [-0.1, -0.2, -300.0]})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_all_motions_and_all_points_are_the_full_model(order):

@@ -15,6 +15,8 @@ from liverjax.core.errors import InputError
 
 #: Error numbers of a full disk and of an exhausted disk quota. Not every system has quotas.
 FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
+#: Exit code after Ctrl-C, as in shells.
+STOPPED = 130
 
 
 def show_unknown_letters() -> None:
@@ -50,7 +52,7 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
             print(
                 "stopped" + ("; finished parts are kept: continue with --resume" if resumable else ""), file=sys.stderr
             )
-            return 130  # the code that shells use for Ctrl-C
+            return STOPPED
         except BrokenPipeError:  # the reader of a pipe has closed it
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
@@ -63,6 +65,17 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
                 file=sys.stderr,
             )
             return 2
+
+
+def end_if_stopped(code: int) -> None:
+    """End the process at once if its exit code is that of Ctrl-C.
+
+    JAX may still compute in another thread. Python would wait for that thread, and the process could end with a crash.
+    """
+    if code == STOPPED:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
 
 
 def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:

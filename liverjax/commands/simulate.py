@@ -177,12 +177,14 @@ def _write_and_tell(given: tuple["Scene", str, list[str]], ran: "Ran", target: P
     from liverjax.core.versions import versions
     from liverjax.jobs import output
     from liverjax.physics import porosity
+    from liverjax.scenes.by_element import by_element
     from liverjax.simulation.cautions import mesh_sentence
 
     scene, text, said = given
     attributes = {"scene": text, "run_time_s": ran.run_time, "compile_time_s": ran.compile_time}
-    if scene.porosity is not None:
-        attributes["bulk"] = porosity.bulk_in_force(scene.porosity, scene.law)
+    own = by_element(scene)
+    if own.porosity is not None:
+        attributes["bulk"] = porosity.bulk_in_force(own.porosity, own.law)
         print(attributes["bulk"])
     attributes |= {"warnings": said, "versions": versions()}
     output.write_hdf5(target, scene, ran.result, attributes, found, ran.beside)

@@ -122,7 +122,7 @@ def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -
 def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> np.ndarray:
     """Return the numbers of all leaves of a value as one array (n,). Raise InputError if a leaf is not a number."""
     try:
-        if any(isinstance(leaf, (str, bytes, bool, dict)) for leaf in leaves):
+        if any(isinstance(leaf, (str, bytes, bool, dict)) or np.iscomplexobj(leaf) for leaf in leaves):
             raise TypeError
         return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in leaves]) if leaves else np.empty(0)
     except (TypeError, ValueError, OverflowError):

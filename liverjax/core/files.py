@@ -52,6 +52,18 @@ def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
         raise
 
 
+def write_whole(file: Path, text: str) -> None:
+    """Write a text file completely or not at all (see `whole`)."""
+    with whole(file) as new:
+        new.write_text(text)
+
+
+def write_rows(file: Path, rows: np.ndarray, header: str, formats: str | list[str]) -> None:
+    """Write a CSV file completely or not at all (see `whole`). `formats`: see `numpy.savetxt`."""
+    with whole(file) as new:
+        np.savetxt(new, rows, formats, ",", header=header, comments="")
+
+
 def mark_of(*arrays: object) -> str:
     """Return a string that is equal only for equal arrays (SHA-256 of type, shape and bytes)."""
     found = hashlib.sha256()

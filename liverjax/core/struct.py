@@ -1,13 +1,16 @@
 """Frozen dataclasses that are JAX pytrees, with a unit and bounds for each parameter."""
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import replace as replace
 from typing import Any, TypedDict, TypeVar, Unpack, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from liverjax.core.errors import InputError
 
 T = TypeVar("T")
 #: One number, or an array with one number per element or sample. It may be unknown (inside jit, grad or vmap).
@@ -95,6 +98,8 @@ def struct(cls: type[T]) -> type[T]:
     """Make `cls` a frozen, keyword-only dataclass that is registered as a pytree. `static` fields are not leaves."""
     made: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
     fields = dataclasses.fields(made)
+    if any(f.name in _WHOLE | _FLOATING for f in fields):
+        made.__init__ = _with_arrays(made.__init__)
     meta = tuple(f.name for f in fields if f.metadata.get("static"))
     data = tuple(f.name for f in fields if not f.metadata.get("static"))
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in data)
@@ -117,6 +122,29 @@ def struct(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
     return made
+
+
+#: Names of fields whose values are arrays of whole numbers or of floating-point numbers. A user may give a list.
+_WHOLE, _FLOATING = frozenset(("nodes", "triangles", "elements", "drained")), frozenset(("times", "history"))
+
+
+def _with_arrays(make: Callable[..., None]) -> Callable[..., None]:
+    """Return the method `make` (__init__ of a struct) that converts lists to arrays (see `_WHOLE`)."""
+
+    def converted(name: str, value: list) -> Array:
+        try:
+            if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value)):
+                return jnp.asarray(value)
+            return np.asarray(value, float if name in _FLOATING else None if value else int)
+        except (TypeError, ValueError):
+            raise InputError(f"{name} = {str(value)[:60]} is not an array of numbers: correct this list") from None
+
+    @functools.wraps(make)
+    def init(self: object, **given: object) -> None:
+        lists = {k: v for k, v in given.items() if k in _WHOLE | _FLOATING and isinstance(v, list)}
+        make(self, **given | {name: converted(name, value) for name, value in lists.items()})
+
+    return init
 
 
 def in_precision(value: Any, dtype: Any) -> Any:

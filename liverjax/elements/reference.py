@@ -61,7 +61,10 @@ def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.sparse.csr
 
 @jax.jit
 def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Nodal forces (V, 3) [N] of standard finite elements: B^T S with S = 2 dW/dC (B: `_strain_displacement`)."""
+    """Nodal forces (V, 3) [N] of standard finite elements: B^T S with S = 2 dW/dC (B: `_strain_displacement`).
+
+    Elements must not be inverted, because S is computed from C.
+    """
     F, law = _gradient(mesh, x), mesh.at_points(law)
     S = _second_piola(law, F)
     B = _strain_displacement(F, _all_shape_vectors(mesh))
@@ -88,7 +91,10 @@ def _standard_entries(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.sparse.csr_array":
-    """Stiffness (3V, 3V) [N/m] of standard finite elements, B^T D B + geometric part (Zienkiewicz and Taylor 2000)."""
+    """Stiffness (3V, 3V) [N/m] of standard finite elements, B^T D B + geometric part (Zienkiewicz and Taylor 2000).
+
+    Elements must not be inverted.
+    """
     return sparse(mesh, np.asarray(_standard_entries(mesh, law, x)))
 
 

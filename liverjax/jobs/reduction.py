@@ -15,7 +15,7 @@ from liverjax.jobs.long_run import Ran
 from liverjax.jobs.sweep import read_sweep
 from liverjax.reduced.estimate import reduced_error
 from liverjax.reduced.files import load_reduced, save_reduced
-from liverjax.reduced.model import ReducedModel
+from liverjax.reduced.model import ReducedModel, parameters_outside
 from liverjax.reduced.run import ReducedResult, reduced_positions, reduced_pressure, simulate_reduced
 from liverjax.reduced.training import reduce_scene
 from liverjax.scenes.scene import Scene
@@ -89,6 +89,8 @@ def tried(scene: Scene) -> Tried:
         f"estimated error {error.max():.2g} m"
         + (f", {error.max() / moved:.2%} of the largest displacement" if moved else "")
     )
+    outside = parameters_outside(model, plain)
+    said += f". Outside of the training range: {', '.join(outside)}" if outside else ""
     small, beside = error.max() <= solve.reduced_tolerance * moved, {"reduced_error": (error, "m")}
     P = None if model.pressures is None else reduced_pressure(model, plain, found)
     if P is not None and found.pressure_error is not None:

@@ -121,8 +121,14 @@ class Law(Energies):
 
 
 def _floating(F: Number) -> jax.Array:
-    """Return `F` as an array of floating-point numbers. Integers are converted to the default precision."""
+    """Return `F` as an array of floating-point numbers. Integers are converted to the default precision.
+
+    Raises:
+        InputError: the last two axes of `F` do not have the length 3.
+    """
     F = jnp.asarray(F)
+    if F.shape[-2:] != (3, 3):
+        raise InputError(f"F has shape {F.shape}: give deformation gradients (..., 3, 3)")
     return F if jnp.issubdtype(F.dtype, jnp.floating) else F.astype(float)
 
 

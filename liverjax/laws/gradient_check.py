@@ -330,6 +330,9 @@ def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable)
         error = value / (scale if scale > 0 else 1.0)
         found = f"{error:.1e} of the tangent" if scale > 0 else f"{value:.1e} Pa"
         rows.append(Row(name, found, f"< {EXACT_LIMIT:.0e}", bool(error < EXACT_LIMIT)))
+    smallest = _smallest_stiffness(A)
+    if smallest < -EXACT_LIMIT * scale:
+        rows.append(Row("stiffness at rest", f"{smallest:.6g} Pa for a strain", "not negative", False))
     moduli, near = _mean_moduli(A[None])[:, 0], _mean_moduli(_as_numbers(tangent, _near_rest()))
     jumps = np.ptp(near, axis=1).max() > JUMP * np.abs(near).max()
     if jumps:
@@ -347,6 +350,16 @@ def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable)
         agrees = bool(low - allowed < stated < high + allowed)
         rows.append(Row(f"ground-state {name}", found, f"stated {stated:.6g}", agrees))
     return rows
+
+
+def _smallest_stiffness(A: np.ndarray) -> float:
+    """Return the smallest eigenvalue [Pa] of the tangent A (3, 3, 3, 3) at rest, for symmetric strains. If it is
+    negative, the energy is not a minimum at rest."""
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    strains = np.zeros((6, 3, 3))
+    for own, (i, j) in zip(strains, pairs, strict=True):
+        own[i, j] = own[j, i] = 1.0 if i == j else np.sqrt(0.5)
+    return float(np.linalg.eigvalsh(np.einsum("aij,ijkl,bkl->ab", strains, A, strains)).min())
 
 
 def _mean_moduli(A: np.ndarray) -> np.ndarray:

@@ -73,8 +73,9 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
             f"mesh file {path}: tetrahedra contain node numbers that do not exist (largest number {tets.max()}, number "
             f"of nodes {len(points)}); export the mesh again"
         )
-    sets = _node_sets(data, tets, f"mesh file {path}"), _element_sets(data, cell)
-    groups = _named_triangles(data)
+    node_sets, groups = _node_sets(data, tets, f"mesh file {path}"), _named_triangles(data)
+    points, tets, node_sets, groups = _without_other_nodes(points, tets, (node_sets, groups), f"mesh file {path}")
+    sets = node_sets, _element_sets(data, cell)
     if order == 1:
         mesh = tet_mesh(points, tets, *sets)
         check_mesh(mesh, f"mesh file {path}")
@@ -90,6 +91,22 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
             stacklevel=2,
         )
     return mesh
+
+
+def _without_other_nodes(points: np.ndarray, tets: np.ndarray, sets: tuple[dict, dict], name: str) -> tuple:
+    """Return points, elements, node sets and groups of triangles without the nodes that belong to no tetrahedron:
+    centres of arcs, reference points, shells. The program warns if there are such nodes."""
+    used, (node_sets, groups) = np.unique(tets), sets
+    if len(used) == len(points):
+        return points, tets, node_sets, groups
+    warnings.warn(
+        f"{name}: {len(points) - len(used)} nodes belong to no tetrahedron. They are left out, so the nodes after them "
+        "get smaller numbers than in the file: select nodes by their positions, not by numbers",
+        stacklevel=3,
+    )
+    node_sets = {name: np.searchsorted(used, np.intersect1d(own, used)) for name, own in node_sets.items()}
+    groups = {name: np.searchsorted(used, own[np.isin(own, used).all(axis=1)]) for name, own in groups.items()}
+    return points[used], np.searchsorted(used, tets), node_sets, groups
 
 
 def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element_sets: dict, name: str) -> TetMesh:
@@ -167,7 +184,7 @@ def _read_quietly(path: Path) -> Any:
     except SystemExit:  # meshio prints the reasons and exits if none of its readers accepts the file
         reason = " ".join(said.getvalue().split()) or f"the content is not in the format of {path.suffix} files"
     except KeyError as error:  # a missing attribute, or a missing entity of a Gmsh group
-        reason = f"the entry {error.args[0]} is missing in the file"
+        reason = f"it does not know or does not find the entry {error.args[0]}"
     except Exception as error:  # meshio's readers raise many kinds of errors
         reason = " ".join(str(error).split()) or type(error).__name__
     raise InputError(f"mesh file {path} cannot be read by meshio ({reason[:120]}); export the mesh as VTU or Gmsh 2.2")

@@ -162,9 +162,17 @@ def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
 
     Pieces outside the mesh are removed.
     """
+    return cut_lines(barycentric(mesh, begin), barycentric(mesh, end))
+
+
+def cut_lines(first: np.ndarray, last: np.ndarray) -> Pieces:
+    """Cut n straight lines at the faces of E tetrahedra. Pieces outside of the tetrahedra are removed.
+
+    Args:
+        first, last: barycentric coordinates (4, n, E) of the beginning and of the end of each line in all tetrahedra.
+    """
     found = []
-    first, last = barycentric(mesh, begin), barycentric(mesh, end)
-    for line in range(len(begin)):
+    for line in range(first.shape[1]):
         a, b = first[:, line], last[:, line] - first[:, line]
         with np.errstate(divide="ignore", invalid="ignore"):
             cut = -a / b

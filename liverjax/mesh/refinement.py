@@ -7,7 +7,7 @@ import numpy as np
 from liverjax.core.struct import Array, Indices, replace
 from liverjax.mesh.adjacency import PAIRS, node_numbers
 from liverjax.mesh.promotion import middles_of_set, quadratic
-from liverjax.mesh.selection import boundary_triangles
+from liverjax.mesh.selection import boundary_triangles, check_nodes
 from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
@@ -23,9 +23,12 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
 
     Args:
         near: node numbers (n,). If given, only the edges at these nodes are halved, and the edges that must also be
-            halved so that the mesh stays conforming. An element is cut at its longest edge first (Rivara 1984), so
-            elements do not become flatter. `rim` returns the nodes around a clamp, where most of the mesh error occurs.
+            halved so that the mesh stays conforming. The result then has no element sets. An element is cut at its
+            longest edge first (Rivara 1984), so elements do not become flatter. `rim` returns the nodes around a clamp,
+            where most of the mesh error occurs.
     """
+    if near is not None:
+        check_nodes(near, mesh.number_of_nodes, "refined: near")
     V = mesh.number_of_vertices
     points: Array = mesh.points if isinstance(mesh.points, jax.core.Tracer) else np.asarray(mesh.points)
     points, (low, high) = points[:V], np.asarray(mesh.pattern.edges)
@@ -69,12 +72,25 @@ def places_in(mesh: TetMesh, fine: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 
     Returns an element (V',) that contains each node, and the barycentric coordinates (4, V') of the node in it.
     """
-    corners = _corners_of_parts(*np.eye(4), *(np.eye(4)[[i, j]].mean(axis=0) for i, j in PAIRS))  # (8, 4, 4)
+    corners = _places_of_parts()
     inside = np.concatenate([corners, corners[:, [i for i, _ in PAIRS]] / 2 + corners[:, [j for _, j in PAIRS]] / 2], 1)
     own = fine.element_nodes_on_host  # (n, 8 E)
     _, first = np.unique(own, return_index=True)
     slot, part = np.unravel_index(first, own.shape)
     return part // 8, inside[part % 8, slot].T
+
+
+def barycentric_in_parts(L: np.ndarray) -> np.ndarray:
+    """Return the barycentric coordinates (4, m, 8) of m points in the eight parts of their elements (`refined`).
+
+    `L` (4, m): barycentric coordinates of the points in their elements.
+    """
+    return np.einsum("kca,cm->amk", np.linalg.inv(_places_of_parts()), L)
+
+
+def _places_of_parts() -> np.ndarray:
+    """Return the barycentric coordinates (8, 4, 4) of the four corners of each part of an element."""
+    return _corners_of_parts(*np.eye(4), *(np.eye(4)[[i, j]].mean(axis=0) for i, j in PAIRS))
 
 
 def _triangles_in(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) -> jax.Array:
@@ -89,7 +105,11 @@ def _triangles_in(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) 
 
 
 def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
-    """Return the nodes (m,) at the border of the surface region of nodes (n,). At this border, strain is largest."""
+    """Return the nodes (m,) at the border of the surface region of nodes (n,). At this border, strain is largest.
+
+    Vertices that belong to no triangle of this region (single nodes, nodes inside the body) are returned too.
+    """
+    check_nodes(nodes, mesh.number_of_nodes, "rim: nodes", least=0)
     held = np.asarray(nodes)[np.asarray(nodes) < mesh.number_of_vertices]
     triangles = boundary_triangles(mesh, held)
     sides = np.sort(np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)

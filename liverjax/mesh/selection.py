@@ -82,7 +82,10 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
     codes = face_codes(np.sort(faces.astype(np.int64), axis=1), mesh.number_of_vertices)
     _, first, count = np.unique(codes, return_index=True, return_counts=True)
     outer = faces[np.sort(first[count == 1])]
-    return outer if nodes is None else outer[np.isin(outer, np.asarray(nodes)).all(axis=1)]
+    if nodes is None:
+        return outer
+    check_nodes(nodes, mesh.number_of_nodes, "boundary_triangles: nodes", least=0)
+    return outer[np.isin(outer, np.asarray(nodes)).all(axis=1)]
 
 
 def face_codes(triples: np.ndarray, V: int) -> np.ndarray:
@@ -115,8 +118,9 @@ def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> 
     return kept
 
 
-def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
-    """Raise `InputError` if `nodes` is not a list (n,) of node numbers below `count`, with `least` or more numbers.
+def check_nodes(nodes: Indices, count: int, name: str, least: int = 1, once: bool = False) -> None:
+    """Raise `InputError` if `nodes` is not a list (n,) of node numbers below `count`, with `least` or more numbers. If
+    `once` is true, no number may occur twice.
 
     Raises:
         InputError: `nodes` is not such a list. The message begins with `name`.
@@ -133,14 +137,23 @@ def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
             f"{name} contains node {wrong[0]}, but the mesh has only the nodes 0 to {count - 1}: give node numbers in "
             "this range (node numbers start at 0)"
         )
+    values, times = np.unique(numbers, return_counts=True) if once else (numbers, np.ones(1))
+    if np.any(times > 1):
+        raise InputError(f"{name} contains node {values[times > 1][0]} more than once: give each node once")
 
 
-def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
+def check_triangles(mesh: TetMesh, triangles: Indices, name: str, outward: bool = False) -> None:
     """Raise `InputError` if triangles (m, 3) are not faces of elements.
 
+    Args:
+        mesh: `TetMesh`.
+        triangles: node numbers (m, 3).
+        name: name of the triangles, with which the message begins.
+        outward: whether the triangles must lie on the surface, in an order with outward normals.
+
     Raises:
-        InputError: `triangles` has another shape, a node does not exist, or a triangle is not a face. The message
-            begins with `name`.
+        InputError: `triangles` has another shape, a node does not exist, a triangle occurs twice or is not a face, or
+            (if `outward`) it points inward or lies inside the body.
     """
     numbers = np.asarray(triangles)
     if numbers.ndim != 2 or numbers.shape[1] != 3:
@@ -160,3 +173,22 @@ def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
             f"{name} contains the triangle {first}, which is not a face of an element: use the triangles from "
             "boundary_triangles(mesh)"
         )
+    _, once, times = np.unique(own @ code, return_index=True, return_counts=True)
+    if np.any(times > 1):
+        first = numbers[once[times > 1][0]].tolist()
+        raise InputError(f"{name} contains the triangle {first} more than once: give each triangle once")
+    if outward:
+        way = np.concatenate([near[:, f] for f in FACES])
+        inner = np.isin(_turned(numbers[:, ::-1]) @ code, _turned(way) @ code)
+        if np.any(inner):
+            first = numbers[np.flatnonzero(inner)[0]].tolist()
+            raise InputError(
+                f"{name}: the triangle {first} points inward or lies inside the body, so its pressure has the wrong "
+                "sign: use the triangles from boundary_triangles(mesh)"
+            )
+
+
+def _turned(triangles: np.ndarray) -> np.ndarray:
+    """Return triangles (m, 3) that begin with their smallest node number, in the same direction of rotation."""
+    first = triangles.argmin(axis=1)[:, None]
+    return np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1).astype(np.int64)

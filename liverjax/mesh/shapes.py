@@ -23,6 +23,8 @@ def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
         cells: number of bricks along each edge.
     """
     _positive("size", size)
+    if len(size) != 3:
+        raise InputError(f"box size has {len(size)} numbers: give three lengths in metres")
     if len(cells) != 3 or any(int(n) != n or n < 1 for n in cells):
         raise InputError(
             f"box cells = {np.asarray(cells).tolist()} must be three positive whole numbers: give e.g. [8, 8, 8]"
@@ -135,8 +137,8 @@ def _not_too_many(tetrahedra: int, names: str) -> None:
             "give fewer cells" if names == "cells" else "use larger cells, or give lengths in metres, or add the unit"
         )
         raise InputError(
-            f"the shape with these values of {names} would have about {tetrahedra:.2g} tetrahedra, but at most "
-            f"{MOST_TETRAHEDRA:.0e} are allowed: {remedy}"
+            f"the shape with these values of {names} would have about {min(tetrahedra, 10**300):.2g} tetrahedra, but "
+            f"at most {MOST_TETRAHEDRA:.0e} are allowed: {remedy}"
         )
 
 

@@ -180,7 +180,9 @@ def tet_mesh(
     node_sets: Mapping[str, object] | None = None,
     element_sets: Mapping[str, object] | None = None,
 ) -> TetMesh:
-    """Make a mesh from positions (V, 3) [m] and node numbers (E, 4). Nothing is checked (see `check_mesh`).
+    """Make a mesh from positions (V, 3) [m] and node numbers (E, 4). The geometry is not checked (see `check_mesh`).
+
+    A set contains the numbers of its nodes or elements, or it is a mask (V,) or (E,).
 
     The positions may be unknown (inside jit, grad or vmap), but the node numbers must be known.
     """
@@ -193,7 +195,10 @@ def tet_mesh(
     neighbours = pattern(tetrahedra, points)
     tetrahedra = node_numbers(tetrahedra)
     shape_vectors, volumes = _geometry(points, tetrahedra)
-    nodes, elements = ({k: node_numbers(v) for k, v in (sets or {}).items()} for sets in (node_sets, element_sets))
+    nodes, elements = (
+        {name: node_numbers(_numbers_of_set(own, name)) for name, own in (sets or {}).items()}
+        for sets in (node_sets, element_sets)
+    )
     return TetMesh(
         points=points,
         tetrahedra=tetrahedra,
@@ -203,6 +208,16 @@ def tet_mesh(
         element_sets=elements,
         pattern=neighbours,
     )
+
+
+def _numbers_of_set(members: object, name: str) -> np.ndarray:
+    """Return the numbers of the nodes or elements of a set. The user may also give a mask (True for each member)."""
+    own = np.asarray(members)
+    if own.dtype.kind == "b":
+        return np.flatnonzero(own)
+    if own.size and own.dtype.kind not in "iu":
+        raise InputError(f"tet_mesh: the set {name!r} has numbers of type {own.dtype}: give whole numbers, or a mask")
+    return own
 
 
 def _float_copy(points: Numbers) -> jax.Array:
@@ -240,7 +255,8 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
 
     Raises:
         InputError: the mesh has no elements, node numbers out of range or positions that are not finite. Other causes
-            are flat or inverted elements, elements that occur twice or overlap, and vertices without an element.
+            are flat or inverted elements, elements that occur twice or lie on the same side of a common face, and
+            vertices without an element.
     """
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     if tets.size == 0:

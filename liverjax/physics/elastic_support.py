@@ -76,7 +76,7 @@ class ElasticSupport(Physics):
         if (self.triangles is None) == (self.nodes is None):
             raise InputError(f"{name} needs either triangles or nodes: give one of them")
         if self.nodes is not None:
-            selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
+            selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes", once=True)
             bounds.check_shape(f"{name}.stiffness", self.stiffness, (), np.shape(self.nodes))
             _refuse_idle(self, ("normal", "tangential"), name, "for springs on nodes give stiffness in N/m")
         else:

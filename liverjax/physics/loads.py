@@ -16,7 +16,11 @@ from liverjax.physics.base import NodalForce, Physics, Step
 
 @struct
 class Traction:
-    """A load on m triangles of the boundary: a dead load (`value`), or a pressure normal to the deformed triangles."""
+    """A load on m triangles of the boundary: a dead load (`value`), or a pressure normal to the deformed triangles.
+
+    Without a history and without time steps, the load grows linearly until the last load step. With time steps, the
+    whole load acts from the end of the first step on; in dynamics, from time 0 on.
+    """
 
     triangles: Indices = param("1", "node numbers (m, 3), in an order with outward normals", lower=0)
     value: Any = param("Pa", "force per reference area (3,), in a fixed direction", default=None)
@@ -39,7 +43,10 @@ class Traction:
 
 @partial(jax.jit, inline=True)
 def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
-    """Return the nodal forces (V, 3) [N] of the dead loads: reference area times traction, distributed to the nodes."""
+    """Return the nodal forces (V, 3) [N] of the dead loads: reference area times traction, distributed to the nodes.
+
+    Histories are not used (see `Traction.at`).
+    """
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for load in tractions:
         if load.value is None:

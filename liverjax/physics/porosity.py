@@ -127,6 +127,15 @@ def check_porosity(porosity: Porosity) -> None:
         InputError: the scheme is unknown, a value is out of bounds, K_lim is not above K0, or an inlet is incomplete.
     """
     check_sponge(porosity)
+    check_inlets(porosity)
+
+
+def check_inlets(porosity: Porosity) -> None:
+    """Check that every inlet is complete. Values are not checked.
+
+    Raises:
+        InputError: pressure and flux, nodes and triangles, or times and history do not belong together.
+    """
     for k, inlet in enumerate(porosity.inlet):
         name = f"porosity.inlet.{k}"
         history.check_times(inlet.times, inlet.history, name, (1,))
@@ -174,8 +183,13 @@ def law_in_force(porosity: Porosity | None, law: Law) -> Law:
 
 
 def bulk_in_force(porosity: Porosity, law: Law) -> str:
-    """Return a sentence for the report: the bulk modulus in use, and the parts of the law that are not used."""
-    sponge = f"the bulk modulus in use is the modulus {float(porosity.bulk):g} Pa of the porous body"
+    """Return a sentence for the report: the bulk modulus in use, and the parts of the law that are not used.
+
+    Both arguments may contain one value per element (`liverjax.scenes.by_element`).
+    """
+    low, high = float(np.min(np.asarray(porosity.bulk))), float(np.max(np.asarray(porosity.bulk)))
+    size = f"{low:g} Pa" if low == high else f"{low:g} to {high:g} Pa (it differs between regions)"
+    sponge = f"the bulk modulus in use is the modulus {size} of the porous body"
     if porosity.keep_bulk:
         return f"{sponge}, plus the bulk modulus of the law (keep_bulk)"
     parts = [part for own in law.pieces() for part in own.summands()]

@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core import bounds
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices, Number, Numbers, param, replace, static, struct
+from liverjax.mesh import selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, NodalForce, Physics, Step
 
@@ -46,18 +48,20 @@ class RigidPlate(Physics):
         """Raise InputError for wrong node numbers, a wrong axis or a wrong history."""
         numbers, turn = np.asarray(self.nodes), np.asarray(self.turn)
         times = np.zeros(()) if self.times is None else np.asarray(self.times)
-        if numbers.size < 2 or numbers.max() >= mesh.number_of_nodes:
-            raise InputError(
-                f"{name} has fewer than two nodes, or a node number above {mesh.number_of_nodes - 1}: correct the nodes"
-            )
+        selection.check_nodes(numbers, mesh.number_of_nodes, f"{name}.nodes", once=True)
+        if numbers.size < 2:
+            raise InputError(f"{name} has fewer than two nodes: give two nodes or more")
+        bounds.check_shape(f"{name}.axis", self.axis, (3,))
+        bounds.check_shape(f"{name}.centre", self.centre, (3,))
         if abs(np.linalg.norm(np.asarray(self.axis)) - 1) > 1e-6:
             raise InputError(
                 f"{name} axis = {self.axis} must be of length 1: give such a vector, for example [0, 0, 1]"
             )
         if times.shape != turn.shape or (times.ndim and (np.diff(times) <= 0).any()):
             raise InputError(f"{name} needs ascending times and one value of turn for each time: correct the history")
-        arms = self.at_rest(mesh).arms(mesh.points)
-        if not np.abs(np.asarray(arms)).max() > 1e-9 * np.ptp(np.asarray(mesh.points)):
+        points = np.asarray(mesh.points)
+        arms = np.cross(np.asarray(self.axis), points[numbers] - np.asarray(self.centre))
+        if not np.abs(arms).max() > 1e-9 * np.ptp(points):
             raise InputError(f"{name} has only nodes on its axis: add other nodes, or move the centre")
 
     def at_rest(self, mesh: TetMesh) -> "Plate":

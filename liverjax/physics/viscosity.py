@@ -193,6 +193,8 @@ def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
 def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax.Array:
     """Return the complex ratios gamma_k / S_h (N, ...) of N modes in steady vibration.
 
+    Ratios and times of `prony` must be (N,). If they differ between elements, call this function for each element.
+
     gamma_k is the stress that has relaxed in mode k, and S_h the stress of the law. `omega` [rad/s] are angular
     frequencies. With `dt` [s] the ratios are exact for the time-discrete recursion. Without `dt` they are the ratios in
     continuous time, g/(1 + i omega tau). The complex modulus G*, divided by the instantaneous modulus G0, is 1 minus

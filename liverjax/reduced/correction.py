@@ -47,10 +47,10 @@ class Correction:
     """Polynomials with k terms for the coefficients of m fields, and numbers that determine the stated error (module
     docstring). Both are learnt from R training runs."""
 
-    fields: jax.Array = param("1", "(m, V, 3), orthonormal with the nodal volumes as weights")
+    fields: jax.Array = param("m^-1.5", "(m, V, 3), orthonormal with the nodal volumes as weights")
     factors: jax.Array = param("m^2.5", "factor of each term in the coefficient of each field (k, m)")
     inverse: jax.Array = param("1", "inverse of the normal matrix of the terms (k, k)")
-    scale: jax.Array = param("m", "standard deviation of the first coordinate in the training")
+    scale: jax.Array = param("m^2.5", "standard deviation of the first coordinate in the training")
     statement: jax.Array = param("1", "constant and 3 exponents (4,) of the stated error, see `_logarithms`")
     left: jax.Array = param("1", "error of each left-out run, divided by its largest displacement (R,)")
     ratios: jax.Array = param("1", "stated error divided by true error of each left-out run (R,)")
@@ -60,7 +60,7 @@ class Correction:
 class Learnt(NamedTuple):
     """R training runs with T steps, from which a correction is learnt. n is the number of reduced coordinates."""
 
-    q: np.ndarray  # coordinates of the reduced runs (R, T, n) [m]
+    q: np.ndarray  # coordinates of the reduced runs (R, T, n) [m^2.5]
     missing: np.ndarray  # full minus reduced motion (R, T, V, 3) [m]
     moved: np.ndarray  # largest displacement of each run (R,) [m]
     volumes: np.ndarray  # lumped volumes of the nodes (V,) [m^3]
@@ -71,8 +71,8 @@ def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.
     """Return the values (T, k) [1] of the k terms of the polynomial at every step of a run that begins at rest.
 
     Args:
-        q: the n reduced coordinates at T steps (T, n) [m].
-        scale: standard deviation of the first coordinate in the training [m].
+        q: the n reduced coordinates at T steps (T, n) [m^2.5].
+        scale: standard deviation of the first coordinate in the training [m^2.5].
         products: number of coordinates with quadratic terms.
         dt: time step [s]; None if the scene has no time.
     """
@@ -87,8 +87,8 @@ def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.
 
 
 def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Return the correction (T, V, 3) [m] of the node positions at T steps, for the n reduced coordinates q (T, n) [m]
-    and the time step dt [s]."""
+    """Return the correction (T, V, 3) [m] of the node positions at T steps, for the n reduced coordinates q (T, n)
+    [m^2.5] and the time step dt [s]."""
     return jnp.tensordot(terms(q, own.scale, own.products, dt) @ own.factors, own.fields, axes=1)
 
 
@@ -103,7 +103,7 @@ def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None
 
     Args:
         own: `Correction`.
-        q: the n reduced coordinates at T steps (T, n) [m].
+        q: the n reduced coordinates at T steps (T, n) [m^2.5].
         moved: corrected displacements of the nodes (T, V, 3) [m].
         dt: time step [s]; None if the scene has no time.
     """

@@ -9,8 +9,10 @@ solution of the linear equations of the same body,
 with the mass matrix M, the acceleration a(e), the stiffness K of the reference shape, and the forces memory(e) of the
 history variables. These variables are updated from step to step as in the full model. The matrix of the left-hand side
 is factorised once per run. So a step needs the forces of the full mesh and one linear solve, but no Newton iterations.
-In statics the energy norm of e is the dual norm of r. The estimate neglects terms of second order in e and the change
-of the stiffness with the deformation.
+In statics the energy norm of e is the dual norm of r. The estimate neglects terms of second order in e. Near buckling,
+the deformed body is much softer than the reference shape, and K then gives a much too small error. So in statics
+without a fluid, one more equation is solved with the stiffness of the deformed body, at the step with the largest
+error. If its solution is larger by more than the factor `SOFTER`, all errors are multiplied by this ratio.
 
 In a scene with a porous body, the fluid pressures on the full mesh are computed from the reduced motion. Then the
 volume balance of the fluid is fulfilled, and only the forces are out of balance. These forces cause the errors of
@@ -54,6 +56,10 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 
+#: See the docstring of the module.
+SOFTER = 2.0
+
+
 class _Body(NamedTuple):
     """Matrices (f, f) of the linear equations for the error, where f is the number of free degrees of freedom."""
 
@@ -72,13 +78,34 @@ def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> R
         model, scene, result: arguments and result of `simulate_reduced`.
     """
     own = prepared(scene)
-    residuals, reactions, P = _out_of_balance(own, reduced_positions(model, scene, result))
+    x = reduced_positions(model, scene, result)
+    residuals, reactions, P = _out_of_balance(own, x)
     e, p = _errors(own, np.asarray(residuals))
     error = jnp.asarray(np.linalg.norm(e, axis=-1).max(axis=1))
+    worst = int(np.argmax(error))
+    if own.solve.kind == "static" and P is None:
+        larger = _softening(own, np.asarray(residuals[worst]), x[worst])
+        error = error * (larger if larger > SOFTER else 1.0)
     if P is None or p is None:
         return replace(result, error=error, reactions=reactions)
     off = np.abs(np.asarray(reduced_pressure(model, scene, result))[:, : P.shape[1]] - np.asarray(P) - p).max(axis=1)
     return replace(result, error=error, reactions=reactions, pressure_error=jnp.asarray(off))
+
+
+def _softening(scene: Scene, r: np.ndarray, x: jax.Array) -> float:
+    """Return how much larger the response to forces r (V, 3) [N] is with the stiffness at positions x (V, 3) [m] than
+    with the stiffness of the reference shape: ratio of the largest displacements of a node. Viscosity is not used."""
+    from scipy.sparse.linalg import splu
+
+    free = np.flatnonzero(np.asarray(free_directions(scene).mask).ravel())
+    springs = spring_matrix(scene)[free][:, free] if has_springs(scene) else 0.0
+    sizes = []
+    for at in (scene.mesh.points, x):
+        K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), at)[free][:, free] + springs
+        u = np.zeros(r.size)
+        u[free] = splu(K.tocsc()).solve(r.ravel()[free])
+        sizes.append(float(np.linalg.norm(u.reshape(-1, 3), axis=1).max()))
+    return sizes[1] / sizes[0] if sizes[0] > 0 else 1.0
 
 
 @jax.jit

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 #: Names of the arrays of a correction.
 _LEARNT = ("fields", "factors", "inverse", "scale", "statement", "left", "ratios")
-_UNITS = {"modes": "1", "slopes": "1/m", "weights": "m^3", "points": "1"}
+_UNITS = {"modes": "m^-1.5", "slopes": "m^-2.5", "weights": "m^3", "points": "1"}
 #: Names and units of the arrays of the pressure modes.
-_PRESSURES = {"modes": "1", "values": "1", "parts": "1", "slopes": "1/m"}
+_PRESSURES = {"modes": "m^-1.5", "values": "m^-1.5", "parts": "m^-1.5", "slopes": "m^-2.5"}
 
 
 def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") -> None:

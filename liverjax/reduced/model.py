@@ -53,10 +53,12 @@ class PressureModes:
     """The m modes of the fluid pressure, with their values at the S points of the reduced model. The modes are 0 where
     the body is drained."""
 
-    modes: jax.Array = param("1", "(m, V), orthonormal with the volumes of the vertices as weights")
-    values: jax.Array = param("1", "values at the points (S, m)")
-    parts: jax.Array = param("1", "(m, 4, S) vertex values around each point, times square roots of shape functions")
-    slopes: jax.Array = param("1/m", "gradients at the points (m, 3, S)")
+    modes: jax.Array = param("m^-1.5", "(m, V), orthonormal with the volumes of the vertices as weights")
+    values: jax.Array = param("m^-1.5", "values at the points (S, m)")
+    parts: jax.Array = param(
+        "m^-1.5", "(m, 4, S) vertex values around each point, times square roots of shape functions"
+    )
+    slopes: jax.Array = param("m^-2.5", "gradients at the points (m, 3, S)")
 
 
 @struct
@@ -64,8 +66,8 @@ class ReducedModel:
     """A reduced model of one scene with n modes and S points. The loads of the scene and the parameters of its law and
     viscosity can be changed."""
 
-    modes: jax.Array = param("1", "(n, V, 3), orthonormal with the nodal volumes as weights")
-    slopes: jax.Array = param("1/m", "gradients of the modes at the points (9, S, n), with 9 entries row by row")
+    modes: jax.Array = param("m^-1.5", "(n, V, 3), orthonormal with the nodal volumes as weights")
+    slopes: jax.Array = param("m^-2.5", "gradients of the modes at the points (9, S, n), with 9 entries row by row")
     weights: jax.Array = param("m^3", "reference volume that a point represents (S,), not negative")
     points: jax.Array = param("1", "(S,) numbers q E + e: integration point q of element e, with E elements")
     ranges: dict[str, Any] = param("1", "name of each training parameter -> its lowest and highest value")
@@ -259,6 +261,17 @@ def _course(scene: Scene) -> Content:
     return {"solve.integrator": solve.integrator, "solve.dt x solve.steps": duration}
 
 
+def parameters_outside(model: ReducedModel, scene: Scene) -> list[str]:
+    """Return the names of the parameters that are outside their training range by more than `BEYOND` of its width. The
+    values must be known (not inside jit, grad or vmap)."""
+    found = []
+    for name, bounds in model.ranges.items():
+        value, (low, high) = np.asarray(numbers_at(scene, name), float), np.asarray(bounds)
+        if np.any(np.maximum(low - value, value - high) > BEYOND * (high - low) + 1e-9 * np.abs(high)):
+            found.append(name)
+    return found
+
+
 def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
     """Raise InputError if the scene has numbers that do not occur in the training runs. A scene inside jit, grad or
     vmap is not checked.
@@ -271,15 +284,14 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
     parts = [*(getattr(scene, part) for part in _PARTS), scene.solve.dt]
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((parts, model.ranges))):
         return
-    for name, bounds in model.ranges.items():
-        value, (low, high) = np.asarray(numbers_at(scene, name), float), np.asarray(bounds)
-        if np.any(np.maximum(low - value, value - high) > BEYOND * (high - low) + 1e-9 * np.abs(high)):
-            raise InputError(
-                f"{name} = {np.array2string(value, precision=4)} is outside the training range of the reduced model "
-                f"({np.array2string(low, precision=4)} to {np.array2string(high, precision=4)}) by more than "
-                f"{BEYOND:.0%} of its width. The stated error is not valid there: use lj.reduced_error, or train the "
-                "model with a wider range"
-            )
+    for name in parameters_outside(model, scene):
+        value, (low, high) = np.asarray(numbers_at(scene, name), float), np.asarray(model.ranges[name])
+        raise InputError(
+            f"{name} = {np.array2string(value, precision=4)} is outside the training range of the reduced model "
+            f"({np.array2string(low, precision=4)} to {np.array2string(high, precision=4)}) by more than "
+            f"{BEYOND:.0%} of its width. The stated error is not valid there: use lj.reduced_error, or train the "
+            "model with a wider range"
+        )
     if not model.others:
         return  # models of an earlier version of the program do not contain these digests
     made, own = json.loads(model.others), json.loads(other_numbers(scene, {n: b[0] for n, b in model.ranges.items()}))

@@ -56,13 +56,13 @@ class ReducedResult:
     function `reduced_positions` returns the motion of the nodes."""
 
     times: jax.Array = param("s", "end of each step (T,); in a scene without time: number of the load step")
-    coordinates: jax.Array = param("m", "reduced coordinates (T, n): coordinates of the modes")
+    coordinates: jax.Array = param("m^2.5", "coordinates of the modes (T, n): numbers that multiply the modes")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
     iterations: jax.Array = param("1", "(T,) iterations of Newton's method")
     residual: jax.Array = param("1", "(T,) residual of the reduced equations, divided by the size of all forces")
-    pressures: jax.Array | None = param("Pa", "coordinates of the pressure modes (T, m)", default=None)
+    pressures: jax.Array | None = param("Pa m^1.5", "coordinates of the pressure modes (T, m)", default=None)
     error: jax.Array | None = param(
-        "m", "(T,) estimated maximum distance of a node from the full model; None if unknown", default=None
+        "m", "(T,) estimated maximum distance of a corrected node from the full model; None if unknown", default=None
     )
     reactions: jax.Array | None = param("N", "(T, V, 3), as in the full model; None if error is None", default=None)
     pressure_error: jax.Array | None = param(
@@ -239,7 +239,12 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
 
 def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
     """Return the positions (T, V, 3) [m] of the nodes. `corrected`: whether the learnt correction of the model is
-    added."""
+    added.
+
+    Raises:
+        InputError: the model was made for another scene.
+    """
+    refuse_another_scene(model, scene)
     u = _free_motion(model if corrected else replace(model, correction=None), scene, result)
     if scene.displaced:
         u = u + _prescribed_steps(scene)
@@ -250,8 +255,9 @@ def reduced_pressure(model: ReducedModel, scene: Scene, result: ReducedResult) -
     """Return the fluid pressure (T, V) [Pa] at the nodes of a porous body.
 
     Raises:
-        InputError: the scene has no porosity.
+        InputError: the scene has no porosity, or the model was made for another scene.
     """
+    refuse_another_scene(model, scene)
     if model.pressures is None or result.pressures is None:
         raise InputError("this reduced model has no pressures, because its scene has no [porosity]")
     return jax.vmap(partial(on_middles, scene.mesh))(result.pressures @ model.pressures.modes)

@@ -45,7 +45,7 @@ LEAST_MOTION = 1e-9
 class Coordinates(NamedTuple):
     """Reduced coordinates of R runs with T steps each, for n modes of the motion and m modes of the pressure."""
 
-    q: np.ndarray | jax.Array  # coordinates of the modes (R, T, n) [m]
+    q: np.ndarray | jax.Array  # coordinates of the modes (R, T, n) [m^2.5]
     p: np.ndarray | jax.Array | None  # coordinates of the pressure modes (R, T, m) [Pa]
 
 
@@ -134,7 +134,8 @@ def _contributions(
     """Return (forces, balance). forces (K, n, P) [N] are the contributions of the P points to the n reduced forces at
     the K steps `times` of a run. balance is the result of `_balance`, or None if the scene has no fluid.
 
-    `run` contains the coordinates of the modes of motion (T, n) [m] and of the m modes of pressure (T, m) [Pa].
+    `run` contains the coordinates of the modes of motion (T, n) [m^2.5] and of the m modes of pressure (T, m)
+    [Pa m^1.5].
     """
     solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
     F0, (q, p) = prescribed_gradients(whole, scene), run

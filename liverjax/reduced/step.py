@@ -50,7 +50,7 @@ class ReducedEquations(NamedTuple):
     load: jax.Array  # loads on the modes (n,) [N]
     gradient: jax.Array  # deformation gradients of the prescribed motion (9, S)
     mass: jax.Array | None  # reduced mass matrix (n, n) [kg]; None without inertia
-    q: jax.Array  # reduced coordinates at the beginning of the step (n,) [m]
+    q: jax.Array  # reduced coordinates at the beginning of the step (n,) [m^2.5]
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
@@ -63,8 +63,8 @@ class ReducedEquations(NamedTuple):
 
 
 def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
-    """Return velocity and acceleration at the end of the step, for the n reduced coordinates q (n,) [m] at this time.
-    The formulas are those of `liverjax.physics.inertia.Moving.kinematics`."""
+    """Return velocity and acceleration at the end of the step, for the n reduced coordinates q (n,) [m^2.5] at this
+    time. The formulas are those of `liverjax.physics.inertia.Moving.kinematics`."""
     assert e.motion is not None
     velocity = (q - e.q) / e.dt
     acceleration = (velocity - e.motion.velocity) / e.dt
@@ -77,7 +77,7 @@ def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
 
 
 def gradients_at(e: ReducedEquations, q: jax.Array) -> jax.Array:
-    """Return the deformation gradients (9, S) at the S points, for the n reduced coordinates q (n,) [m]."""
+    """Return the deformation gradients (9, S) at the S points, for the n reduced coordinates q (n,) [m^2.5]."""
     return e.gradient + e.model.slopes @ q
 
 
@@ -101,8 +101,10 @@ def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _residual(e: ReducedEquations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return out-of-balance forces (n,) [N] and the size of all forces [N], for the n reduced coordinates q (n,) [m]
-    and their deformation gradients F (9, S) at the S points."""
+    """Return out-of-balance forces (n,) [N m^-1.5] and the size of all forces in the same unit.
+
+    q (n,) [m^2.5] are the n reduced coordinates, and F (9, S) their deformation gradients at the S points.
+    """
     P = _point_forces(e, F)
     return _unbalanced(e, q, P, _added_up(e, P))
 
@@ -126,7 +128,7 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
 
     Args:
         e: constants of the step.
-        q: the n reduced coordinates (n,) [m].
+        q: the n reduced coordinates (n,) [m^2.5].
         P: stress times weight at the S points (9, S) [N m].
         internal: forces of P on the modes (n,) [N].
     """
@@ -170,7 +172,7 @@ def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
 class _Found(NamedTuple):
     """State at the end of a step, and the inverse tangent with which the next step begins."""
 
-    q: jax.Array  # reduced coordinates (n,) [m]
+    q: jax.Array  # reduced coordinates (n,) [m^2.5]
     residual: jax.Array  # relative residual
     iterations: jax.Array | np.ndarray
     inverse: jax.Array

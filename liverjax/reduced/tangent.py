@@ -43,7 +43,7 @@ def in_single_precision(slopes: jax.Array) -> SinglePrecision:
 
 
 def tangent_times(K: ReducedTangent, x: jax.Array) -> jax.Array:
-    """Return the product K x (n,) [N] of the tangent K and the n reduced coordinates x (n,) [m]."""
+    """Return the product K x (n,) [N m^-1.5] of the tangent K and the n reduced coordinates x (n,) [m^2.5]."""
     stress = jnp.sum(K.moduli * (K.slopes @ x)[None], axis=1)
     return jnp.tensordot(stress, K.slopes, axes=2) + K.rest @ x
 

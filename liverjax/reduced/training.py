@@ -1,6 +1,7 @@
 """Make a reduced model: choose parameter sets, run the full model, and compute modes from the displacements (proper
 orthogonal decomposition)."""
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -95,11 +96,22 @@ def _some(values: Mapping[str, np.ndarray], which: slice | np.ndarray) -> dict[s
     return {name: value[which] for name, value in values.items()}
 
 
+def _words_of(row: Mapping[str, np.ndarray]) -> str:
+    return ", ".join(f"{name} = {np.array2string(value[0], precision=4)}" for name, value in row.items())
+
+
 def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
     result = simulate_batch(scene, dict(values)).result
     good = np.all(np.asarray(result.status) == status.CONVERGED, axis=1)
     if not good.any():
         raise InputError(f"none of the {len(good)} runs converged: give smaller loads, or more steps")
+    if not good.all():
+        warnings.warn(
+            f"{np.sum(~good)} of {len(good)} training runs failed and are left out (the first has "
+            f"{_words_of(_some(values, np.flatnonzero(~good)[:1]))}). The model is not trained for such parameters: "
+            "give smaller loads, or more steps",
+            stacklevel=3,
+        )
     mask = free_degrees(scene.mesh, scene.fixed, scene.displaced)
     u = np.asarray(result.positions)[good]
     u -= np.asarray(scene.mesh.points)
@@ -142,8 +154,8 @@ def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction |
 def _coordinates_of_rows(
     model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Run the reduced model once for each of R parameter sets. Return the n reduced coordinates (R, T, n) [m], and for
-    each run whether it failed (R,)."""
+    """Run the reduced model once for each of R parameter sets. Return the n reduced coordinates (R, T, n) [m^2.5], and
+    for each run whether it failed (R,)."""
 
     def run(model: ReducedModel, values: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
         found = simulate_reduced(model, with_parameters(scene, values))

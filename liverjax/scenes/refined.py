@@ -58,23 +58,20 @@ class Within:
 def can_be_refined(scene: Scene) -> bool:
     """Return whether all entries of the scene can be converted to the refined mesh.
 
-    A vessel cannot be converted, because it contains element numbers. A load, an inlet or an object in `scene.physics`
-    with one number per triangle or per node cannot be converted either.
+    The pressure at the beginning, an inlet or an object in `scene.physics` cannot be converted if it has one number per
+    triangle or per node. A vessel can be converted if its position is known (not inside jit).
     """
 
     def plain(physics: Physics) -> bool:
         triangles = getattr(physics, "triangles", None)
         if triangles is None:
-            return not isinstance(physics, Vessel)
+            return not (isinstance(physics, Vessel) and isinstance(physics.enters, jax.core.Tracer))
         others = jax.tree.leaves(replace(physics, triangles=None))
         return all(jnp.shape(leaf)[:1] != (len(triangles),) for leaf in others)
 
     fluid = scene.porosity
     one = [fluid.initial_pressure, *(own for i in fluid.inlet for own in (i.pressure, i.flux))] if fluid else []
-    one += [load.pressure for load in scene.traction]
-    several = any(np.ndim(number) for number in one if number is not None)
-    several |= any(np.ndim(load.value) > 1 for load in scene.traction if load.value is not None)
-    return not several and all(map(plain, scene.physics))
+    return not any(np.ndim(number) for number in one if number is not None) and all(map(plain, scene.physics))
 
 
 def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
@@ -96,6 +93,9 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
         triangles = getattr(load, "triangles", None)
         return load if triangles is None else replace(load, triangles=quarters(old, triangles))  # type: ignore[type-var]
 
+    def attached(physics: Physics) -> Physics:
+        return physics.in_parts() if isinstance(physics, Vessel) else parts(physics.enriched(mesh, more))
+
     body = scene.body
     if body is not None and jnp.ndim(body.density):
         body = replace(body, density=within.field(jnp.asarray(body.density)))
@@ -110,7 +110,7 @@ def on_refined_mesh(scene: Scene) -> tuple[Scene, Within]:
         fixed=tuple(replace(f, nodes=more(f.nodes)) for f in scene.fixed),
         displaced=tuple(_moved_in_between(within, d, more(d.nodes), old.number_of_nodes) for d in scene.displaced),
         traction=tuple(map(parts, scene.traction)),
-        physics=tuple(parts(p.enriched(mesh, more)) for p in scene.physics),
+        physics=tuple(map(attached, scene.physics)),
     ), within
 
 

@@ -21,7 +21,11 @@ POROUS = ("bulk", "limit_bulk", "fluid_fraction", "permeability")
 
 @struct
 class Region:
-    """Elements with other parameters or another law than the scene. If regions overlap, the later region is used."""
+    """Elements with other parameters or another law than the scene.
+
+    If regions that change parameters overlap, the later region is used. A region with a whole law must not overlap a
+    later region that changes the law.
+    """
 
     elements: Indices = param("1", "element numbers (n,)")
     law: Content | Law | None = param(

@@ -43,7 +43,9 @@ class Body:
     history: Numbers | None = param(
         "1", "factors (T,) that multiply gravity, or gravity itself (T, 3) [m/s^2]", default=None
     )
-    mass: str = static(default="lumped", about="mass for inertia: lumped, or consistent (as in the weight)")
+    mass: str = static(
+        default="lumped", about="mass for inertia in time steps: lumped, or consistent (as in the weight)"
+    )
 
 
 @struct

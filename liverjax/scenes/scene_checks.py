@@ -3,6 +3,8 @@
 import warnings
 from collections.abc import Container
 
+import jax
+
 from liverjax.core.errors import InputError
 from liverjax.mesh.tetrahedra import check_mesh
 from liverjax.physics.prescribed import free_places
@@ -22,11 +24,14 @@ from liverjax.scenes.scene import Scene, named_physics
 
 
 def check_before_run(scene: Scene) -> None:
-    """Check choices, bounds of numbers, and nodes. Arrays inside jit are not checked. The check compiles nothing.
+    """Check choices, bounds of numbers, nodes, regions and the objects in `scene.physics`. Arrays inside jit are not
+    checked. The check compiles nothing.
 
     Raises:
         InputError: see `check_choices` and `check_bounds`; a node is not in the mesh; an element is inverted; a node is
-            fixed and moved along the same axis, is fixed although a plate moves it, or slides in two oblique planes.
+            fixed and moved along the same axis, is fixed although a plate moves it, or slides in two oblique planes;
+            regions contradict each other; a support or an obstacle has a wrong number, for example an axis that is
+            not a unit vector.
     """
     check_choices(scene)
     check_bounds(scene)
@@ -34,6 +39,16 @@ def check_before_run(scene: Scene) -> None:
     check_moved_where_fixed(scene)
     check_plates_alone(scene)
     check_normals(scene)
+    if _are_known([region.elements for region in scene.region]):
+        check_region_elements(scene)
+    with jax.ensure_compile_time_eval():  # a check may use JAX, and its numbers are known
+        for name, physics in named_physics(scene):
+            if _are_known((physics, scene.mesh)):
+                physics.check(scene.mesh, name)
+
+
+def _are_known(arrays: object) -> bool:
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arrays))
 
 
 def check_time_and_mass(scene: Scene) -> None:
@@ -45,7 +60,8 @@ def check_time_and_mass(scene: Scene) -> None:
     """
     solve = scene.solve
     loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))
-    histories = any(getattr(load, "history", None) is not None for load in loads)
+    given = (getattr(load, key, None) for load in loads for key in ("history", "times"))
+    histories = any(values is not None for values in given)
     if solve.dt is None and solve.kind != "harmonic":
         for present, what in (
             (scene.viscosity is not None, "viscosity"),

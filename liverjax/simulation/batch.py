@@ -112,6 +112,10 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
     return int(lengths[first] or 0)
 
 
+#: Tables of a scene whose numbers are checked only for their bounds in all parameter sets but the first.
+_MATERIAL = ("law", "viscosity", "porosity", "body", "region", "traction", "solve")
+
+
 def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[str, np.ndarray]]:
     """Check the numbers of each parameter set and return the sets, or an empty list inside jit, grad or vmap.
 
@@ -123,10 +127,12 @@ def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[
         return []
     on_host = {name: np.asarray(value) for name, value in parameters.items()}
     lanes = [{name: value[k] for name, value in on_host.items()} for k in range(_lanes(parameters))]
+    # Moduli, densities and loads need only their bounds. Positions and directions need all checks.
+    placed = any(name.split(".")[0] not in _MATERIAL for name in on_host)
     for k, values in enumerate(lanes):
         own = with_parameters(scene, values)
         try:
-            check_before_run(own) if k == 0 else check_bounds(own)
+            check_before_run(own) if k == 0 or placed else check_bounds(own)
         except InputError as error:
             raise InputError(f"parameter set {k} (counted from 0): {error}") from None
     return lanes

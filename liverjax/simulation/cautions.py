@@ -9,6 +9,7 @@ import numpy as np
 from liverjax.core import status
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Number
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.locate import doubled_vertices, hanging_vertices
 from liverjax.mesh.tetrahedra import TetMesh
@@ -368,14 +369,11 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
     if not len(at):
         return []
     try:
-        shear = float(np.median(np.asarray(scene.law.shear_modulus())))
+        M, limit, kappa = _moduli_and_permeability(scene, at)
     except InputError:  # a law may have no moduli
         return []
-    K0, limit, kappa = (
-        float(np.median(np.asarray(own))) for own in (sponge.bulk, sponge.limit_bulk, sponge.permeability)
-    )
     height = _height_beside(scene, at, given)
-    layer = float(np.sqrt(kappa / (1 / limit + 1 / (K0 + 4 / 3 * shear)) * seconds))
+    layer = float(np.sqrt(kappa / (1 / limit + 1 / M) * seconds))
     if layer >= height:
         return []
     return [
@@ -384,6 +382,25 @@ def of_drained_layer(scene: Scene, seconds: float, when: str) -> list[str]:
         "are wrong there (the mesh error shows how much). Use thinner elements there, or no drained nodes if nothing "
         "should flow"
     ]
+
+
+def _moduli_and_permeability(scene: Scene, at: np.ndarray) -> tuple[float, float, float]:
+    """Return medians over the elements with numbers `at`: the longitudinal modulus K0 + 4/3 mu and the limit K_lim
+    [Pa], and the permeability [m^4/(N s)]. The parameters of regions are used.
+
+    Raises:
+        InputError: the law has no moduli.
+    """
+    own = by_element(scene)
+    sponge = own.porosity
+    assert sponge is not None
+
+    def there(value: Number) -> float:
+        shape = np.broadcast_shapes(np.shape(value), (scene.mesh.number_of_elements,))
+        return float(np.median(np.broadcast_to(value, shape)[..., at]))
+
+    M = there(sponge.bulk) + 4 / 3 * there(own.law.shear_modulus())
+    return M, there(sponge.limit_bulk), there(sponge.permeability)
 
 
 #: A warning is given if the overshoot, divided by the largest pressure of the step, exceeds this value.
@@ -433,10 +450,10 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
         f"{float(scene.solve.dt) * (worst + 1):.3g} s, because the first steps are too short for the elements there"
     )
     try:
-        shear = np.median(np.asarray(scene.law.shear_modulus()))
+        M, _, kappa = _moduli_and_permeability(scene, at)
     except InputError:  # a law may have no moduli
         return [f"{said}: use a larger dt, or thinner elements there"]
-    flow = float(np.median(np.asarray(sponge.permeability)) * (np.median(np.asarray(sponge.bulk)) + 4 / 3 * shear))
+    flow = kappa * M
     enough = _FOLLOWS * height**2 / flow
     if float(scene.solve.dt) >= enough:  # then short steps are not the cause
         return []

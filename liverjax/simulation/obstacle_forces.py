@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.errors import InputError
 from liverjax.physics.base import End, Free, Start, Step
 from liverjax.physics.contact.obstacle import Obstacle, largest_depth
 from liverjax.scenes.scene import Scene
@@ -28,7 +29,15 @@ def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
     Args:
         scene: the scene that was run.
         result: `Result` of `liverjax.simulate`, with all steps, for a run from the reference positions.
+
+    Raises:
+        InputError: the result does not contain all steps.
     """
+    if len(result.positions) != scene.solve.steps:
+        raise InputError(
+            f"the result has {len(result.positions)} steps, but the scene has {scene.solve.steps}: give the result of "
+            "all steps"
+        )
     scene = prepared(scene)  # as in the run: one value per element, in the precision of the scene
     steps, dt = scene.solve.steps, 0.0 if scene.solve.dt is None else scene.solve.dt
     mesh, free = scene.mesh, Free(jnp.ones_like(scene.mesh.points))

@@ -135,7 +135,8 @@ def simulate(
         InputError: unknown choices; a time step or a mass is missing; numbers out of bounds; a loaded mesh for which no
             reference shape is found; precision "float64" although JAX's 64-bit mode is off. Inside jit, grad or vmap,
             numbers are not checked; if no reference shape is found there, the points are NaN and the status of the
-            steps is NOT_FINITE. `check_scene`, which is called when a scene file is read, checks more, mainly the mesh.
+            steps is NOT_FINITE. `check_scene`, which is called when a scene file is read, checks more: the mesh, the
+            positions of obstacles, and whether the supports prevent rigid motions.
     """
     scene = prepared(scene)
     check_time_and_mass(scene)
@@ -175,9 +176,12 @@ def simulate_part(
         report: the same argument as for `simulate`.
 
     Raises:
-        InputError: in the same cases as `simulate`.
+        InputError: in the same cases as `simulate`, and if `first` is below 1.
     """
+    if not isinstance(first, jax.core.Tracer) and first < 1:
+        raise InputError(f"the argument first = {first} must be 1 or more: steps are counted from 1")
     scene = prepared(scene)
+    check_time_and_mass(scene)
     numbers = first + jnp.arange(count, dtype=scene.mesh.points.dtype)
     return _run_part(scene, state, numbers, report)
 
@@ -192,7 +196,7 @@ def prepared(scene: Scene) -> Scene:
     conjugate gradients. Call this function before `jax.jit` if a factorisation may be chosen.
 
     Raises:
-        InputError: in the same cases as `simulate`.
+        InputError: in the same cases as `simulate`, but a time step or a mass may be missing.
     """
     scene = _ready(scene)
     return unload(scene).scene if scene.points_are == "loaded" else scene

@@ -30,7 +30,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Step
 from liverjax.physics.darcy import LEAST_J, unknown_pressures
 from liverjax.physics.porosity import Porosity, inflow, law_in_force, volumetric_slope, volumetric_stress
-from liverjax.physics.volumes.averaged import Averaged
+from liverjax.physics.volumes.averaged import Averaged, nodal_energy
 from liverjax.physics.volumes.mixed import Mixed, MixedVolume
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.matrices import Matrix, determinant, dot, scale
@@ -109,7 +109,7 @@ def _compliance(mesh: TetMesh, volume: Mixed) -> jax.Array:
 
 def _of_averaged(scene: Scene, F: Matrix) -> tuple[Scalars, Pressures]:
     mesh, J = scene.mesh, determinant(F)
-    volume = Averaged(law=scene.law)
+    volume = Averaged(law=nodal_energy(mesh, scene.law))
     volumes = integrals(mesh, jnp.ones_like(J))
     compliance = volume.matrix(mesh, J, False).diagonal[0][0] / volumes
     share = (mesh.volumes / 4)[None] * compliance[mesh.tetrahedra.T]

@@ -12,8 +12,8 @@ from liverjax.laws.base import Law
 class Logarithmic(Law):
     """W = -c1 ln(1 - c2 (Xi(alpha) - 3)) + U(J).
 
-    Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha, with the principal stretches lambda_m. Book chapter, Table 1. W is
-    infinite at Xi(alpha) = 3 + 1/c2. W is NaN for larger Xi.
+    Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha, with the principal stretches lambda_m. Book chapter, Table 1. W tends
+    to infinity at Xi(alpha) = 3 + 1/c2. There and for larger Xi, W is NaN.
     """
 
     c1: Number = param("Pa", "scale", above=0.0, typical=1925.0)

@@ -76,6 +76,9 @@ class Ligament(Physics):
         selection.check_nodes(numbers.ravel(), mesh.number_of_nodes, f"{name}.nodes")
         bounds.check_shape(f"{name}.weights", self.weights, numbers.shape)
         bounds.check_shape(f"{name}.to", self.to, (3,))
+        sums, whole = np.asarray(self.weights).sum(axis=0), 0.0 if self.to is None else 1.0
+        if np.any(np.abs(sums - whole) > 1e-6):
+            raise InputError(f"{name}.weights of each fibre must add up to {whole:g}: correct the weights")
         if (self.pre_tension is None) == (self.rest_length is None):
             raise InputError(f"{name} needs either pre_tension in N or rest_length in m: give one of them")
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))

@@ -7,7 +7,7 @@ acts in uniaxial tension along the piece, at constant volume. The tissue of the 
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +20,15 @@ from liverjax.core.struct import Indices, Number, param, struct
 from liverjax.laws import layers
 from liverjax.laws.base import Law
 from liverjax.mesh import locate
+from liverjax.mesh.adjacency import node_numbers
+from liverjax.mesh.refinement import barycentric_in_parts
 from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.physics.attached.centre_lines import CentreLines, centre_lines, read_surface
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
 
+T = TypeVar("T")
 #: Two Gauss points on a piece integrate the squared derivatives of quadratic shape functions exactly.
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3)
 
@@ -88,6 +91,8 @@ class Vessel(Physics):
             )
         for key in ("enters", "leaves"):
             bounds.check_shape(f"{name}.{key}", getattr(self, key), (4, len(numbers)))
+            if np.any(np.abs(np.asarray(getattr(self, key)).sum(axis=0) - 1) > 1e-6):
+                raise InputError(f"{name}.{key} of each piece must add up to 1: give barycentric coordinates")
         for key in ("radius", "wall"):
             bounds.check_shape(f"{name}.{key}", getattr(self, key), (), (len(numbers),))
         if self.wall is not None and np.any(np.asarray(self.wall) > np.asarray(self.radius)):
@@ -95,6 +100,29 @@ class Vessel(Physics):
                 f"{name}.wall = {self.wall} m is thicker than the radius: remove wall to get a solid cross-section"
             )
         layers.check(self.law, name)
+
+    def in_parts(self) -> "Vessel":
+        """Return the vessel on the refined mesh, where every element is cut into eight (`liverjax.mesh.refinement`).
+
+        The position of the vessel must be known (not inside jit).
+        """
+        m = len(np.asarray(self.element))
+        first, last = (barycentric_in_parts(np.asarray(L)) for L in (self.enters, self.leaves))
+        cut = locate.cut_lines(first, last)
+        begin, end = (each[:, cut.line, cut.element] for each in (first, last))
+        enters, leaves = (begin + at * (end - begin) for at in (cut.begin, cut.end))
+
+        def of_pieces(numbers: T) -> T:
+            return jax.tree.map(lambda v: v[..., cut.line] if jnp.shape(v)[-1:] == (m,) else v, numbers)
+
+        return Vessel(
+            element=node_numbers(8 * np.asarray(self.element)[cut.line] + cut.element),
+            enters=jnp.asarray(enters, self.enters.dtype),
+            leaves=jnp.asarray(leaves, self.leaves.dtype),
+            radius=of_pieces(self.radius),
+            wall=of_pieces(self.wall),
+            law=of_pieces(self.law),
+        )
 
     def freeze(self, memory: None, step: Step) -> "Bars":
         """Return the force term of the vessel for one step.

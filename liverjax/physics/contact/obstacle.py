@@ -55,9 +55,13 @@ class Obstacle(Physics):
         "m", "point of plane or cylinder axis, centre of sphere, tip of cone (3,)", default=(0.0, 0.0, 0.0)
     )
     axis: Numbers = param(
-        "1", "outward normal of a plane, axis of a cylinder, or inward axis of a cone (3,)", default=(0.0, 0.0, 1.0)
+        "1",
+        "unit vector (3,): outward normal of a plane, axis of a cylinder, or inward axis of a cone",
+        default=(0.0, 0.0, 1.0),
     )
-    radius: Number = param("m", "radius of sphere, cylinder or the rounded tip of a cone", lower=0.0, default=0.0)
+    radius: Number = param(
+        "m", "radius of sphere, cylinder or the rounded tip of a cone", lower=0.0, default=0.0, typical=0.01
+    )
     half_angle: Number = param("deg", "angle between axis and side of a cone", above=0.0, default=45.0)
     by: Numbers | None = param("m", "displacement (3,), reached at the last step", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)

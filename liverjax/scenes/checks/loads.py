@@ -2,11 +2,13 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 
 from liverjax.core import history
 from liverjax.core.errors import InputError
 from liverjax.physics.loads import Traction
+from liverjax.physics.porosity import check_inlets
 from liverjax.physics.prescribed import Displaced, check_axes
 from liverjax.scenes.scene import Body, Scene
 
@@ -22,6 +24,8 @@ def check_loads(scene: Scene) -> None:
     """
     for k, load in enumerate(scene.traction):
         _check_traction(load, f"traction.{k}")
+    if scene.porosity is not None:
+        check_inlets(scene.porosity)
     if scene.body is not None:
         _check_body(scene.body, scene.mesh.number_of_nodes)
     for k, hold in enumerate(scene.fixed):
@@ -39,17 +43,22 @@ def _check_traction(load: Traction, name: str) -> None:
     if (load.value is None) == (load.pressure is None):
         raise InputError(f"{name} needs either value (3,) or pressure, in Pa: give one of them")
     key, shape = ("pressure", ()) if load.value is None else ("value", (3,))
-    if np.shape(getattr(load, key)) != shape:
+    if _shape(getattr(load, key)) != shape:
         wanted = f"shape {shape}" if shape else "one number"
-        raise InputError(f"{name} {key} has shape {np.shape(getattr(load, key))}: give {wanted}")
+        raise InputError(f"{name} {key} has shape {_shape(getattr(load, key))}: give {wanted}")
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    """Return the shape of a value. NumPy cannot determine the shape of a sequence of numbers inside jit."""
+    if isinstance(value, tuple | list) and all(np.ndim(one) == 0 for one in value):
+        return (len(value),)
+    return np.shape(value)
 
 
 def _check_motion(motion: Displaced, name: str) -> None:
     history.check_times(motion.times, motion.history, name, (3,) if motion.by is None else (1,))
     check_axes(motion.axes, name)
-    # NumPy cannot determine the shape of a tuple of JAX tracers (numbers inside jit).
-    by: Any = motion.by
-    shape = (3,) if isinstance(by, tuple | list) and len(by) == 3 and np.ndim(by[0]) == 0 else np.shape(by)
+    by, shape = motion.by, _shape(motion.by)
     if by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
         raise InputError(f"{name} 'by' has shape {shape}: give three numbers in m, or three per node")
     if motion.by is None and motion.history is None:
@@ -59,11 +68,16 @@ def _check_motion(motion: Displaced, name: str) -> None:
 def _check_body(body: Body, nodes: int) -> None:
     if body.mass not in MASSES:
         raise InputError(f"[body] mass = {body.mass!r} is not known: use {' or '.join(MASSES)}")
-    # NumPy cannot determine the shape of a tuple of JAX tracers (numbers inside jit).
-    gravity = (len(body.gravity),) if isinstance(body.gravity, tuple) else np.shape(body.gravity)
+    gravity = _shape(body.gravity)
     density = np.shape(body.density)
     if density not in ((), (nodes,)):
         raise InputError(f"[body] density has shape {density}: give one number or one per node ({nodes},), in kg/m^3")
     history.check_times(body.times, body.history, "body")
     if gravity != (3,):
         raise InputError(f"[body] gravity has shape {gravity}: give three numbers in m/s^2")
+    if getattr(body.history, "ndim", 1) == 2 and not _unknown(body.gravity) and np.any(np.asarray(body.gravity) != 0):
+        raise InputError("[body] has gravity, and also a history of gravity: remove one of them")
+
+
+def _unknown(value: object) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))

@@ -24,6 +24,11 @@ def check_known_nodes(scene: Scene) -> None:
         if nodes is not None and not isinstance(nodes, jax.core.Tracer):
             numbers = np.asarray(nodes)
             check_nodes(numbers.ravel() if name.endswith("triangles") else numbers, mesh.number_of_nodes, name, least=0)
+    for k, motion in enumerate(scene.displaced):
+        if getattr(motion.by, "ndim", 1) == 2 and not isinstance(motion.nodes, jax.core.Tracer):
+            check_nodes(motion.nodes, mesh.number_of_nodes, f"displaced.{k}.nodes", once=True)
+    if mesh.order < 3 and not isinstance(mesh.tetrahedra, jax.core.Tracer):
+        _check_loaded_triangles(scene)
     if not isinstance(mesh.volumes, jax.core.Tracer):
         wrong = int(np.sum(~(np.asarray(mesh.volumes) > 0)))
         if wrong:
@@ -32,14 +37,23 @@ def check_known_nodes(scene: Scene) -> None:
             )
 
 
+def _check_loaded_triangles(scene: Scene) -> None:
+    """Check the triangles of loads and fluxes that are known (not inside jit)."""
+    inlets = () if scene.porosity is None else scene.porosity.inlet
+    named = [(f"traction.{k}.triangles", own.triangles, own.pressure) for k, own in enumerate(scene.traction)]
+    named += [(f"porosity.inlet.{k}.triangles", own.triangles, None) for k, own in enumerate(inlets)]
+    for name, triangles, pressure in named:
+        if triangles is not None and not isinstance(triangles, jax.core.Tracer):
+            check_triangles(scene.mesh, triangles, name, outward=pressure is not None)
+
+
 def check_places(scene: Scene) -> None:
     """Raise InputError if nodes or triangles are not in the mesh, or if an inlet has no effect."""
     mesh = scene.mesh
     for kind in ("fixed", "displaced"):
         for k, condition in enumerate(getattr(scene, kind)):
             check_nodes(condition.nodes, mesh.number_of_nodes, f"{kind}.{k}.nodes", least=0)
-    for k, load in enumerate(scene.traction):
-        check_triangles(mesh, load.triangles, f"traction.{k}.triangles")
+    _check_loaded_triangles(scene)
     if scene.porosity is None:
         return
     if scene.porosity.drained is not None:
@@ -49,8 +63,6 @@ def check_places(scene: Scene) -> None:
         if inlet.nodes is not None:
             check_nodes(inlet.nodes, mesh.number_of_nodes, f"porosity.inlet.{k}.nodes")
             _has_vertices(mesh, inlet.nodes, f"porosity.inlet.{k}")
-        else:
-            check_triangles(mesh, inlet.triangles, f"porosity.inlet.{k}.triangles")
     _inlets_that_act(scene.porosity)
 
 

@@ -37,6 +37,8 @@ def check_region_elements(scene: Scene) -> None:
     last = scene.mesh.number_of_elements - 1
     for k, region in enumerate(scene.region):
         elements = np.asarray(region.elements)
+        if elements.size and elements.dtype.kind not in "iu":
+            raise InputError(f"region.{k} has element numbers of type {elements.dtype}: give whole numbers")
         if elements.size == 0 or elements.min() < 0 or elements.max() > last:
             raise InputError(f"region.{k} has no elements, or element numbers outside 0 to {last}: correct the numbers")
         if not region.law and not region.viscosity and not region.porosity:
