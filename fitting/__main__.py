@@ -5,7 +5,7 @@ import importlib
 import sys
 
 from liverjax.commands.arguments import with_joined_numbers
-from liverjax.commands.exit_codes import exit_code, show_unknown_letters
+from liverjax.commands.exit_codes import end_if_stopped, exit_code, show_unknown_letters
 
 #: Names of the commands for tests that are not frequency sweeps. A command line without one of these names is for a
 #: frequency sweep.
@@ -15,13 +15,18 @@ COMMANDS = ("curves", "field", "relaxation", "creep", "indentation", "amplitude"
 def main(arguments: list[str] | None = None, prog: str = "python -m fitting") -> int:
     """Run a command line and return the exit code: 0 (done), 1 (not converged) or 2 (unusable input)."""
     show_unknown_letters()
-    arguments = sys.argv[1:] if arguments is None else arguments
+    given = sys.argv[1:] if arguments is None else arguments
     name = "sweep"
-    if arguments[:1] and arguments[0] in COMMANDS:
-        name, arguments = arguments[0], arguments[1:]
+    if given[:1] and given[0] in COMMANDS:
+        name, given = given[0], given[1:]
         prog = f"{prog} {name}"
     command = importlib.import_module(f"fitting.commands.{name}")  # only this command is loaded, to save time
-    return exit_code(command.run, command.parser(prog).parse_args(with_joined_numbers(arguments)))
+    options = command.parser(prog).parse_args(with_joined_numbers(given))
+    resumable = "resume" in options and not getattr(options, "parameters", None)
+    code = exit_code(command.run, options, resumable)
+    if arguments is None:
+        end_if_stopped(code)
+    return code
 
 
 if __name__ == "__main__":

@@ -258,6 +258,29 @@ def test_ctrl_c_is_one_word_and_exit_code_130(monkeypatch, capsys):
     assert capsys.readouterr().err == "stopped\n"
 
 
+def test_ctrl_c_names_resume_if_the_fit_can_be_continued(monkeypatch, capsys):
+    from fitting.commands import field
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(field, "run", stopped)
+    assert main(["field", "scene.toml", "u.csv"]) == 130
+    assert capsys.readouterr().err == "stopped; finished parts are kept: continue with --resume\n"
+    assert main(["field", "scene.toml", "u.csv", "--parameters", "law.mu"]) == 130
+    assert capsys.readouterr().err == "stopped\n"
+
+
+def test_after_ctrl_c_a_command_does_not_wait_for_computations():
+    """JAX may compute in another thread. The process waited for this thread, and then crashed in a call of Python."""
+    code = (
+        "import sys, threading, time\nfrom liverjax.commands.exit_codes import end_if_stopped\n"
+        "threading.Thread(target=time.sleep, args=(60,)).start()\nprint('written')\nend_if_stopped(int(sys.argv[1]))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, "130"], capture_output=True, text=True, timeout=50, check=False)
+    assert ended.returncode == 130 and ended.stdout == "written\n"
+
+
 def test_laws_lists_every_parameter(capsys):
     assert liverjax_main(["laws"]) == 0
     out = capsys.readouterr().out

@@ -138,6 +138,18 @@ def test_columns_that_hold_something_else_are_named(meaning, tmp_path, capsys):
         assert 980 < float(told[0].split("G0 ")[1].split(" Pa")[0]) < 1020
 
 
+def test_two_meanings_that_explain_the_data_alike_are_both_named(tmp_path, capsys):
+    """The zero of the stretch is wrong. An offset of the stress explains the data as well, and only it was named."""
+    stretch = np.linspace(1.0, 1.4, 30)
+    P = 1000 * np.exp(1.5 * (stretch**2 + 2 / stretch - 3)) * (stretch - stretch**-2)
+    P += 5 * np.random.default_rng(0).standard_normal(30)
+    rows = "".join(f"uniaxial,{x:.6g},{p:.6g}\n" for x, p in zip(stretch + 0.01, P, strict=True))
+    (tmp_path / "c.csv").write_text("test,stretch,nominal_stress_Pa\n" + rows)
+    assert main(["curves", "fung_demiray", str(tmp_path / "c.csv"), "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().err
+    assert "if the zero of the stretch were off by 0.0" in said and "an offset of -" in said
+
+
 def test_components_and_named_tests_are_the_same_data(tmp_path):
     l, g = np.linspace(0.8, 1.2, 5), np.linspace(0, 0.3, 4)
     names = [f"{a}{i}{j}" for a in "FP" for i in (1, 2, 3) for j in (1, 2, 3)]

@@ -330,3 +330,7 @@ def test_a_law_without_a_finite_stress_is_named(tmp_path, capsys):
     (tmp_path / "c.csv").write_text(f"test,stretch,nominal_stress_Pa\n{rows}\n")
     words = ["curves", f"{tmp_path}/root.py:Root", str(tmp_path / "c.csv"), "--out", str(tmp_path / "out")]
     assert main(words) == 2 and "Root: the stress is not finite on these curves" in capsys.readouterr().err
+    rows = "\n".join(f"1,{g:.3f},{800 + g:.4f},{100 + g:.4f}" for g in np.geomspace(1, 60, 9))
+    (tmp_path / "sweep.csv").write_text(f"frequency_Hz,strain_%,storage_modulus_Pa,loss_modulus_Pa\n{rows}\n")
+    words = ["amplitude", f"{tmp_path}/root.py:Root", str(tmp_path / "sweep.csv"), "--out", str(tmp_path / "out")]
+    assert main(words) == 2 and "Root: the stress is not finite on this sweep" in capsys.readouterr().err

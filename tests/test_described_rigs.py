@@ -113,6 +113,18 @@ def test_a_glued_sample_s_stiffness_is_that_of_another_program(tmp_path):
     np.testing.assert_allclose(test.answer[test.used] / test.driven[test.used], 800, rtol=0.005)
 
 
+@SLOW
+def test_a_negative_displacement_in_tension_is_told(tmp_path):
+    time = np.arange(1.0, 7.0)
+    table = {"test": "tension", "radius": 0.01, "height": 0.01}
+    up, down = (
+        read_described(written(tmp_path, table, (time, sign * 1e-6 + 0 * time, sign * 1e-4 * (1 + 1 / time))))
+        for sign in (1, -1)
+    )
+    assert "write test = 'compression'" in " ".join(down.notes) and "compression" not in " ".join(up.notes)
+    np.testing.assert_allclose(down.answer[down.used], up.answer[up.used])
+
+
 @pytest.mark.parametrize("drive", ["displacement", "force"])
 def test_a_load_that_was_there_at_once(tmp_path, drive):
     """Without a row at 0 s, a constant load is read as a ramp, with a note. With ramp = 0 it is read as a step."""
@@ -242,7 +254,7 @@ def test_the_commands_take_a_description(tmp_path):
         ({"height": 1e-4}, "more than half of the height"),
         ({"data": 3}, "must name a file"),
         ({"ramp": 0.5}, "ramp = 0.5 cannot be used; remove ramp"),
-        ({"min_time": -3.0}, "min_time = -3 is negative; give the time after the load"),
+        ({"min_time": -3.0}, "min_time = -3 is negative; give a time of the data file"),
         ({"data": "none.csv"}, "none.csv"),
         ({"data": "shear.csv"}, "needs columns of time, displacement and force"),
         ({"data": "still.csv"}, "displacement is zero throughout"),

@@ -80,8 +80,9 @@ def test_bad_options_are_one_sentence(tmp_path, more, words, capsys):
         "node;UX;UY;UZ\n5;0,001;;-2e-4\n6;0;0,25;1\n",
         "# node,ux,uy,uz\n5,1e-3,,-2e-4\n# no more points\n6,0,0.25,1\n",
         "node\tux\tuy\tuz\n5\t1e-3\tnan\t-2e-4\n6\t0\t0.25\t1\n",
+        "node,ux,uy,uz,\n5,1e-3,,-2e-4,\n6,0,0.25,1,\n",
     ],
-    ids=["spreadsheet", "savetxt", "tabs"],
+    ids=["spreadsheet", "savetxt", "tabs", "a separator at the end"],
 )
 def test_tables_of_displacements_of_other_programs(tmp_path, written):
     (tmp_path / "u.csv").write_text(written)

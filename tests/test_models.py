@@ -13,7 +13,7 @@ from fitting.__main__ import main
 from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.fits.families import limits as family_limits
 from fitting.fits.families import models
-from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots
+from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.rheometer import Sweep, read_sweep
 from fitting.reports import sweep_report
@@ -458,6 +458,26 @@ def test_an_exponent_at_its_bound_is_told():
     s = Sweep(OMEGA, 1e-3 * OMEGA, 10.0 * OMEGA)
     (fit,) = (f for f in models.fractional(s) if f.kind.name == "springpot")
     assert any("exponent is at its bound 1: the springpot is a dashpot" in w for w in fit.warnings)
+    assert any("no finite instantaneous modulus" in w for w in fit.warnings)
+
+
+def test_only_prony_modes_of_a_solid_have_profile_intervals():
+    s = Sweep(OMEGA, 10 * OMEGA**0.3, 5 * OMEGA**0.3)
+    (fit,) = (f for f in models.fractional(s) if f.kind.name == "springpot")
+    assert not uncertainty.has_profile(fit.solution, fit.uncertainty)
+    with pytest.raises(InputError, match="profile intervals are for Prony modes of a solid"):
+        uncertainty.profile_intervals(fit.solution, s, fit.uncertainty)
+    solid = viscoelastic.closed_form(s, 1)
+    assert uncertainty.has_profile(solid.solution, solid.uncertainty)
+
+
+def test_a_springpot_that_is_a_spring_gives_a_finite_modulus():
+    """At high frequencies a Maxwell model is its spring, but it was told to have no finite instantaneous modulus."""
+    G = 1j * OMEGA * 100 / (1 + 1j * OMEGA * 100 / 700.0)
+    (fit,) = (f for f in models.fractional(Sweep(OMEGA, G.real, G.imag)) if f.kind.name == "fractional_maxwell")
+    assert any("the springpot is a spring" in w for w in fit.warnings)
+    assert not any("no finite instantaneous modulus" in w for w in fit.warnings)
+    assert np.isclose(fit.model.shear_modulus, 700, rtol=0.02)
 
 
 def test_a_small_exponent_that_is_known_is_at_no_bound_and_has_modes():

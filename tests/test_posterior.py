@@ -219,6 +219,7 @@ def test_the_command_writes_draws_and_their_summary(tmp_path, capsys):
         assert row["interval_95"][0] < value < row["interval_95"][1]
         assert np.isclose(np.median(rows[name]), row["median"], rtol=1e-6)
     assert "posterior: 4 chains of 200" in capsys.readouterr().out
+    assert not list(tmp_path.glob("*.part"))  # each file is written beside its place, and then renamed
 
 
 def test_a_springpot_has_the_errors_of_its_curvature():

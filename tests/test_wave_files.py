@@ -45,6 +45,17 @@ def test_a_file_of_any_format_is_read_as_it_was_written(tmp_path, ending):
     np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-6 * scale)
 
 
+def test_a_wrong_spacing_of_the_file_is_replaced(tmp_path):
+    """A spacing in mm was refused as too large for a voxel, although --spacing gave the right one."""
+    field = plane_waves((5, 5, 5))
+    np.savez(tmp_path / "w.npz", displacement=field.displacement, frequencies=HERTZ, spacing=1e3 * np.full(3, H))
+    found = wave_field.read_waves(tmp_path / "w.npz", spacing=[H, H, H])
+    np.testing.assert_allclose(found.spacing, H)
+    assert any("the file states a spacing of" in note for note in found.notes)
+    with pytest.raises(InputError, match="too large for a voxel"):
+        wave_field.read_waves(tmp_path / "w.npz")
+
+
 def test_a_table_may_have_the_columns_of_other_formats(tmp_path):
     """A column frequency_Hz was ignored if --frequencies was given, and so were mask and labels."""
     field = plane_waves((5, 5, 5))

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.errors import InputError
 from liverjax.laws.base import Law
 from liverjax.laws.terms.stretch_terms import stress_at_constant
 from liverjax.tensors.matrices import pack, unpack
@@ -46,7 +47,12 @@ def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel")
         memories: M sets of modulus ratios m = G*(n omega) / G0, complex (M, `INSTANTS` / 2 + 1), for the harmonics
             n = 0 to `INSTANTS` / 2 of the angular frequency omega. The reported moduli are linear in m.
         plates: "parallel", or "cone" (cone and plate, where the strain is the same everywhere).
+
+    Raises:
+        InputError: `plates` has another value.
     """
+    if plates not in ("parallel", "cone"):
+        raise InputError(f"plates = {plates!r} is not known: use parallel or cone")
     rho, weights = _radii_and_weights(plates)
     own = np.asarray(strains)[:, None] * rho
     shear = own[..., None] * np.sin(2 * np.pi * np.arange(INSTANTS) / INSTANTS)

@@ -100,6 +100,8 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
 
     If `memory` has no Prony series, the loss tangent is an additional parameter of the fit. The fitted modulus is then
     valid only at the frequency of the sweep.
+
+    `plates`: see `cycle.reading`.
     """
     own = candidate if memory.series is not None else with_loss_tangent(candidate)
     memories = memory.of(sweep.angular_frequency)

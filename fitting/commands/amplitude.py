@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from fitting.commands import shared_options
 from fitting.commands.exit_codes import EXIT_CODES
 from liverjax.core.errors import InputError
 from liverjax.core.files import writable
@@ -63,7 +64,8 @@ def run(options: argparse.Namespace) -> int:
     writable(options.out, ("fit.json", "fit.png"))
     bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
     fits = [law_fit.fit_law(candidate, sweep, memory, options.plates or "parallel") for candidate in bar]
-    fits.sort(key=lambda f: f.law.aicc)
+    wrong = shared_options.laws_without_finite_stress([fit.law for fit in fits], "this sweep")
+    fits = sorted((fit for fit in fits if fit.law.label not in wrong), key=lambda f: f.law.aicc)
     outside = law_fit.outside_series(memory, sweep.angular_frequency)
     content = amplitude_report.write(options.out, sweep, fits, [outside] if outside else [])
     print(amplitude_report.table(sweep, fits))

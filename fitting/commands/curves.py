@@ -3,18 +3,11 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from fitting.commands import shared_options
 from fitting.commands.exit_codes import EXIT_CODES
 from liverjax import laws
-from liverjax.core.errors import InputError
 from liverjax.core.files import writable
-
-if TYPE_CHECKING:
-    from fitting.fits.stress_stretch import LawFit
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
@@ -40,18 +33,6 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--out", type=Path, default=Path("curves"), metavar="DIR", help="folder of the results (default curves)"
     )
     return command
-
-
-def _with_finite_stress(fits: "list[LawFit]") -> "list[LawFit]":
-    """Return the fits whose law has a finite stress on the curves. The program warns about the other laws. Raises
-    `InputError` if no law remains."""
-    wrong = [f.label for f in fits if not np.isfinite(f.mean_relative_error)]
-    told = f"{', '.join(wrong)}: the stress is not finite on these curves; check the law with python -m liverjax check"
-    if len(wrong) == len(fits):
-        raise InputError(told)
-    if wrong:
-        print(f"warning: {told}. These laws are ignored", file=sys.stderr)
-    return [f for f in fits if f.label not in wrong]
 
 
 def run(options: argparse.Namespace) -> int:
@@ -81,7 +62,8 @@ def run(options: argparse.Namespace) -> int:
     writable(options.out, ("curves.json", "curves.png"))
     bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
     fits = [stress_stretch.fit(candidate, found) for candidate in bar]
-    fits = _with_finite_stress(fits)
+    wrong = shared_options.laws_without_finite_stress(fits, "these curves")
+    fits = [fit for fit in fits if fit.label not in wrong]
     structured = structured_curves(found, curves_report.best_first(fits)[0], options.law == "all")
     curves_report.write(options.out, found, fits, structured)
     print(curves_report.table(fits))

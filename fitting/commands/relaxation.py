@@ -45,7 +45,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="S",
         help="duration [s] of the rise of the load before the first row under load, if no row shows it; 0: a step",
     )
-    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="ignore responses before this time")
+    command.add_argument(
+        "--min-time", type=float, default=0.0, metavar="S", help="ignore responses before this time of the file"
+    )
     command.add_argument("--radius", type=float, metavar="M", help="radius of the sample [m], for torque and force")
     command.add_argument("--height", type=float, metavar="M", help="height of the sample [m], for torque and force")
     shared_options.add_cards_and_samples(command)

@@ -7,9 +7,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from liverjax.core.errors import InputError
 
 if TYPE_CHECKING:
+    from fitting.fits.stress_stretch import LawFit
     from fitting.methods.generalised_maxwell import Maxwell
     from fitting.readers.frequency_sweep import Sweep
 
@@ -28,6 +31,21 @@ def refuse_copies(files: list[Path]) -> None:
         first = seen.setdefault(file.read_bytes(), file)
         if first is not file:
             raise InputError(f"{file} is the same measurement as {first}: give each measurement once")
+
+
+def laws_without_finite_stress(fits: "list[LawFit]", data: str) -> list[str]:
+    """Return the names of the laws whose stress is not finite on the data, and warn that these laws are ignored.
+
+    Raises:
+        InputError: no law has a finite stress.
+    """
+    wrong = [f.label for f in fits if not np.isfinite(f.mean_relative_error)]
+    told = f"{', '.join(wrong)}: the stress is not finite on {data}; check the law with python -m liverjax check"
+    if wrong and len(wrong) == len(fits):
+        raise InputError(told)
+    if wrong:
+        print(f"warning: {told}. These laws are ignored", file=sys.stderr)
+    return wrong
 
 
 def add_cards_and_samples(command: argparse.ArgumentParser) -> None:

@@ -174,7 +174,9 @@ def run(options: argparse.Namespace) -> int:
     for fit in fits:
         fit.details.update(shift)
     profile = None
-    if options.profile:
+    if options.profile and not uncertainty.has_profile(fits[0].solution, fits[0].uncertainty):
+        print("note: --profile has no effect, because it is for Prony modes of a solid", file=sys.stderr)
+    elif options.profile:
         profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
     posterior = _posterior(options, sweep, fits[-1])
     predictions = _predictions(tests, sweep, fits[-1])

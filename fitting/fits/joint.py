@@ -22,6 +22,7 @@ from fitting.methods import generalised_maxwell
 from fitting.methods.estimate import Estimate, bias_sentences, estimated, mesh_bias
 from fitting.methods.least_squares import levenberg_marquardt_host
 from fitting.methods.uncertainty import parameter_names, parameter_vector
+from fitting.readers.frequency_sweep import check_sweep
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import glued, torsion
 from liverjax import laws
@@ -48,6 +49,7 @@ class Test(NamedTuple):
 def sweep(data: Sweep) -> Test:
     """Return the test for a frequency sweep that is predicted in closed form. The noise comes from the file, or from
     the misfit of the best Prony modes if the file gives no noise."""
+    check_sweep(data)
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
@@ -58,14 +60,26 @@ def sweep(data: Sweep) -> Test:
 
 def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.Drive = torsion.Drive()) -> Test:
     """Return the test for a frequency sweep that the torsion simulation predicts, at the torque amplitudes `torque` [N
-    m]. `rig.free_height` states whether the height of the sample is free."""
+    m]. `rig.free_height` states whether the height of the sample is free.
+
+    The moduli are corrected for the mesh. The error of the time steps is that at small strain; it is unknown if the rig
+    has a density or is compressed.
+    """
+    check_sweep(data)
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
         found = torsion.moduli(rig, law, viscosity, omega, torque, drive)
         return jnp.concatenate([found.storage, found.loss]), jnp.max(found.statistics.status)
 
-    return Test("torsion", predict, np.concatenate([data.storage, data.loss]), _noise_of(data))
+    def errors(law, viscosity):
+        exact, found = (torsion.linear_moduli(law, viscosity, omega, steps) for steps in (None, drive.steps))
+        of_steps = np.asarray(exact - found)
+        return jnp.zeros(2 * len(of_steps)), np.concatenate([of_steps.real, of_steps.imag])
+
+    known = rig.density is None and rig.held is None
+    measured = np.concatenate([data.storage, data.loss])
+    return Test("torsion", predict, measured, _noise_of(data), errors if known else None)
 
 
 def _noise_of(data: Sweep) -> np.ndarray:
@@ -114,11 +128,11 @@ def fit(
     max_iterations: int = 30,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Estimate:
-    """Fit the Maxwell parameters to all tests, and return them with standard errors. `uncertainty.parameter_names`
-    gives the names of these parameters.
+    """Fit the Maxwell parameters (`uncertainty.parameter_names`) to all tests. Return them with standard errors.
 
     If tests are simulated in rigs, `mesh_bias` and `time_step_bias` are the errors of each parameter due to meshes and
-    time steps. Subtract both to correct the parameter. A warning is given if one of them exceeds the standard error.
+    time steps. Subtract both to correct the parameter. A warning is given if one of them exceeds the standard error. A
+    test whose errors are unknown (`Test.errors`) counts as exact.
 
     Args:
         tests: one or more tests.

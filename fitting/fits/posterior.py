@@ -46,6 +46,11 @@ PRIORS = {
     "fractional": "moduli at the middle of the band are log-uniform within a factor of 1000 of the measured moduli; "
     "exponents are uniform",
 }
+#: Words of `PRIORS` -> words for a test in time, whose prior is relative to the fitted G0 (`of_time_test`).
+_OF_TIME_TESTS = {
+    "from the smallest measured modulus to 1000 times the largest": "from 0.01 to 1000 times the fitted G0",
+    "within a factor of 1000 of the measured moduli": "from 1e-5 to 1000 times the fitted G0",
+}
 
 
 class Posterior(NamedTuple):
@@ -154,7 +159,9 @@ def target(
     if kind.values is None:
         times = (np.log(resolved[0] / BEYOND), np.log(resolved[1] * BEYOND))
         modulus = (np.log(smallest), np.log(largest * MODULI_BEYOND))
-        return Target(residuals, Modes(kind.name == FLUID.name, modulus, times), given)
+        fluid, words = kind.name == FLUID.name, PRIORS["prony"]
+        words = words.replace("the ratios and the equilibrium fraction", "the ratios") if fluid else words
+        return Target(residuals, Modes(fluid, modulus, times, words), given)
     (model,) = (m for m in FRACTIONAL if m.name == kind.name)
     moduli = np.log(smallest / MODULI_BEYOND), np.log(largest * MODULI_BEYOND)
     return Target(residuals, Springpots(model, moduli, kind.values), given)
@@ -166,12 +173,7 @@ class Modes(NamedTuple):
     fluid: bool
     modulus: tuple[float, float]  # lower and upper bound of log G0
     times: tuple[float, float]  # lower and upper bound of the logs of the relaxation times
-
-    @property
-    def words(self) -> str:
-        """Description of the prior in words. A fluid has no equilibrium fraction."""
-        words = PRIORS["prony"]
-        return words.replace("the ratios and the equilibrium fraction", "the ratios") if self.fluid else words
+    words: str = PRIORS["prony"]
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
         """Return the log prior (W,) of W vectors u (W, P), up to a constant."""
@@ -425,7 +427,16 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
     noise = time_tests.data_in_time(test)[-1] * max(fit.uncertainty.noise, QUIETEST)
     offset = np.sqrt(weight) * test.offset_error / noise
     own = target(fit.kind, _beside_offset(residuals, offset), test.resolved, size, False)
-    return sample(own._replace(weight=weight), len(fit.solution.u), count, seed)
+    assert not isinstance(own.prior, WithInstrument)
+    prior = own.prior._replace(words=_of_time_test(own.prior.words))
+    return sample(own._replace(weight=weight, prior=prior), len(fit.solution.u), count, seed)
+
+
+def _of_time_test(words: str) -> str:
+    """Return the description of a prior whose moduli are relative to the fitted G0."""
+    for measured, fitted in _OF_TIME_TESTS.items():
+        words = words.replace(measured, fitted)
+    return words
 
 
 def _beside_offset(residuals: Callable, offset: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:

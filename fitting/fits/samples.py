@@ -109,7 +109,7 @@ def _modes_for_all(
     numbers = range(1, min(largest, min(map(uncertainty.supported_modes, sweeps))) + 1)
     if modes != "auto":
         for s in sweeps:
-            viscoelastic.check_modes(s, int(modes))
+            viscoelastic.check_modes(s, modes)
         numbers = range(int(modes), int(modes) + 1)
     tried: list[_Candidate] = []
     failures = 0

@@ -42,6 +42,20 @@ class Problem(NamedTuple):
         return sum(d.components for d in self.data)
 
 
+def check_data(problem: Problem) -> None:
+    """Raise `InputError` if the data of a scene name a step or a node that the scene does not have."""
+    for k, (scene, data) in enumerate(zip(problem.scenes, problem.data, strict=True)):
+        for name, values, number in (
+            ("step", data.step, scene.solve.steps),
+            ("nodes", data.nodes, scene.mesh.number_of_nodes),
+        ):
+            own = np.asarray(values)
+            if own.size and not 0 <= own.min() <= own.max() < number:
+                raise InputError(
+                    f"data.{k}.{name} contains a number outside 0 to {number - 1}: count steps and nodes from 0"
+                )
+
+
 def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
     """Return the n residuals (n,) of all scenes for the parameters `values`, and the worst status code of each
     scene."""
@@ -55,7 +69,12 @@ def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "a
 
 def with_solvers(problem: Problem, values: Mapping[str, object]) -> Problem:
     """Return the problem with the linear solvers that its scenes need for these parameters. A compiled program cannot
-    choose the solvers, because the values are unknown at compilation."""
+    choose the solvers, because the values are unknown at compilation.
+
+    Raises:
+        InputError: the data name a step or a node that a scene does not have.
+    """
+    check_data(problem)
     return problem._replace(scenes=tuple(with_solver(scene, [values]) for scene in problem.scenes))
 
 

@@ -16,7 +16,18 @@ import numpy as np
 from fitting.fits import sample_inertia
 from fitting.fits.honesty.alike_points import INDEPENDENT, OF_INDEPENDENT, SHARED, with_alike_points
 from fitting.fits.honesty.long_times import INTERVAL
-from fitting.fits.viscoelastic import MISSES, OPTIMIZERS, SHORT, BestPoint, Fit, Kind, by_importance, fit_at, timed
+from fitting.fits.viscoelastic import (
+    MISSES,
+    OPTIMIZERS,
+    SHORT,
+    BestPoint,
+    Fit,
+    Kind,
+    by_importance,
+    check_optimizer,
+    fit_at,
+    timed,
+)
 from fitting.methods import uncertainty
 from fitting.methods.estimate import Estimate, mesh_bias, with_shared_errors
 from fitting.methods.generalised_maxwell import Maxwell
@@ -35,7 +46,7 @@ from liverjax.physics.viscosity import Prony
 
 class Simulation(NamedTuple):
     """Settings of the simulated torsion test: geometry [m], law, time integration of the Prony series, number of time
-    steps and element size."""
+    steps and element size. `height` is the gap during the test, so a precompressed sample was taller at rest."""
 
     radius: float = torsion.RADIUS
     height: float = torsion.HEIGHT
@@ -181,11 +192,18 @@ def _without_mesh(radius: float, gap: float, law: str, strain: float) -> tuple[G
 
 def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
     """Return the data of `simulated_residuals`: rig, law, angular frequencies, torques, measured moduli and their
-    standard deviations."""
-    rig = rig_of(simulation)
+    standard deviations.
+
+    Raises:
+        InputError: scheme or part of the simulation is unknown, or the law has no such part.
+    """
+    from liverjax.physics.viscosity import check_viscosity
+
+    rig, law = rig_of(simulation), laws.typical(simulation.law)
+    check_viscosity(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
-    return rig, laws.typical(simulation.law), jnp.asarray(sweep.angular_frequency), torque, measured, scales
+    return rig, law, jnp.asarray(sweep.angular_frequency), torque, measured, scales
 
 
 #: Results of the closed-form fit that stay valid for the fit through the simulation. OF_THE_DATA: words that identify
@@ -235,14 +253,12 @@ def through_torsion(
         optimizer: one of `OPTIMIZERS`.
         progress: called after every evaluation.
     """
-    from liverjax.physics.viscosity import check_viscosity
-
+    check_optimizer(optimizer)
     begin = time.perf_counter()
     data = simulation_data(sweep, simulation)
     # Nearly all of the time for the compression is compilation.
     pressing = time.perf_counter() - begin if simulation.precompression else 0.0
     rig, law, *_, scales = data
-    check_viscosity(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
     u0, kind = jnp.asarray(start.solution.u), start.kind
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()

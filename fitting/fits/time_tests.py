@@ -150,7 +150,7 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
     """
     rows = thinned(test)
     largest = (len(rows) - 2) // 2
-    if modes != "auto" and not 1 <= int(modes) <= largest:
+    if modes != "auto" and not 1 <= viscoelastic.whole_number(modes) <= largest:
         raise InputError(
             f"{test.source}: --modes {modes} is out of range; give 1 to {largest} for {len(rows)} measured values"
         )

@@ -18,7 +18,7 @@ from fitting.methods import generalised_maxwell, host, kramers_kronig, time_resp
 from fitting.methods.estimate import Estimate, errors_and_correlation, spread
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, degrees_of_freedom, from_starts
-from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.frequency_sweep import Sweep, check_sweep
 from fitting.readers.time_tests import TimeTest
 from fitting.waves import shear_waves
 from fitting.waves.dispersion import Dispersion
@@ -156,11 +156,17 @@ def fit(
         tests: two or more tests.
         modes: number of modes, or "auto".
         progress: called with the name of each fit.
+
+    Raises:
+        InputError: `modes` is not a whole number or too large, or a sweep has invalid values.
     """
     tests = list(tests)
+    for test in tests:
+        if isinstance(test, Sweep):
+            check_sweep(test)
     band = ResolvedBand(resolved_by(tests))
     largest = (sum(len(reported_numbers(t)[1]) for t in tests) - 2) // 2
-    if modes != "auto" and not 1 <= int(modes) <= largest:
+    if modes != "auto" and not 1 <= viscoelastic.whole_number(modes) <= largest:
         raise InputError(f"--modes {modes} is out of range: give 1 to {largest} for these files, or auto")
     top = min(uncertainty.supported_modes(band), largest)
     numbers = range(1, top + 1) if modes == "auto" else range(int(modes), int(modes) + 1)
@@ -341,6 +347,7 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     out += missed(chosen.shares)
     out += structured(chosen)
     out += uncertainty.superfluous(band, chosen.uncertainty)
+    out += _of_better_fits(chosen, tried)
     out += _of_rises(chosen)
     if chosen.kind.name == "prony":
         out += uncertainty.like_a_fluid(chosen.uncertainty, "measure longer, or at lower frequencies")
@@ -356,6 +363,26 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
         run_time=sum(f.run_time for f in tried) + time.perf_counter() - begin,
         compile_time=sum(f.compile_time for f in tried),
     )
+
+
+def _of_better_fits(chosen: Together, tried: list[Together]) -> list[str]:
+    """Return a warning if a fit with more modes follows the tests clearly better, although the tests do not determine
+    all of its parameters."""
+    best = min(tried, key=criterion_of_all)
+    lower = criterion_of_all(chosen) - criterion_of_all(best)
+    if best.modes <= chosen.modes or not lower > BETTER:
+        return []
+    return [
+        f"{best.modes} modes follow the tests better than {chosen.modes} (criterion lower by {lower:.3g}), but the "
+        f"tests do not determine all of their parameters. With {best.modes} modes, shear_modulus would be "
+        f"{best.model.shear_modulus:.4g} instead of {chosen.model.shear_modulus:.4g} Pa. The stated errors do not "
+        "contain this difference: measure faster or slower processes too"
+    ]
+
+
+#: The program warns if a fit with more modes lowers the information criterion by more than this value, but has
+#: parameters that the tests do not determine (Burnham, Anderson 2002).
+BETTER = 4.0
 
 
 #: The program warns if a rise of the load between two rows lasts longer than this fraction of the shortest relaxation
@@ -384,7 +411,7 @@ def disagreements(shares: list[Share]) -> list[str]:
     return [
         f"the tests do not agree. The misfit of {s.source or s.name} is {100 * s.misfit:.2g} % in the common fit, but "
         f"only {100 * s.misfit_alone:.2g} % in a fit to this test alone: check whether this test was made at another "
-        "temperature or strain, or on another sample"
+        "temperature or strain, or on another sample; otherwise try more modes"
         for s in shares
         if s.noise > APART * s.alone and s.misfit > 0.01
     ]

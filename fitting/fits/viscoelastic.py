@@ -96,13 +96,26 @@ def best_of(minimise: Callable, residuals: Callable) -> Callable[..., Solution]:
     return best
 
 
-def check_modes(sweep: Sweep, modes: int) -> None:
+def whole_number(modes: int | str, otherwise: str = 'give "auto"') -> int:
+    """Return a number of modes. Raise `InputError` if it is not a whole number. `otherwise`: what else the user can
+    do."""
+    if isinstance(modes, bool) or not isinstance(modes, (int, np.integer)):
+        raise InputError(f"modes = {modes!r} must be a whole number: give e.g. 2, or {otherwise}")
+    return int(modes)
+
+
+def check_optimizer(optimizer: str) -> None:
+    """Raise `InputError` if the name of an optimizer is unknown."""
+    if optimizer not in OPTIMIZERS:
+        raise InputError(f"optimizer = {optimizer!r} is not known: use {' or '.join(OPTIMIZERS)}")
+
+
+def check_modes(sweep: Sweep, modes: int | str) -> None:
     """Raise `InputError` if `modes` is not a whole number above 0, or if the sweep has too few points for the
     parameters of this number of modes."""
     check_sweep(sweep)
     largest = generalised_maxwell.largest_number_of_modes(sweep)
-    if isinstance(modes, bool) or not isinstance(modes, (int, np.integer)):
-        raise InputError(f"modes = {modes!r} must be a whole number: give e.g. 2, or call choose_modes")
+    modes = whole_number(modes, "call choose_modes")
     if largest < 1:
         raise InputError(
             f"{sweep.source or 'sweep'}: one frequency does not determine a mode. Measure at more frequencies"
@@ -126,8 +139,7 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
         optimizer: one of `OPTIMIZERS`.
     """
     check_modes(sweep, modes)
-    if optimizer not in OPTIMIZERS:
-        raise InputError(f"optimizer = {optimizer!r} is not known: use {' or '.join(OPTIMIZERS)}")
+    check_optimizer(optimizer)
     dense = dense or generalised_maxwell.refuse_impossible(sweep)
     return modes_from(sweep, generalised_maxwell.starts(sweep, modes, dense), Kind(), optimizer)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from fitting.master.master_curve import MasterCurve
 from fitting.readers.units import celsius
+from liverjax.core.files import write_rows
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 
 HEAD = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa"
@@ -18,10 +19,10 @@ def write_master_curve(out: Path, found: MasterCurve) -> None:
     s = found.shifts
     rows = [celsius(s.temperatures), 10**s.log_a, s.log_a_errors, 10**s.log_b, s.log_b_errors, s.misfit]
     head = "temperature_C,shift_factor,sd_of_log10_shift_factor,vertical_factor,sd_of_log10_vertical_factor,distance"
-    np.savetxt(out / "shift_factors.csv", np.column_stack(rows), "%.8g", ",", header=head, comments="")
+    write_rows(out / "shift_factors.csv", np.column_stack(rows), head, "%.8g")
     whole = found.sweep
     columns = [whole.angular_frequency / (2 * np.pi), whole.storage, whole.loss]
-    np.savetxt(out / "master_curve.csv", np.column_stack(columns), "%.10g", ",", header=HEAD, comments="")
+    write_rows(out / "master_curve.csv", np.column_stack(columns), HEAD, "%.10g")
     save(shift_figure(found), out / "shift.png")
 
 

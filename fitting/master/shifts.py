@@ -2,10 +2,11 @@
 
 The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
 a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency. The curve and all factors are fitted
-together by least squares. So no model of the material is needed, and every factor has a standard error. The distance
-between the knots of the spline is chosen from the data, because a curve that follows the noise would be steeper than
-the true curve. Then the errors of the factors, which depend on the slope of the curve, would be too small. Source:
-Ferry (1980), Viscoelastic properties of polymers, chapter 11.
+together by least squares. So no model of the material is needed, and every factor has a standard error. If the noise of
+log G' and of log G'' differs, each has its weight. The distance between the knots of the spline is chosen from the
+data, because a curve that follows the noise would be steeper than the true curve. Then the errors of the factors, which
+depend on the slope of the curve, would be too small. Source: Ferry (1980), Viscoelastic properties of polymers, chapter
+11.
 """
 
 from collections.abc import Sequence
@@ -26,6 +27,10 @@ LONGEST, CONVERGED = 0.3, 1e-6
 #: Settings for the first estimate of a shift. OVERLAP: minimum fraction of a sweep that must overlap with the
 #: neighbouring sweep. REACH: shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
+#: G' and G'' have different weights if chance makes their distances from the curves so different with a probability
+#: below CHANCE. ROUNDS: maximum number of fits, each followed by new weights. SETTLED: the fits end if no weight
+#: changes by more than this fraction. MOST: largest ratio of the weights.
+CHANCE, ROUNDS, SETTLED, MOST = 1e-3, 8, 0.02, 100.0
 #: Two sweeps match within the noise if their mean square distance, divided by the variance of their noise, is at most
 #: this value.
 WITHIN = 2.0
@@ -45,6 +50,7 @@ class Shifts(NamedTuple):
     covariance: np.ndarray  # (K, K) of `log_a`; errors of neighbouring sweeps are correlated
     knots: float  # distance between two knots of the curve [decades]
     given: bool = False
+    weights: tuple[float, float] = (1.0, 1.0)  # of the distances in log G' and in log G''
 
     @property
     def apart(self) -> float:
@@ -100,16 +106,24 @@ def _best(sweeps: Sequence[Sweep], every: list[Shifts], factors: int) -> Shifts:
     criterion for any result, return the result with the largest distance between knots. `factors`: number of fitted
     factors.
     """
-    data = 2 * sum(len(s.storage) for s in sweeps)
+    data, least = 2 * sum(len(s.storage) for s in sweeps), np.finfo(float).tiny
+    differ = any(own.weights != (1.0, 1.0) for own in every)  # whether the noise of the two moduli differs
 
     def criterion(own: Shifts) -> float:
-        numbers = 2 * size_of_curve(sweeps, own.log_a, own.knots) + factors + 1
+        numbers = 2 * size_of_curve(sweeps, own.log_a, own.knots) + factors + 1 + differ
         if data < numbers + 2:
             return np.inf
-        square = max(sum_of_squares(sweeps, own) / data, np.finfo(float).tiny)
-        return data * np.log(square) + 2 * numbers * (1 + (numbers + 1) / (data - numbers - 1))
+        squares = _squares_of_moduli(sweeps, own) if differ else np.array([sum_of_squares(sweeps, own) / data])
+        fit = data * float(np.mean(np.log(np.maximum(squares, least))))
+        return fit + 2 * numbers * (1 + (numbers + 1) / (data - numbers - 1))
 
     return min(reversed(every), key=criterion)
+
+
+def _squares_of_moduli(sweeps: Sequence[Sweep], own: Shifts) -> np.ndarray:
+    """Return the mean squared relative distances (2,) of G' and of G'' from their curves."""
+    distances = _distances_of_moduli(sweeps, own.log_a, own.log_b, own.knots)
+    return np.mean(distances**2, axis=1) * np.log(10) ** 2
 
 
 def _at_knots(
@@ -128,23 +142,56 @@ def _at_knots(
         free: whether each log a and each log b is fitted (2, K).
         knots: distance between two knots [decades].
     """
-    columns, (log_a, log_b) = _in_decades(sweeps), first
+    columns, points = _in_decades(sweeps), sum(len(s.storage) for s in sweeps)
+    log_a, log_b, weights = *first, np.ones(2)
+    for _ in range(ROUNDS):
+        log_a, log_b, A, b = _by_gauss_newton(columns, (log_a, log_b), free, knots, weights)
+        own = _weights_of_moduli(b[: 2 * points].reshape(2, points) / weights[:, None], points - A.shape[1] / 2)
+        settled, weights = np.abs(np.log(own / weights)).max() < SETTLED, own
+        if settled:
+            break
+    covariance = np.zeros((2 * len(sweeps),) * 2)
+    found = _covariance(A, b, 2 * points)[: free.sum(), : free.sum()]
+    covariance[np.ix_(free.ravel(), free.ravel())] = found
+    spread = np.sqrt(np.diag(covariance)).reshape(2, -1)
+    misfit = distances_from_curve(sweeps, log_a, log_b, knots)
+    of_a = covariance[: len(sweeps), : len(sweeps)]
+    found_weights = (float(weights[0]), float(weights[1]))
+    return Shifts(*at, log_a, spread[0], log_b, spread[1], misfit, of_a, knots, weights=found_weights)
+
+
+def _by_gauss_newton(
+    columns: list, first: tuple[np.ndarray, np.ndarray], free: np.ndarray, knots: float, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return log a (K,), log b (K,), and the matrix and the right-hand side of the last step. The matrix has columns
+    only for the fitted factors and for the curves. `weights` (2,) multiply the distances in log G' and in log G''. The
+    other arguments are the same as for `_at_knots`."""
+    log_a, log_b = first
     for _ in range(60):
-        A, b = _linear_problem(columns, log_a, log_b, knots)
-        step = np.zeros((2, len(sweeps)))
+        A, b = _linear_problem(columns, log_a, log_b, knots, weights)
+        step = np.zeros((2, len(columns)))
         kept = np.concatenate([free.ravel(), np.ones(A.shape[1] - free.size, bool)])
         step[free] = np.linalg.lstsq(A[:, kept], b, rcond=None)[0][: free.sum()]
         moved = np.clip(step, -LONGEST, LONGEST)
         log_a, log_b = log_a + moved[0], log_b + moved[1]
         if np.abs(moved).max() < CONVERGED:
             break
-    covariance = np.zeros((2 * len(sweeps),) * 2)
-    own = _covariance(A[:, kept], b, 2 * sum(len(c[0]) for c in columns))[: free.sum(), : free.sum()]
-    covariance[np.ix_(free.ravel(), free.ravel())] = own
-    spread = np.sqrt(np.diag(covariance)).reshape(2, -1)
-    misfit = distances_from_curve(sweeps, log_a, log_b, knots)
-    of_a = covariance[: len(sweeps), : len(sweeps)]
-    return Shifts(*at, log_a, spread[0], log_b, spread[1], misfit, of_a, knots)
+    return log_a, log_b, A[:, kept], b
+
+
+def _weights_of_moduli(distances: np.ndarray, degrees: float) -> np.ndarray:
+    """Return the weights (2,) of log G' and of log G'', from the distances (2, n) of n points from their curves. The
+    weights are 1 unless the noise of the two moduli differs by more than chance explains.
+
+    `degrees`: degrees of freedom of the distances of one modulus.
+    """
+    from scipy.stats import f  # slow to import
+
+    size = np.sqrt(np.mean(distances**2, axis=1))
+    if degrees < 2 or not size.min() > 0 or (size.max() / size.min()) ** 2 < f.isf(CHANCE, degrees, degrees):
+        return np.ones(2)
+    ratio = min(size[1] / size[0], MOST) if size[1] > size[0] else max(size[1] / size[0], 1 / MOST)
+    return np.array([np.sqrt(ratio), 1 / np.sqrt(ratio)])
 
 
 def known_shifts(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, log_a: np.ndarray) -> Shifts:
@@ -183,15 +230,18 @@ def _refuse_gap(columns: list, shifts: Shifts) -> None:
 
 def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray, knots: float) -> np.ndarray:
     """Return the relative root mean square distance (K,) of each of K shifted sweeps from their common curve."""
+    place = np.repeat(np.arange(len(sweeps)), [len(s.storage) for s in sweeps])
+    square = 0.5 * np.sum(_distances_of_moduli(sweeps, log_a, log_b, knots) ** 2, axis=0)
+    return np.sqrt(np.bincount(place, square) / np.bincount(place)) * np.log(10)
+
+
+def _distances_of_moduli(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray, knots: float) -> np.ndarray:
+    """Return the distances (2, n) [decades] of all n points of the shifted sweeps from the curves of G' and of G''."""
     columns = _in_decades(sweeps)
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
-    place = np.repeat(np.arange(len(columns)), [len(c[0]) for c in columns])
     B = _basis(x, knots)[0]
-    square = np.zeros(len(x))
-    for j in (1, 2):
-        y = np.concatenate([c[j] + b for c, b in zip(columns, log_b, strict=True)])
-        square += 0.5 * (B @ _smooth_coefficients(B, y) - y) ** 2
-    return np.sqrt(np.bincount(place, square) / np.bincount(place)) * np.log(10)
+    every = [np.concatenate([c[j] + b for c, b in zip(columns, log_b, strict=True)]) for j in (1, 2)]
+    return np.stack([B @ _smooth_coefficients(B, y) - y for y in every])
 
 
 def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, knots: float) -> int:
@@ -223,9 +273,11 @@ def _smoothness(size: int) -> np.ndarray:
     return SMOOTH * np.diff(np.eye(size), min(3, size - 1), axis=0)
 
 
-def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: float) -> tuple[np.ndarray, np.ndarray]:
+def _linear_problem(
+    columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: float, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix and the right-hand side of a Gauss-Newton step. The unknowns are log a and log b of the K
-    sweeps, and the coefficients of the curves of G' and G''."""
+    sweeps, and the coefficients of the curves of G' and G''. `weights` (2,) multiply the rows of G' and of G''."""
     K, counts = len(columns), [len(c[0]) for c in columns]
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     own = np.repeat(np.eye(K), counts, axis=0)
@@ -236,8 +288,8 @@ def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray, knots: 
         c = _smooth_coefficients(B, y)
         part = [np.zeros((len(x), size)), np.zeros((len(x), size))]
         part[j - 1] = B
-        rows.append(np.hstack([(slope @ c)[:, None] * own, -own, *part]))
-        right.append(y - B @ c)
+        rows.append(weights[j - 1] * np.hstack([(slope @ c)[:, None] * own, -own, *part]))
+        right.append(weights[j - 1] * (y - B @ c))
     smooth = np.kron(np.eye(2), _smoothness(size))
     A = np.vstack([*rows, np.hstack([np.zeros((len(smooth), 2 * K)), smooth])])
     # The rows of the penalty have the right-hand side 0, so they keep the change of the coefficients smooth.

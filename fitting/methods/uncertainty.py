@@ -15,6 +15,7 @@ from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.frequency_sweep import SHARED
 from fitting.readers.rheometer import Sweep
+from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
 
@@ -102,9 +103,17 @@ def equilibrium_change(values: np.ndarray, moved: np.ndarray) -> np.ndarray:
     return moved[0] * (1 - values[ratios].sum()) - values[0] * moved[ratios].sum(axis=0)
 
 
+def has_profile(found: Solution, uncertainty: Estimate) -> bool:
+    """Return whether the fit is one of Prony modes of a solid, as `profile_intervals` needs."""
+    if len(found.u) < 3 or len(found.u) % 2 == 0:
+        return False
+    known = parameter_names((len(found.u) - 1) // 2)
+    return tuple(uncertainty.names[: len(known)]) == tuple(known)
+
+
 def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, points: int = 21) -> Content:
-    """Compute 95 % intervals by profile likelihood, for a closed-form fit. One parameter is fixed at several values,
-    and all other parameters are fitted again for each value.
+    """Compute 95 % intervals by profile likelihood, for a closed-form fit of Prony modes of a solid. One parameter is
+    fixed at several values, and all other parameters are fitted again for each value.
 
     The likelihood contains only the noise. If `uncertainty` has errors of the gap or the instrument too, these errors
     widen the interval. The squares of both half widths are added. This is right to first order in these errors.
@@ -112,7 +121,12 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
     Returns:
         [low, high] for each name. An end is None if the likelihood does not fall to the limit of the interval within
             about four standard errors.
+
+    Raises:
+        InputError: the fit is one of a fluid or of another model.
     """
+    if not has_profile(found, uncertainty):
+        raise InputError("profile intervals are for Prony modes of a solid: use the standard errors or the posterior")
     data = (jnp.asarray(sweep.angular_frequency), sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     best = 2 * float(found.cost)
     by_noise = estimate(found, sweep.noise_given).standard_errors

@@ -63,6 +63,35 @@ class Curve(NamedTuple):
         return float(np.sqrt(np.mean(self.stress**2)))
 
 
+#: det F may differ from 1 by this much, because the digits of F in a file are rounded.
+_SAME_VOLUME = 1e-3
+
+
+def check_curves(curves: list[Curve]) -> None:
+    """Check the values of curves that were made in Python. The file reader has separate checks, whose messages name
+    file and row.
+
+    Raises:
+        InputError: there is no curve; a shape is wrong; a value is not finite; the volume changes; or face 3 tilts.
+    """
+    if not curves:
+        raise InputError("there are no curves: give one curve or more")
+    for c in curves:
+        F, stress = np.asarray(c.F), np.asarray(c.stress)
+        if F.shape != (*stress.shape, 3, 3) or stress.ndim != 1 or not len(stress):
+            raise InputError(f"{c.label}: F has shape {F.shape} and stress {stress.shape}: give (n, 3, 3) and (n,)")
+        if not (np.all(np.isfinite(F)) and np.all(np.isfinite(stress))):
+            raise InputError(f"{c.label}: F or stress is not finite; remove these points")
+        off = np.abs(np.linalg.det(F) - 1)
+        if off.max() > _SAME_VOLUME:
+            raise InputError(
+                f"{c.label}: det F = {np.linalg.det(F)[off.argmax()]:.4g} at point {off.argmax()}, but the volume must "
+                "not change; give gradients with det F = 1"
+            )
+        if np.abs(F[:, [0, 1, 2, 2], [2, 2, 0, 1]]).max() > 1e-9:
+            raise InputError(f"{c.label}: F13, F23, F31, F32 must be 0; rotate the axes so that face 3 stays flat")
+
+
 def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[str]]:
     """Read the stress-stretch curves of CSV files. Return the curves, and notes for the user.
 
@@ -372,7 +401,7 @@ def _stretches_of_shear(rows: list[dict[str, str]]) -> dict[float, str]:
 def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tuple, stress: np.ndarray) -> Curve:
     J = np.linalg.det(F)
     worst = int(np.argmax(np.abs(J - 1)))
-    if abs(J[worst] - 1) > 1e-3:
+    if abs(J[worst] - 1) > _SAME_VOLUME:
         raise InputError(
             f"{file}: det F = {J[worst]:.4g} in row {worst + 1}, but the volume must not change; give gradients with "
             "det F = 1"

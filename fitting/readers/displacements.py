@@ -149,6 +149,8 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
         lines = [line for line in lines if not line.lstrip().startswith("#")]
         between, names = split_line(lines[0]) if lines else (between, names)
         names, lines = [name.lower() for name in names], lines[1:]
+    while names and not names[-1]:  # each line ends with a separator
+        names.pop()
     for name in names:
         if name not in _COLUMNS:
             raise InputError(f"{path}: column {name!r} is not known; use {', '.join(_COLUMNS)}")
@@ -168,9 +170,9 @@ def _rows_of_numbers(path: Path, names: list[str], rows: list[list[str]], betwee
     count as not measured."""
     sign, values = decimal_sign(cell for row in rows[:1000] for cell in row), np.full((len(rows), len(names)), np.nan)
     for k, row in enumerate(rows):
-        if len(row) > len(names):
+        if any(row[len(names) :]):
             raise InputError(f"{path}: row {k + 1} has {len(row)} cells under {len(names)} headings; correct the row")
-        for j, cell in enumerate(row):
+        for j, cell in enumerate(row[: len(names)]):
             value = to_number(cell, between, sign)
             if value is None:
                 raise InputError(

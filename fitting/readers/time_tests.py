@@ -113,14 +113,14 @@ def read_time_test(
         sample: radius and height of a cylinder, for torque and force.
         ramp: duration [s] of the ramp of strain or stress, 0 for a step. For a column of modulus or compliance, None
             means a step. For two columns, give a duration only if no row shows the rise (see `from_rest`).
-        start: responses before this time [s] are not fitted.
+        start: responses before this time [s] are not fitted. This is a time of the file, whenever the load begins.
 
     Raises:
         InputError: the file cannot be used; the message names the column or line, the value and the remedy.
     """
     if not (np.isfinite(start) and start >= 0):
         raise InputError(
-            f"--min-time {start:g} must be a finite number of seconds after the load, 0 or more: give e.g. 0.5"
+            f"--min-time {start:g} must be a finite number of seconds, 0 or more (a time of the file): give e.g. 0.5"
         )
     columns, notes = read_columns(path)
     time = columns["time"]
@@ -172,8 +172,11 @@ def of_columns(
         start: responses before this time [s] are not fitted.
 
     Raises:
-        InputError: the imposed load is zero, there are too few responses, or most responses have the opposite sign.
+        InputError: the imposed load is zero, there are too few responses, most responses have the opposite sign, or the
+            times do not ascend.
     """
+    if np.any(np.diff(time) < 0):
+        raise InputError(f"{source[0]}: the times do not ascend; sort the rows by time")
     driven, told = without_scatter(time, driven, "strain" if kind == "relaxation" else "stress")
     told += _ringing(time, driven, answer, start) if kind == "creep" else []
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
@@ -493,6 +496,8 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         raise InputError(
             f"{test.source}: most responses of the {test.kind} test have the wrong sign for its load; correct the signs"
         )
+    if 0 < start <= test.begun:
+        told = [*told, f"--min-time {start:g} s has no effect, because the load begins at {test.begun:.3g} s"]
     if np.sum(test.time <= test.begun) > 2:
         told = [*told, f"the load begins at {test.begun:.3g} s: the rows before it are not fitted"]
     told = [*told, *told_of_far_values(test.time[used], driven[used], answer[used])]

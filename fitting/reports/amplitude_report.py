@@ -11,6 +11,7 @@ from fitting.amplitude.law_fit import StrainFit, said_of
 from fitting.amplitude.strain_sweep import StrainSweep
 from fitting.reports import curves_report
 from fitting.reports.sweep_report import numbers
+from liverjax.core.files import write_whole
 from liverjax.core.plotting import BLUE, COLOURS, ORANGE, pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -42,7 +43,7 @@ def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequen
         "versions": versions(),
     }
     content = numbers(content)
-    (out / "fit.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_whole(out / "fit.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     save(figure(sweep, fits), out / "fit.png")
     return content
 

@@ -12,6 +12,7 @@ import numpy as np
 from fitting.fits.stress_stretch import LawFit, loaded_at_rest, unfollowed
 from fitting.readers.curves import Curve
 from fitting.reports.sweep_report import numbers
+from liverjax.core.files import write_whole
 from liverjax.core.plotting import COLOURS, GREY, pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -74,7 +75,7 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit], structured: Sequen
         "laws": [summary(f) for f in ordered],
         "versions": versions(),
     }
-    (out / "curves.json").write_text(json.dumps(numbers(content), indent=1, allow_nan=False) + "\n")
+    write_whole(out / "curves.json", json.dumps(numbers(content), indent=1, allow_nan=False) + "\n")
     save(figure(curves, ordered), out / "curves.png")
 
 

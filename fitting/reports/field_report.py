@@ -12,6 +12,7 @@ from fitting.fits.field import Field
 from fitting.methods.estimate import Estimate, bias_sentences
 from fitting.readers.displacements import locate
 from fitting.reports.sweep_report import numbers
+from liverjax.core.files import whole, write_whole
 from liverjax.core.plotting import pyplot, save
 from liverjax.core.status import NAMES
 from liverjax.core.struct import Content
@@ -143,7 +144,7 @@ def of_field(mesh: TetMesh, found: Field) -> Content:
 
 def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> None:
     """Write field.json into the folder `out`. For a map, also write field.vtu, field.h5 and field.png."""
-    (out / "field.json").write_text(json.dumps(numbers(content | {"versions": versions()}), indent=1) + "\n")
+    write_whole(out / "field.json", json.dumps(numbers(content | {"versions": versions()}), indent=1) + "\n")
     if found is None:
         return
     at_nodes = {"factor": found.log_factor, "sd_of_ln": found.sd, "prior_sd_of_ln": found.prior_sd}
@@ -156,7 +157,7 @@ def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> No
     for values in at_nodes.values():
         values[unknown] = np.nan
     write_mesh(out / "field.vtu", mesh, at_nodes)
-    with h5py.File(out / "field.h5", "w") as f:
+    with whole(out / "field.h5") as new, h5py.File(new, "w") as f:
         f["modulus"], f["reference"], f["tetrahedra"] = found.modulus, mesh.points, mesh.tetrahedra
         for name, values in at_nodes.items():
             f[name] = values

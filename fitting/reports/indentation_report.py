@@ -12,6 +12,7 @@ from fitting.readers.indentation_curves import IndentationCurve
 from fitting.readers.noise_of_series import noise_of_series
 from fitting.reports.sweep_report import numbers
 from fitting.rigs.thin_layer import Indenter, half_space
+from liverjax.core.files import write_whole
 from liverjax.core.plotting import BLUE, GREY, pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -67,7 +68,7 @@ def write(
             "versions": versions(),
         }
     )
-    (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    write_whole(out / "fit.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(curve, rig, fit), out / "fit.png")
     return content
 

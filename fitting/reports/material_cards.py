@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fitting.methods.generalised_maxwell import Maxwell
+from liverjax.core.files import write_whole
 
 #: Poisson's ratio of the elastic law: nearly incompressible.
 POISSON = 0.49
@@ -29,7 +30,7 @@ def write(folder: Path, model: Maxwell) -> list[str]:
         )
         (folder / "febio.feb").unlink(missing_ok=True)
     else:
-        (folder / "febio.feb").write_text(febio(model))
+        write_whole(folder / "febio.feb", febio(model))
     if np.sum(model.ratios) > LARGEST_SUM:
         told.append(
             "the model is a fluid, but Abaqus and liverjax need an equilibrium modulus: in the cards for these "
@@ -41,7 +42,7 @@ def write(folder: Path, model: Maxwell) -> list[str]:
         ("ansys.inp", ansys),
         ("sofa.xml", sofa),
     ):
-        (folder / name).write_text(card(model))
+        write_whole(folder / name, card(model))
     return told
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from fitting.fits.posterior import Posterior
+from liverjax.core.files import write_rows
 from liverjax.core.struct import Content
 
 #: Quantiles that are reported.
@@ -40,7 +41,7 @@ def write_draws(path: Path, p: Posterior) -> None:
     fit.json."""
     rows = np.column_stack([np.repeat(np.arange(len(p.draws)), p.draws.shape[1]), p.draws.reshape(-1, len(p.names))])
     header = ",".join(["chain", *p.names])
-    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt=["%d"] + ["%.9g"] * len(p.names))
+    write_rows(path, rows, header, ["%d"] + ["%.9g"] * len(p.names))
 
 
 def table(p: Posterior) -> str:

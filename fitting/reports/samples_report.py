@@ -13,6 +13,7 @@ from fitting.fits.viscoelastic import SHORT
 from fitting.readers.rheometer import WARMER
 from fitting.readers.units import celsius
 from fitting.reports.sweep_report import band_sensitivity, numbers, summary
+from liverjax.core.files import whole, write_whole
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -25,7 +26,7 @@ def write(out: Path, found: Samples) -> Content:
     """Write fit.json, fit.png and fit.h5 into the folder `out`. Return the content of fit.json."""
     out.mkdir(parents=True, exist_ok=True)
     content = numbers(_json_content(found))
-    (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    write_whole(out / "fit.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(found), out / "fit.png")
     _store_samples(out / "fit.h5", found, content)
     return content
@@ -270,7 +271,7 @@ def _inside(value: float, limits: tuple[float, float]) -> bool:
 def _store_samples(path: Path, found: Samples, content: Content) -> None:
     import h5py
 
-    with h5py.File(path, "w") as file:
+    with whole(path) as new, h5py.File(new, "w") as file:
         file.attrs["fit.json"] = json.dumps(content)
         for k, (fit, sweep) in enumerate(_pairs(found)):
             group = file.create_group(f"samples/{k}")

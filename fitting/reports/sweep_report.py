@@ -21,6 +21,7 @@ from fitting.methods.uncertainty import equilibrium_change, equilibrium_error
 from fitting.readers.rheometer import Sweep
 from fitting.reports import posterior_report
 from fitting.waves import shear_waves
+from liverjax.core.files import whole, write_whole
 from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE, pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -207,7 +208,7 @@ def write(
             )
         posterior_report.write_draws(out / "posterior.csv", posterior)
     content = numbers(content)
-    (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    write_whole(out / "fit.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(sweep, fits), out / "fit.png")
     _store(out / "fit.h5", sweep, fits, content)
     return content
@@ -216,7 +217,7 @@ def write(
 def _store(path: Path, sweep: Sweep, fits: list[Fit], content: Content) -> None:
     import h5py
 
-    with h5py.File(path, "w") as file:
+    with whole(path) as new, h5py.File(new, "w") as file:
         file.attrs["fit.json"] = json.dumps(content)
         data = file.create_group("data")
         for name in ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd"):

@@ -17,6 +17,7 @@ from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.time_tests import TimeTest
 from fitting.reports import posterior_report
 from fitting.reports.sweep_report import by_stem, ends_of_interval, numbers, own_numbers, own_rows
+from liverjax.core.files import write_whole
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -69,7 +70,7 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
             **sampled,
         }
     )
-    (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    write_whole(out / "fit.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(test, fit), out / "fit.png")
     return content
 

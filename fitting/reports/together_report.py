@@ -17,6 +17,7 @@ from fitting.readers.frequency_sweep import Sweep
 from fitting.reports.sweep_report import by_stem, ends_of_interval, numbers, own_numbers, spectrum_rows
 from fitting.waves import shear_waves
 from fitting.waves.dispersion import Dispersion
+from liverjax.core.files import write_whole
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -77,7 +78,7 @@ def write(out: Path, found: Together, relative: float) -> Content:
             "versions": versions(),
         }
     )
-    (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    write_whole(out / "fit.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(found), out / "fit.png")
     return content
 

@@ -156,8 +156,9 @@ def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
             the sample is glued and bulges.
 
     Raises:
-        InputError: the simulation does not converge at this compression.
+        InputError: the simulation does not converge at this compression, or `strain` is out of range.
     """
+    check_strain(strain)
     if strain == 0:
         return rig
     X = rig.mesh.points

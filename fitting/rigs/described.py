@@ -102,6 +102,11 @@ def read_described(path: str | Path) -> TimeTest:
     if described.test == "compression":
         notes.append("displacement and force are assumed to be positive in compression")
     sign = np.sign(d[np.argmax(np.abs(d))]) or 1.0
+    if described.test == "tension" and sign < 0:
+        notes.append(
+            "the displacement is negative, and is taken as the length by which the sample is pulled. If the sample was "
+            "pressed, write test = 'compression'"
+        )
     largest = float(np.max(sign * d))
     if not largest > 0:
         raise InputError(f"{described.data}: the displacement is zero throughout; give a test with a displacement")
@@ -205,7 +210,7 @@ def _description(path: Path) -> Described:
     first = _number_of(path, "min_time", table.get("min_time", 0.0))
     if first < 0:
         raise InputError(
-            f"{path}: min_time = {first:g} is negative; give the time after the load in seconds, 0 or more"
+            f"{path}: min_time = {first:g} is negative; give a time of the data file in seconds, 0 or more"
         )
     ramp = table.get("ramp")
     if ramp is not None and _number_of(path, "ramp", ramp) != 0:

@@ -1,7 +1,8 @@
 """Tension, indentation and creep of a cylinder as differentiable simulations.
 
 Each test is a rig: a scene without a law, and a reading (the force or displacement that is taken from the run). Law and
-viscosity are added for each run. The simulated sample is glued to its plates, so no shape factor is needed.
+viscosity are added for each run. The simulated sample is glued to its plates (in creep, only at its bottom). So no
+shape factor is needed.
 
 By default, the mesh is a narrow sector of the cylinder between two planes of symmetry. The cells of the mesh are small
 at the rims of the plates and at the edge of the punch, where stresses are infinite. experiments/TABLES.md lists the
@@ -154,7 +155,8 @@ def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
 
 
 def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size: float | Cells | None = None) -> Rig:
-    """Return the rig of a cylinder that is pulled (or pressed) between glued plates. Its reading is the force [N].
+    """Return the rig of a cylinder that is pulled (or pressed) between glued plates. Its reading is the force [N] of
+    the upper plate, positive in tension.
 
     Args:
         radius, height: size of the sample [m].
@@ -179,7 +181,7 @@ def indentation(
     radius: float, height: float, punch: float, dt: float, depths: Numbers, cell_size: float | Cells | None = None
 ) -> Rig:
     """Return the rig of a cylinder with a glued flat punch of radius `punch` [m]. Its reading is the force [N] of the
-    punch.
+    punch along its axis, negative while the punch presses.
 
     At the end of each of T steps, the punch is pressed into the cylinder by `depths` (T,) [m]. At a negative depth, the
     punch pulls.
@@ -213,6 +215,7 @@ def creep(
 ) -> Rig:
     """Return the rig of a cylinder with a constant tensile stress `stress` [Pa] on its top from time 0 on.
 
+    The stress is a force per original area. It acts everywhere on the top, without a plate; only the bottom is glued.
     The stress rises during the first step, as in a rheometer. The reading is the mean displacement [m] of the top,
     weighted with the area.
 

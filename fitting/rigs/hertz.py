@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from liverjax.core.errors import InputError
+
 SHAPES = ("sphere", "cone", "punch")
 
 
 class Indenter(NamedTuple):
-    """An indenter on a layer. A half-space is a layer of infinite thickness."""
+    """An indenter on a layer. `half_space` does not use the thickness."""
 
     shape: str  # one of `SHAPES`
     thickness: float  # [m]
@@ -22,7 +24,13 @@ class Indenter(NamedTuple):
 
 def half_space(rig: Indenter, depth: np.ndarray) -> np.ndarray:
     """Return the force [N] for a Young's modulus of 1 Pa at depths [m] (formulas of Hertz and Sneddon). The force is 0
-    before contact."""
+    before contact.
+
+    Raises:
+        InputError: the shape of the indenter is not known.
+    """
+    if rig.shape not in SHAPES:
+        raise InputError(f"shape = {rig.shape!r} is not known: use {', '.join(SHAPES)}")
     depth, plane = np.maximum(depth, 0.0), 1 / (1 - rig.poisson**2)
     if rig.shape == "sphere":
         return 4 / 3 * plane * np.sqrt(rig.radius) * depth**1.5

@@ -15,6 +15,7 @@ from fitting.rigs.plates import (
     sample_positions,
     work_conjugates,
 )
+from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, replace
 from liverjax.elements import mjed
 from liverjax.laws import Law, isochoric_part, volumetric_part
@@ -70,7 +71,12 @@ def geometry_factor(rig: Rig, law: Law) -> jax.Array:
     differs from 1 because the cross-section is a polygon and the elements are too stiff.
 
     Moduli that are divided by this factor have no bias in the linear range.
+
+    Raises:
+        InputError: the rig is compressed.
     """
+    if rig.held is not None:
+        raise InputError("the factor of a compressed rig is not known: use the rig without its compression")
     inverse = jnp.linalg.inv(rest_stiffness(rig, law))
     return _response(inverse[:, -1]).stiffness / exact_stiffness(rig, law)
 

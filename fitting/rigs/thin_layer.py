@@ -81,7 +81,13 @@ def factors(poisson: float, shape: str) -> Factors:
 
 def punch_factor(radius: float, thickness: float, poisson: float) -> float:
     """Return the force of a flat punch on a layer, divided by its force on a half-space. Hayes et al. tabulate this
-    factor."""
+    factor.
+
+    Raises:
+        InputError: a length is not above 0, the punch is wider than 8 times the thickness, or Poisson's ratio is out of
+            range.
+    """
+    check_indenter(Indenter("punch", thickness, poisson, radius))
     return _contact(radius / thickness, poisson, "punch")[1]
 
 

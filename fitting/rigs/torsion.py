@@ -47,6 +47,7 @@ from fitting.rigs.plates import (  # noqa: F401  names that users import from he
     sample_positions,
     work_conjugates,
 )
+from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, Numbers
 from liverjax.elements import mjed
 from liverjax.laws import Law
@@ -68,6 +69,8 @@ class Drive(NamedTuple):
 
     `steps`: time steps per cycle. `cycles`: cycles of a run; the last one is demodulated. `by`: imposed quantity,
     "torque" or "angle". `start`: initial state, "cycle" (the steady linear cycle) or "rest".
+
+    The functions that use a drive raise `InputError` if `by` or `start` has another value.
     """
 
     steps: int = 50
@@ -106,7 +109,13 @@ def scene_of(
 
     `oscillate` with `start="rest"` gives the same result in a fraction of the time. `oscillate` uses the inverse
     of the stiffness, which is possible because the mesh is small.
+
+    Raises:
+        InputError: the rig is compressed (`fitting.rigs.compression`), and the scene would begin uncompressed.
     """
+    _check_drive(drive)
+    if rig.held is not None:
+        raise InputError("a compressed rig cannot be converted to a scene: use the rig without its compression")
     steps, n = drive.steps * drive.cycles, rig.mesh.number_of_nodes
     dt = 2 * jnp.pi / (omega * drive.steps)
     times = dt * jnp.arange(steps + 1)
@@ -339,7 +348,14 @@ def oscillate(rig: Rig, law: Law, prony: Prony | None, omega: Number, amplitude:
         amplitude: amplitude of the torque [N m] or of the angle [rad].
         drive: see `Drive`; a change compiles a new program.
     """
+    _check_drive(drive)
     return _oscillate(_Oscillation(rig, law, prony, omega, amplitude, drive), linearised_rig(rig, law, prony))[0]
+
+
+def _check_drive(drive: Drive) -> None:
+    for key, words in (("by", ("torque", "angle")), ("start", ("cycle", "rest"))):
+        if getattr(drive, key) not in words:
+            raise InputError(f"drive {key} = {getattr(drive, key)!r} is not known: use {' or '.join(words)}")
 
 
 def demodulate(run: Run, omega: Number, drive: Drive) -> tuple[jax.Array, jax.Array]:
@@ -363,6 +379,7 @@ def moduli(
     Args:
         omega, amplitude: arrays (n,) or single values, which are broadcast; see `oscillate`.
     """
+    _check_drive(drive)
     rest = linearised_rig(rig, law, prony)
     omega, amplitude = jnp.broadcast_arrays(jnp.asarray(omega, float), jnp.asarray(amplitude, float))
 
@@ -389,19 +406,27 @@ def strain_sweep(
     Args:
         strains: amplitudes at the rim, e.g. 1e-4 … 0.2.
         omega: angular frequency [rad/s], default 1 Hz.
+        drive: see `Drive`; the angle must be imposed.
+
+    Raises:
+        InputError: the drive imposes the torque.
     """
     drive = drive or Drive(cycles=3, by="angle")
+    if drive.by != "angle":
+        raise InputError(f"drive by = {drive.by!r} cannot impose strains: use by = 'angle'")
     return moduli(rig, law, prony, omega, jnp.asarray(strains) * rig.height / rig.radius, drive)
 
 
 def linearity_limit(strains: Numbers, storage: Numbers, deviation: float = 0.05) -> float:
     """Return the strain at which G' differs by `deviation` from its value at the smallest strain. Returns infinity if
-    G' never differs that much.
+    G' never differs that much. The strains may have any order.
 
     If a modulus is not finite (a diverged run) before this strain, the last strain with a finite modulus is returned,
     or NaN if the first modulus is not finite.
     """
-    strains, change = np.asarray(strains), np.abs(np.asarray(storage) / np.asarray(storage)[0] - 1)
+    order = np.argsort(np.asarray(strains))
+    strains, storage = np.asarray(strains)[order], np.asarray(storage)[order]
+    change = np.abs(storage / storage[0] - 1)
     beyond = np.flatnonzero(~(change <= deviation))
     if not len(beyond):
         return math.inf

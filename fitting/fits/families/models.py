@@ -128,7 +128,8 @@ def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> as_prony_modes.Conver
 
 def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
     """Return the fit with the error of the conversion to Prony modes, and with the warnings about the model."""
-    sentences = [_cut_off(fit)] if fit.kind.name != "fractional_zener" and fit.kind.effective is None else []
+    endless = fit.kind.name != "fractional_zener" and fit.kind.effective is None and not _has_spring(fit.parameters)
+    sentences = [_cut_off(fit)] if endless else []
     if made.error > as_prony_modes.ALLOWED:
         sentences.append(
             f"{fit.modes} Prony modes represent the model {fit.kind.name} only with errors of up to "
@@ -138,6 +139,11 @@ def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
     warnings = (*fit.warnings, *sentences, *undetermined(fit))
     details = fit.details | {"conversion": {"modes": fit.modes, "largest_relative_error": made.error}}
     return fit._replace(details=details, warnings=warnings)
+
+
+def _has_spring(own: Estimate | None) -> bool:
+    """Return whether an exponent of a fractional model is 0. Such a springpot is a spring."""
+    return own is not None and bool(np.any(_bounded(own) & (own.values < 0.5)))
 
 
 def _cut_off(fit: Fit) -> str:

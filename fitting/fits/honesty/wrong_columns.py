@@ -20,6 +20,8 @@ _FEWEST, _EXACT = 8, 1e-6
 #: A cause is reported if it lowers Akaike's criterion by more than _BETTER and if the remaining residuals look random
 #: (probability of their order above _RANDOM).
 _BETTER, _RANDOM = 10.0, 0.05
+#: Causes are named together if their values of Akaike's criterion differ by less than this (Burnham, Anderson 2002).
+_AS_GOOD = 6.0
 _stress = jax.jit(homogeneous.nominal_stress)
 
 
@@ -90,10 +92,10 @@ def _nearest_factor(law: Law, curve: Curve, named: bool) -> float:
 
 
 def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
-    """Return a string with the cause that lowers Akaike's criterion most and leaves random residuals. The string is
+    """Return a string with the causes that lower Akaike's criterion most and leave random residuals. The string is
     empty if there is no such cause."""
-    found = [(_criterion(fit.law, curves, odd, None), "")]
-    limit = found[0][0].value - _BETTER
+    found: list[tuple[_Refit, str]] = []
+    limit = _criterion(fit.law, curves, odd, None).value - _BETTER
     for cause in _CAUSES:
         sheared = any(c.test not in ("uniaxial", "equibiaxial", "pure_shear") for c in odd)
         if sheared and not cause.of_stress:
@@ -101,11 +103,12 @@ def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
         refit = _criterion(fit.law, curves, odd, cause)
         if refit.value < limit and refit.chance > _RANDOM:
             words = cause.words.format(driven="stretch", number=refit.number)
-            modulus = _slope_at_rest(refit.law)
-            found.append(
-                (refit, f"the same law would fit the curve {words}, with G0 {modulus:.4g} Pa: check the columns")
-            )
-    return min(found, key=lambda each: each[0].value)[1]
+            found.append((refit, f"{words} (G0 {_slope_at_rest(refit.law):.4g} Pa)"))
+    if not found:
+        return ""
+    found.sort(key=lambda each: each[0].value)
+    as_good = [words for refit, words in found if refit.value < found[0][0].value + _AS_GOOD]
+    return f"the same law would fit the curve {', or '.join(as_good)}: check the columns"
 
 
 class _Refit(NamedTuple):

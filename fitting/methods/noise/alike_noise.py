@@ -90,7 +90,7 @@ def _alike_noise(
     lengths = np.geomspace(neighbour / 3, size, LENGTHS)
     # If the chosen groups do not depend on an unknown, this unknown absorbs no noise of their residuals.
     shown = np.linalg.norm(J[np.concatenate(chosen)], axis=0) > SHOWN * np.linalg.norm(J, axis=0)
-    if sum(map(len, chosen)) <= shown.sum():
+    if not 0 < shown.sum() < sum(map(len, chosen)):
         return None
     basis = _determined(J[np.ix_(np.concatenate(chosen), shown)])
     limit = OUTLIER * 1.4826 * float(np.median(np.abs(r)))

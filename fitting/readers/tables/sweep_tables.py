@@ -122,6 +122,8 @@ def tables_of(path: str, lines: list[str]) -> list[Table]:
     hint = (
         "; viscosities are not read (convert them to |G*| = omega |eta*|, and name the column complex_modulus_Pa)"
         if viscous
+        else "; shear waves belong to a sweep (SWEEP --with this file)"
+        if re.search("(?i)velocity", shown)
         else ""
     )
     raise InputError(f"{path}: no column for {lacks} in the header {shown!r}; add {NEEDED[lacks]}{hint}")

@@ -10,6 +10,7 @@ import numpy as np
 from fitting.waves import voxels
 from fitting.waves.elastography import Organ
 from fitting.waves.stiffness_map import WaveMap, sd_of_modulus
+from liverjax.core.files import whole
 from liverjax.core.plotting import pyplot
 
 if TYPE_CHECKING:
@@ -28,16 +29,16 @@ def at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
 def write_at_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.ndarray) -> None:
     """Write waves.h5: the mask, the direct inversion `usual` (F, nx, ny, nz) [Pa] at F frequencies, and the map with
     its standard deviations."""
-    with h5py.File(path, "w") as file:
+    with whole(path) as new, h5py.File(new, "w") as file:
         for name in ("frequencies", "spacing", "origin", "mask"):
             file[name] = getattr(organ.field, name)
         file["direct_inversion"] = usual
         if drawn is None:
             return
-        whole = np.stack([at_voxels(organ, G) for G in drawn.modulus])
+        moduli = np.stack([at_voxels(organ, G) for G in drawn.modulus])
         sd = np.stack([at_voxels(organ, own) for own in drawn.sd])
-        file["modulus"], file["sd_of_logarithm"], file["sd_of_loss_angle"] = whole, sd.real, sd.imag
-        file["sd"] = sd_of_modulus(whole, sd)
+        file["modulus"], file["sd_of_logarithm"], file["sd_of_loss_angle"] = moduli, sd.real, sd.imag
+        file["sd"] = sd_of_modulus(moduli, sd)
         file["draws_of_exponent"] = (
             np.stack([[at_voxels(organ, c) for c in own] for own in drawn.draws]) if len(drawn.draws) else []
         )

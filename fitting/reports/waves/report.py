@@ -13,6 +13,7 @@ from fitting.waves.regions import Regions
 from fitting.waves.shear_waves import velocity_and_attenuation
 from fitting.waves.stiffness_map import WaveMap
 from liverjax.core.errors import InputError
+from liverjax.core.files import write_whole
 from liverjax.core.plotting import save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -54,7 +55,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
     content = numbers(content)
     content["springpots"], told = _springpots(_sweeps(out, organ, content))
     content["warnings"] += told
-    (out / "waves.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_whole(out / "waves.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     write_at_voxels(out / "waves.h5", organ, drawn, usual)
     if drawn is not None:
         write_for_paraview(out / "waves.vtu", organ, drawn)
@@ -153,7 +154,7 @@ def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
         rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
         rows += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
         files[name] = out / f"sweep_{name}.csv"
-        files[name].write_text("\n".join(rows) + "\n")
+        write_whole(files[name], "\n".join(rows) + "\n")
     return files
 
 
