@@ -37,6 +37,42 @@ def sets_of(tmp_path, cards):
     return {name: sorted(np.asarray(members).tolist()) for name, members in found.items()}
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_surfaces_of_elements_are_groups_of_triangles(tmp_path, order):
+    """A surface was left out without a word. Its faces are those of the keyword reference: S1 is 1-2-3, S2 is 1-4-2, S3
+    is 2-4-3, S4 is 3-4-1."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    tets, top = np.asarray(mesh.tetrahedra), lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_max"])
+    faces = {"S1": (0, 1, 2), "S2": (0, 3, 1), "S3": (1, 3, 2), "S4": (2, 3, 0)}
+    wanted = {tuple(sorted(t)) for t in top.tolist()}
+    lines = [(e, s) for e, t in enumerate(tets) for s, f in faces.items() if tuple(sorted(t[list(f)])) in wanted]
+    alone, by_set = lines[:3], lines[3:]
+    text = ["*NODE", *(f"{k + 1}, {x}, {y}, {z}" for k, (x, y, z) in enumerate(np.asarray(mesh.points).tolist()))]
+    text += [f"*ELEMENT, TYPE=C3D{4 if order == 1 else 10}"]
+    text += [", ".join(map(str, [e + 1, *(nodes + 1)])) for e, nodes in enumerate(meshio_cells(mesh)[1])]
+    for s in faces:
+        own = [str(e + 1) for e, face in by_set if face == s]
+        text += [f"*ELSET, ELSET=_top_{s}, INTERNAL", *own] if own else []
+    text += ["*SURFACE, TYPE=ELEMENT, NAME=top", *(f"{e + 1}, {s}" for e, s in alone)]
+    text += [f"_top_{s}, {s}" for s in faces if any(face == s for _, face in by_set)]
+    text += ["*SURFACE, TYPE=NODE, NAME=other", "1, 1.0"]
+    (tmp_path / "m.inp").write_text("\n".join(text) + "\n")
+    back = lj.read_mesh(tmp_path / "m.inp")
+    assert {tuple(sorted(t)) for t in np.asarray(back.triangle_sets["top"]).tolist()} == wanted
+    assert set(np.asarray(back.node_sets["top"])) == set(np.asarray(mesh.node_sets["z_max"]))
+    lj.scenes.scene_checks.check_before_run(
+        lj.Scene(
+            mesh=back,
+            law=lj.laws.NeoHookean(mu=1.0, bulk=2.0),
+            traction=(lj.Traction(triangles=back.triangle_sets["top"], pressure=1.0),),
+        )
+    )
+    (tmp_path / "m.inp").write_text("\n".join([*text, "*SURFACE, NAME=a", "nothing, S1"]) + "\n")
+    with pytest.raises(lj.InputError, match=r"\*SURFACE contains nothing, but the file does not define this set"):
+        lj.read_mesh(tmp_path / "m.inp")
+
+
 @pytest.mark.parametrize(
     ("cards", "members"),
     [

@@ -1,4 +1,4 @@
-"""Read meshes in Abaqus input files (.inp): nodes, elements and their sets.
+"""Read meshes in Abaqus input files (.inp): nodes, elements, their sets, and surfaces of tetrahedra.
 
 A file consists of cards. A card is a keyword line such as ``*ELSET, ELSET=hard``, with data lines. Several cards of the
 same set add members to the set, and a data line may name another set. The reader of meshio 5.3 keeps only the last card
@@ -27,6 +27,8 @@ _CELLS = {
     },
     r"(?:S|DS|STRI|M3D|SFM3D|R3D|CPS|CPE)(3|6)5?[A-Z]*": {3: "triangle", 6: "triangle6"},
 }  # fmt: skip
+#: Corners of the faces S1 … S4 of a tetrahedron, counterclockwise if seen from outside.
+_FACES = {"S1": (0, 2, 1), "S2": (0, 1, 3), "S3": (1, 2, 3), "S4": (0, 3, 2)}
 #: Keywords that create nodes or elements, or that change coordinates.
 _MAKING = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM")
 
@@ -66,15 +68,22 @@ def read_abaqus(path: Path) -> "meshio.Mesh":
         element_sets = _sets(cards, "ELSET", {k: block.labels for k, block in blocks.items()}, {})
         by_card = {k: [int(line[0]) for line in card.lines] for k, card in _cards_of(cards, "NODE")}
         node_sets = _sets(cards, "NSET", by_card, _nodes_of(element_sets, blocks, list(nodes)))
+        surfaces = _surfaces(cards, element_sets, blocks)
     except _Wrong as error:
         raise InputError(f"mesh file {path}: {error}") from None
+    none = [np.zeros(0, int)] * len(surfaces)
+    cell_sets = {
+        name: [*(_indices_of(block.labels, own) for block in blocks.values()), *none]
+        for name, own in element_sets.items()
+    }
+    empty = [np.zeros(0, int)] * len(blocks)
+    for k, (name, triangles) in enumerate(surfaces.items()):
+        cell_sets[name] = [*empty, *none[:k], np.arange(len(triangles)), *none[k + 1 :]]
     return meshio.Mesh(
         points,
-        [(block.kind, block.nodes) for block in blocks.values()],
+        [*((block.kind, block.nodes) for block in blocks.values()), *(("triangle", own) for own in surfaces.values())],
         point_sets={name: _indices_of(list(nodes), own) for name, own in node_sets.items()},
-        cell_sets={
-            name: [_indices_of(block.labels, own) for block in blocks.values()] for name, own in element_sets.items()
-        },
+        cell_sets=cell_sets,
     )
 
 
@@ -242,6 +251,28 @@ def _sets(
         f"{part}.{names[name]}" if inside and (False, name) in found else names[name]: members((inside, name), ())
         for inside, name in found
     }
+
+
+def _surfaces(
+    cards: list[_Card], element_sets: dict[str, set[int]], blocks: dict[int, _Block]
+) -> dict[str, np.ndarray]:
+    """Return {name of a ``*SURFACE`` card: corners (m, 3) of its triangles}. A data line is an element or a set of
+    elements, with one of `_FACES`. Other surfaces (of nodes, of shells, analytical ones) are ignored."""
+    tetrahedra = [block for block in blocks.values() if block.kind in ("tetra", "tetra10")]
+    corners = {k: own[:4] for block in tetrahedra for k, own in zip(block.labels, block.nodes, strict=True)}
+    sets = {key: own for name, own in element_sets.items() for key in (name.lower(), name.rpartition(".")[2].lower())}
+    found: dict[str, list[np.ndarray]] = {}
+    for _, card in _cards_of(cards, "SURFACE"):
+        for line in card.lines if card.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT" else ():
+            of, face = line[0].lower(), line[1].upper() if len(line) > 1 else ""
+            last = of.rpartition(".")[2]  # the name of the part may stand before the number or the name
+            members = {int(last)} if last.isdigit() else sets.get(of, sets.get(last))
+            if members is None:
+                raise _Wrong(f"*SURFACE contains {line[0]}, but the file does not define this set; define it")
+            if face in _FACES:
+                own = [corners[k][list(_FACES[face])] for k in sorted(members & corners.keys())]
+                found.setdefault(card.parameters.get("NAME", "surface"), []).extend(own)
+    return {name: np.array(own) for name, own in found.items() if own}
 
 
 def _listed(card: _Card, of_elements: dict[str, set[int]]) -> tuple[set[int], list[str]]:
