@@ -70,7 +70,7 @@ def test_closed_form_on_measured_data(tmp_path, capsys):
     content = json.loads((tmp_path / "fit.json").read_text())
     _contract(content, content["modes"])
     assert content["method"] == "closed-form" and content["profile_intervals_95"]
-    assert "profile 95 % (closed form)" in capsys.readouterr().out
+    assert "(profile likelihood, closed form): " in capsys.readouterr().out
 
 
 @pytest.mark.slow

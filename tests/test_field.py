@@ -259,7 +259,7 @@ def test_a_scene_without_an_answer_is_no_map(problem, monkeypatch):
         return jax.linearize(lambda m: (jnp.nan * m, (jnp.zeros((), jnp.int32),)), m, has_aux=True)
 
     monkeypatch.setattr(field, "_linearised", nothing)
-    with pytest.raises(lj.InputError, match="fails at the parameters from which the map begins"):
+    with pytest.raises(lj.InputError, match="fails at the parameters from which the search begins"):
         field.estimate(problem, length=0.02, mesh_error=False)
 
 

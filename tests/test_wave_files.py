@@ -52,6 +52,9 @@ def test_a_wrong_spacing_of_the_file_is_replaced(tmp_path):
     found = wave_field.read_waves(tmp_path / "w.npz", spacing=[H, H, H])
     np.testing.assert_allclose(found.spacing, H)
     assert any("the file states a spacing of" in note for note in found.notes)
+    np.savez(tmp_path / "u.npz", displacement=field.displacement, frequencies=HERTZ, spacing=np.full(3, H), unit="um")
+    other = wave_field.read_waves(tmp_path / "u.npz", unit="mm")
+    assert any("states the unit um, but --unit mm is used" in note for note in other.notes)
     with pytest.raises(InputError, match="too large for a voxel"):
         wave_field.read_waves(tmp_path / "w.npz")
 

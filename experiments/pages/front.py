@@ -101,9 +101,9 @@ def choices() -> str:
     error = max(table["laws"]["neo_hookean"][f"{what}_error"] for what in ("stress", "tangent"))
     rows += [
         "",
-        "For the liver phantom, the table gives only the error of the time step. The error of its linear tetrahedra is",
-        f"much larger: in {mesh['ended']} static runs, the displacement differs from that of quadratic elements by "
-        f"{percent(mesh['median'])} (median) to {percent(mesh['largest'])}.",
+        "For the liver phantom, the table gives only the error of the time step or of Newton's tolerance. The error of",
+        f"its linear tetrahedra is much larger: in {mesh['ended']} static runs, the displacement differs from that of "
+        f"quadratic elements by {percent(mesh['median'])} (median) to {percent(mesh['largest'])}.",
         "",
         f"The assembly of force and stiffness needs no choice. Its error is {error_text(error)}. For "
         f"{fig4['elements']:,} neo-Hookean tetrahedra it",

@@ -90,7 +90,7 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
     names = options.parameters.split(",")
     for option in ("name", "length", "iterations", "sphere", "resume"):
         if getattr(options, option):
-            raise InputError(f"--{option} is for maps and cannot be used with --parameters: remove one of both")
+            raise InputError(f"--{option} is for maps and cannot be used with --parameters: remove one of them")
     for name in names:
         if name.startswith("solve."):
             raise InputError(f"--parameters {name} belongs to the solver, and not to the body: give e.g. law.mu")

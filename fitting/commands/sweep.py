@@ -196,8 +196,8 @@ def run(options: argparse.Namespace) -> int:
         one_page.write(options.out / "report.pdf", sweep, fits, content, shifted)
         print(f"written: {options.out}/report.pdf")
     for name, (low, high) in (profile or {}).items():
-        ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
-        print(f"profile 95 % (closed form): {name} from {ends[0]} to {ends[1]}")
+        ends = ["not found" if end is None else f"{end:.4g}" for end in (low, high)]
+        print(f"95 % interval of {name} (profile likelihood, closed form): {ends[0]} to {ends[1]}")
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")

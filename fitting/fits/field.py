@@ -299,8 +299,8 @@ def estimate(
     here = search.at(search.z)
     if not here.finite:
         raise InputError(
-            "the simulation fails at the parameters from which the map begins: run simulate on the scene to find the "
-            "cause"
+            "the simulation fails at the parameters from which the search begins: run simulate on the scene to find "
+            "the cause"
         )
     deviation, m = here.deviation, np.asarray(here.m)
     values, vectors = _measured_directions(here, len(m), options.modes)

@@ -201,7 +201,7 @@ def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law:
             f"start: ratios = {ratios.tolist()} must be above 0 and add up to less than 1; correct the ratios"
         )
     if not (np.all(times > 0) and np.all(np.isfinite(times))):
-        raise InputError(f"start: relaxation_times = {times.tolist()} must be above 0 s; correct the times")
+        raise InputError(f"start: relaxation_times = {times.tolist()} must be finite and above 0 s; correct the times")
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> tuple[np.ndarray, np.ndarray]:

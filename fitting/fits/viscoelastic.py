@@ -244,8 +244,8 @@ FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
 
 def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> tuple[str, ...]:
     """Return a warning with the worst point, if the model does not fit the data."""
-    # If errors of the phase angle cause the scatter of the loss modulus, small loss moduli have large relative errors.
-    # So their errors are divided by |G*|.
+    # If the deviations come from the scatter of the points, errors of the phase angle may be their cause. Small loss
+    # moduli then have large relative errors, so their errors are divided by |G*|.
     size = np.hypot(sweep.storage, sweep.loss) if sweep.sd_estimated else sweep.loss
     e = np.abs(np.concatenate([storage / sweep.storage - 1, (loss - sweep.loss) / size]))
     if e.mean() < 0.05 and e.max() < 0.3:

@@ -27,7 +27,7 @@ class Conversion(NamedTuple):
     times: np.ndarray  # (N,) [s], descending
     solid: bool  # whether the first strength is an equilibrium modulus
     strengths_of: np.ndarray  # (N + solid, 2n): matrix from the moduli (G', then G'') to the strengths [Pa]
-    error: float  # largest relative error of G' and G'' of the model that was converted
+    error: float  # largest relative difference of G' and G'' between modes and model
 
 
 def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.ndarray:

@@ -27,8 +27,8 @@ SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
 #: A warning is given if the relative distance of the best spectrum from the data is larger than FAR, and also larger
 #: than FAR_RATIO times the scatter.
 FAR, FAR_RATIO = 0.01, 5.0
-#: If random noise gives as few changes of sign of the residuals with a probability below this value, the misfit is
-#: called structured.
+#: The misfit is called structured if the probability that random noise gives so few changes of sign of the residuals is
+#: below this value.
 CHANCE = 0.005
 
 
@@ -115,7 +115,7 @@ def _noise_of_loss(sweep: Sweep, same: float) -> np.ndarray:
 
 
 def _breach(omega, storage, loss, noise) -> str:
-    """Return a string with the bound that two neighbouring points violate, or an empty string."""
+    """Return words that say how two neighbouring points violate a bound, or an empty string."""
     step = math.log(omega[1] / omega[0])
     # Upper bound of the rise of G' between the two points, for the largest G'' that is possible between them:
     # |d ln G''/d ln omega| is at most 1.

@@ -122,7 +122,8 @@ class _Spreads(NamedTuple):
 
 
 def _over_spreads(y: np.ndarray, v: np.ndarray) -> _Spreads:
-    """Return a grid of spreads with their weights from the restricted likelihood and the prior."""
+    """Return a grid of standard deviations s between samples. The weight of each value is the restricted likelihood
+    times the prior."""
     size = float(np.sqrt(np.var(y) + np.mean(v)))
     s = np.concatenate([[0.0], np.geomspace(1e-4 * size, max(100 * size, 30.0), 400)])
     w = 1 / (v + s[:, None] ** 2)

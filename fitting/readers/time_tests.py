@@ -120,7 +120,8 @@ def read_time_test(
     """
     if not (np.isfinite(start) and start >= 0):
         raise InputError(
-            f"--min-time {start:g} must be a finite number of seconds, 0 or more (a time of the file): give e.g. 0.5"
+            f"--min-time {start:g} must be a finite number of seconds, 0 or more, on the time axis of the file: give "
+            "e.g. 0.5"
         )
     columns, notes = read_columns(path)
     time = columns["time"]

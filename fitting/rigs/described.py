@@ -47,8 +47,8 @@ _GLUED, _LAYER = 0.4995, 0.5
 #: Displacements, divided by the largest displacement, at which glued samples are simulated. Above the strain _LARGE,
 #: the finer grid is used.
 _GRID, _FINER_GRID, _LARGE = (0.05, 0.5, 1.0), (0.05, 0.25, 0.5, 0.75, 1.0), 0.1
-#: Sizes of the cells at the rims of the plates, divided by the shortest length there. The simulation is tried with the
-#: small cells first. They are more accurate, but may invert at large compression.
+#: Sizes of the cells at the rims of the plates, divided by the shortest dimension of the sample there. The simulation
+#: is tried with the small cells first. They are more accurate, but may invert at large compression.
 _RIMS = (0.04, 0.1, 0.2)
 #: An indenter counts as going back if its depth falls by more than both _BACK times the largest depth and _SCATTERS
 #: times the scatter of the depth.

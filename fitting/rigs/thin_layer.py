@@ -101,7 +101,7 @@ def reach(rig: Indenter, depth: np.ndarray) -> np.ndarray:
 
 
 def check_indenter(rig: Indenter) -> None:
-    """Check that an indenter can be computed.
+    """Check that the force on an indenter can be computed.
 
     Raises:
         InputError: the shape is not known, a length is not above 0, Poisson's ratio or the angle is out of range, or a

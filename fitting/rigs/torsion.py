@@ -418,8 +418,8 @@ def strain_sweep(
 
 
 def linearity_limit(strains: Numbers, storage: Numbers, deviation: float = 0.05) -> float:
-    """Return the strain at which G' differs by `deviation` from its value at the smallest strain. Returns infinity if
-    G' never differs that much. The strains may have any order.
+    """Return the strain at which G' differs by the fraction `deviation` from its value at the smallest strain.
+    Returns infinity if G' never differs that much. The strains may have any order.
 
     If a modulus is not finite (a diverged run) before this strain, the last strain with a finite modulus is returned,
     or NaN if the first modulus is not finite.

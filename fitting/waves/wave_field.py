@@ -68,7 +68,7 @@ def read_waves(
         found["phases"], jumps = unwrapped(name, phases)
         found["unit"] = "rad"
     U, notes = _motion(name, found)
-    notes += [*found.get(formats.NEARLY, []), *jumps, *_of_another_spacing(name, found, step)]
+    notes += [*found.get(formats.NEARLY, []), *jumps, *_of_replaced(name, found, step, unit)]
     U = np.where(np.isfinite(U), U, np.nan) * _factor(name, unit or found.get("unit") or "m")
     notes += _leave_out_rest(U)
     hertz = _hertz(name, frequencies, found.get("frequencies"), len(U))
@@ -92,8 +92,17 @@ def read_waves(
     return field._replace(noise=noise_of(field))
 
 
+def _of_replaced(name: str, found: Content, step: np.ndarray, unit: str | None) -> list[str]:
+    """Return notes if the unit in the file differs from the given `unit`, or its spacing from the spacing `step` [m]
+    that is used."""
+    stated = found.get("unit")
+    told = []
+    if unit and stated and unit != stated:
+        told.append(f"the file states the unit {stated}, but --unit {unit} is used")
+    return told + _of_another_spacing(name, found, step)
+
+
 def _of_another_spacing(name: str, found: Content, step: np.ndarray) -> list[str]:
-    """Return a note if the spacing in the file differs from the spacing `step` [m] that is used."""
     if found.get("spacing") is None or formats.CONFLICT in found:
         return []
     stated = _plain(name, "spacing", found["spacing"])  # it may be wrong, because it is not used

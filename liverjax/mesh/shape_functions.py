@@ -1,8 +1,8 @@
 """Shape functions of straight tetrahedra, and their integration points.
 
 L_k are the barycentric coordinates. Their gradients D_k are constant; these are the shape vectors of the linear
-element. With the shape functions N_a, the positions x_a of the nodes, c_ak = dN_a/dL_k and y_k = sum_a c_ak x_a, the
-deformation gradient is F (⊗: tensor product):
+element. N_a are the shape functions, and x_a the positions of the nodes. With c_ak = dN_a/dL_k and y_k = sum_a c_ak
+x_a, the deformation gradient F is (⊗: tensor product):
 
     grad N_a = sum_k c_ak D_k,    so    F = sum_a x_a ⊗ grad N_a = sum_k y_k ⊗ D_k
 

@@ -11,7 +11,7 @@ from liverjax.core.struct import Indices
 from liverjax.mesh.shape_functions import triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Edges of a triangle, in the order of the middles of its edges.
+#: Edges of a triangle. Middle nodes are listed in this order.
 _EDGES = ((0, 1), (1, 2), (2, 0))
 #: The same edges of a triangle with vertices in increasing order, each from its lower to its higher vertex. This is the
 #: direction of the shape function of order 3 of the edge.

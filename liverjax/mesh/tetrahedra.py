@@ -92,7 +92,7 @@ class TetMesh:
     @property
     def element_nodes(self) -> list[jax.Array]:
         """Node numbers of every element, as a list of arrays (E,): 4 vertices; in quadratic meshes also the middles of
-        the 6 edges `PAIRS`; in order 3 also the additional functions."""
+        the 6 edges `PAIRS`; in order 3 also the indices of the additional functions."""
         return self._nodes(self.tetrahedra, self.pattern.element_edges, self.faces)
 
     @property

@@ -44,8 +44,8 @@ FEW_RUNS = 10.0
 
 @struct
 class Correction:
-    """Polynomials with k terms for the coefficients of m fields, and numbers that determine the stated error (module
-    docstring). Both are learnt from R training runs."""
+    """Polynomials with k terms for the coefficients of m fields, and numbers that determine the stated error (see the
+    docstring of the module). Both are learnt from R training runs."""
 
     fields: jax.Array = param("m^-1.5", "(m, V, 3), orthonormal with the nodal volumes as weights")
     factors: jax.Array = param("m^2.5", "factor of each term in the coefficient of each field (k, m)")

@@ -75,13 +75,13 @@ class ReducedResult:
 class _Given(NamedTuple):
     """Reduced loads and prescribed motion at the end of each of T steps, for n modes and S points."""
 
-    load: jax.Array  # forces on the modes (T, n) [N]
+    load: jax.Array  # forces on the modes (T, n) [N m^-1.5]
     gradient: jax.Array  # deformation gradient of the prescribed motion (T, 9, S), or (1, 9, S) without motion
 
 
 def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
-    """Return the reduced loads and the prescribed motion of all steps. The second result is the reduced load (n,) [N]
-    on the n modes at the beginning of the run."""
+    """Return the reduced loads and the prescribed motion of all steps. The second result is the reduced load (n,)
+    [N m^-1.5] on the n modes at the beginning of the run."""
     mesh, solve, body = scene.mesh, scene.solve, scene.body
     weight = {} if body is None else {k: getattr(body, k) for k in ("density", "gravity", "times", "history")}
     loads = Loads(traction=scene.traction, **weight)
@@ -131,9 +131,9 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     """Return the initial state: reduced coordinates, history variables of viscosity, state of the fluid, velocity and
     acceleration, and a zero matrix for the inverse tangent, which is not yet known. The last result is the reduced mass
-    matrix (n, n) [kg] of the n modes.
+    matrix (n, n) [kg m^-3] of the n modes.
 
-    Velocity, acceleration and mass are None without inertia. `load` (n,) [N]: reduced load at the beginning.
+    Velocity, acceleration and mass are None without inertia. `load` (n,) [N m^-1.5]: reduced load at the beginning.
     """
     n, S = model.number_of_modes, model.weights.shape[0]
     q = jnp.zeros(n, model.modes.dtype)
@@ -156,7 +156,7 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
 
 
 def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> jax.Array:
-    """Return the reduced forces (n,) [N] on the n modes due to a given initial pressure (see
+    """Return the reduced forces (n,) [N m^-1.5] on the n modes due to a given initial pressure (see
     `liverjax.simulation.equations.initial_state`)."""
     sponge = reduced_sponge(model, scene)
     flow = flowing(model, sponge, fluid, jnp.asarray(scene.solve.dt))

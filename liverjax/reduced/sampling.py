@@ -46,7 +46,7 @@ class Coordinates(NamedTuple):
     """Reduced coordinates of R runs with T steps each, for n modes of the motion and m modes of the pressure."""
 
     q: np.ndarray | jax.Array  # coordinates of the modes (R, T, n) [m^2.5]
-    p: np.ndarray | jax.Array | None  # coordinates of the pressure modes (R, T, m) [Pa]
+    p: np.ndarray | jax.Array | None  # coordinates of the pressure modes (R, T, m) [Pa m^1.5]
 
 
 def sampled(
@@ -171,7 +171,7 @@ def _balance(
     Args:
         whole, scene: the same arguments as for `sampled`.
         gradient: function (number of a step, from 0) -> deformation gradients (9, P) at the end of this step.
-        p: coordinates of the pressure (T, m) [Pa].
+        p: coordinates of the pressure (T, m) [Pa m^1.5].
         times: numbers of the K steps.
     """
     sponge, rest, modes = porosity_at_points(whole, scene), fluid_at_rest(whole, scene), whole.pressures

@@ -47,9 +47,9 @@ class ReducedEquations(NamedTuple):
 
     model: ReducedModel
     acting: Solid  # stress of the solid, with the history variables at the end of the last step
-    load: jax.Array  # loads on the modes (n,) [N]
+    load: jax.Array  # loads on the modes (n,) [N m^-1.5]
     gradient: jax.Array  # deformation gradients of the prescribed motion (9, S)
-    mass: jax.Array | None  # reduced mass matrix (n, n) [kg]; None without inertia
+    mass: jax.Array | None  # reduced mass matrix (n, n) [kg m^-3]; None without inertia
     q: jax.Array  # reduced coordinates at the beginning of the step (n,) [m^2.5]
     motion: ReducedMotion | None
     dt: jax.Array
@@ -119,18 +119,18 @@ def _point_forces(e: ReducedEquations, F: jax.Array) -> jax.Array:
 
 
 def _added_up(e: ReducedEquations, P: jax.Array) -> jax.Array:
-    """Return the forces (n,) [N] on the n modes, from stress times weight (9, S) [N m] at the S points."""
+    """Return the forces (n,) [N m^-1.5] on the n modes, from stress times weight (9, S) [N m] at the S points."""
     return jnp.tensordot(P, e.model.slopes, axes=2)
 
 
 def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return out-of-balance forces (n,) [N], and the sum of the norms of all forces [N].
+    """Return out-of-balance forces (n,), and the sum of the norms of all forces, in N m^-1.5.
 
     Args:
         e: constants of the step.
         q: the n reduced coordinates (n,) [m^2.5].
         P: stress times weight at the S points (9, S) [N m].
-        internal: forces of P on the modes (n,) [N].
+        internal: forces of P on the modes (n,) [N m^-1.5].
     """
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:
@@ -184,11 +184,11 @@ class _ReducedIterate(NamedTuple):
     q: jax.Array
     F: jax.Array  # deformation gradients (9, S)
     P: jax.Array  # stress times weight at the points (9, S) [N m]
-    internal: jax.Array  # forces of P on the modes (n,) [N]
-    r: jax.Array  # out-of-balance forces (n,) [N]
+    internal: jax.Array  # forces of P on the modes (n,) [N m^-1.5]
+    r: jax.Array  # out-of-balance forces (n,) [N m^-1.5]
     size: jax.Array  # norm of r, relative to the size of all forces
     rounded: jax.Array  # bound of the error of `size` due to single precision
-    inverse: jax.Array  # exact or approximate inverse of the tangent (n, n) [m/N]
+    inverse: jax.Array  # exact or approximate inverse of the tangent (n, n) [m^4/N]
     fresh: jax.Array  # whether `inverse` is the inverse of the tangent at q
     slow: jax.Array  # whether the last iteration reduced the residual too little
     iterations: jax.Array

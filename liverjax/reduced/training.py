@@ -135,8 +135,8 @@ def _model_of(scene: Scene, runs: _Runs, tolerance: float, most_modes: int, poin
 
 
 def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -> tuple[jax.Array, np.ndarray]:
-    """Return m modes (m, V) [1] of the pressures P (R, T, V) [Pa] in R runs, and the coordinates (R, T, m) [Pa] of P in
-    these modes. The number m of modes is at most half of `most`."""
+    """Return m modes (m, V) [m^-1.5] of the pressures P (R, T, V) [Pa] in R runs, and the coordinates (R, T, m)
+    [Pa m^1.5] of P in these modes. The number m of modes is at most half of `most`."""
     volumes = np.asarray(integrals(scene.mesh, jnp.ones_like(scene.mesh.weights)))
     modes = proper_modes(P.reshape(-1, P.shape[-1], 1), volumes, tolerance)[: max(1, most // PRESSURES), :, 0]
     return jnp.asarray(modes), (P * volumes) @ modes.T

@@ -105,7 +105,7 @@ def changed_numbers(region: Region) -> dict[str, object]:
 
 
 def set_by_regions(regions: tuple[Region, ...], name: str, number_of_elements: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether a region changes a parameter, such as `law.mu`, in each element (E,), and the new values (E,).
+    """Return for each element whether a region changes a parameter such as `law.mu` (E,), and the new value (E,).
 
     A value is NaN if the law of the region does not have the parameter, or if the parameter is not one number.
     """

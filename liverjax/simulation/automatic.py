@@ -112,7 +112,7 @@ def form_of_volumes(scene: Scene) -> str:
     """Return the scene's setting `volumetric`, the form of the volume changes.
 
     The setting "auto" becomes "mixed" for quadratic elements if possible, otherwise "element". This choice does not
-    depend on numbers, since a run and its derivatives must use the same form.
+    depend on the values of parameters, since a run and its derivatives must use the same form.
     """
     name = scene.solve.volumetric
     if name != "auto":

@@ -299,7 +299,7 @@ _Solved = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _Solved]:
-    """Return the unknowns at which the last linear solve begins, and the result of this solve.
+    """Return the unknowns about which the last linear system is linearised, and the solution of this system.
 
     Without contact and without a flowing fluid, there is one solve, at q. With contact, more solves are needed to find
     the contact points in the richer space. With a flowing fluid, more solves are needed because one solve is not exact.

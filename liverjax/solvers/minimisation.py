@@ -158,7 +158,7 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
 
 
 def _length(problem: Problem, c: _Descent, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
-    """Return the first step length t among 1, 1/2, 1/4, … for which the energy at q + t dq is small enough, or 0.
+    """Return the first step length t among 1, 1/2, 1/4, … for which the energy decreases sufficiently (Armijo).
 
     If the energies at q and q + t dq differ only by roundoff, a smaller residual at q + t dq is also enough. The result
     is 0 if no step length is found.

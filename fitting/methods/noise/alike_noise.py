@@ -112,7 +112,8 @@ def _alike_noise(
 
 def _determined(J: np.ndarray) -> np.ndarray:
     """Return the k directions (p, k) of the unknowns that the derivatives J (n, p) determine. If a parameter is at its
-    bound, one direction is not determined. A determinant that contains this direction would be only roundoff."""
+    bound, one direction is not determined. With this direction, the determinant in the likelihood would be only
+    roundoff."""
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
     _, values, directions = np.linalg.svd(J / size, full_matrices=False)

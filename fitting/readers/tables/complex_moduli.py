@@ -65,7 +65,7 @@ def fault_of(column: Column, written: float, value: float, smallest: float, larg
     written in the file."""
     if not np.isfinite(value):
         if np.isnan(written):
-            return f"{column.name} is empty or nan", "fill this cell, or remove the line"
+            return f"{column.name} is empty", "fill this cell, or remove the line"
         problem, remedy = "is not finite", "remove the line"
     elif value <= 0:
         problem, remedy = "is not positive", "correct the sign or remove the line"

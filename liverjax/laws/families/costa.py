@@ -81,7 +81,7 @@ class Costa(Law):
         if np.any(np.linalg.norm(np.cross(f, s), axis=-1) <= 1e-9 * size):
             raise InputError(
                 "law costa: the directions 'fibre' and 'sheet' are parallel, or one of them is zero; give two "
-                "different directions"
+                "directions that are not parallel"
             )
 
     @classmethod

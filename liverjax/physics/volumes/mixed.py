@@ -50,7 +50,8 @@ def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = '
         U = volumetric_part(law)
         if isochoric_part(law) is None or U is None:
             raise InputError(
-                f"{name} needs a law with an isochoric part and bulk, unlike {type(law).__name__}: use another law"
+                f"{name} needs a law with an isochoric and a volumetric part, unlike {type(law).__name__}: use another "
+                "law"
             )
         parts = [part for own in U.pieces() for part in own.summands() if isinstance(part, Volumetric)]
         kinds |= {(part.volumetric, part.below) for part in parts}

@@ -40,7 +40,7 @@ from liverjax.tensors.places import given
 class ReducedFluid(NamedTuple):
     """State of the fluid at the end of a step, from which the next step starts (m pressure modes, S points)."""
 
-    pressure: jax.Array  # coordinates p (m,) [Pa]
+    pressure: jax.Array  # coordinates p (m,) [Pa m^1.5]
     F: jax.Array  # deformation gradients (9, S)
     J_before: jax.Array | None  # volume ratios one step earlier (S,), only for the lagged scheme
 
@@ -63,9 +63,9 @@ class Flowing(NamedTuple):
     """Data of the fluid that are constant during a step (m pressure modes, S points; A and S: module docstring)."""
 
     porosity: Porosity  # with parameters at the points
-    inverse: jax.Array  # inverse of A (m, m) [Pa/m^3]
-    stored: jax.Array  # (m,) [m^3] S p_before; in the lagged scheme, minus the last change of volume
-    averages: jax.Array  # modes at the points, times their weights (S, m) [m^3]
+    inverse: jax.Array  # inverse of A (m, m) [Pa]
+    stored: jax.Array  # (m,) [m^1.5] S p_before; in the lagged scheme S p_before - c, with the last change of volume c
+    averages: jax.Array  # modes at the points, times their weights (S, m) [m^1.5]
     J: jax.Array  # volume ratios at the beginning of the step (S,)
 
 
@@ -146,8 +146,8 @@ def _squares(a: jax.Array) -> jax.Array:
 
 
 def pressure_coordinates(own: Flowing, J: jax.Array) -> jax.Array:
-    """Return the coordinates p (m,) [Pa] of m pressure modes at the end of a step, for the volume ratios J (S,) at the
-    S points at this time."""
+    """Return the coordinates p (m,) [Pa m^1.5] of m pressure modes at the end of a step, for the volume ratios J (S,)
+    at the S points at this time."""
     if own.porosity.scheme == "lagged":
         return own.inverse @ own.stored
     return own.inverse @ (own.stored - (J - own.J) @ own.averages)

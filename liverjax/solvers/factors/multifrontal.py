@@ -182,7 +182,7 @@ class _Elimination(NamedTuple):
         memory = np.empty(max((len(own) + len(border)) * len(own) for own, border, _ in fronts), self.kind)
         for k, front in zip(groups, fronts, strict=True):
             own, m = _own_columns(self.A, front, place, memory), len(front.border)
-            rest = np.zeros((m, m), self.kind, order="F")  # much of its upper triangle is never written
+            rest = np.zeros((m, m), self.kind, order="F")  # the children are added to its lower triangle
             for c in front.children:
                 left = self.rests[c]
                 if left is not None:  # None: the child is not coupled with later unknowns
