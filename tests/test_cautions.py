@@ -1,6 +1,7 @@
 """Warnings after a converged run, in the report and in result.h5: unusual sizes, slivers and volume changes."""
 
 import json
+from types import SimpleNamespace
 
 import h5py
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.pressed import PressedObstacle
+from liverjax.simulation import cautions
 from liverjax.simulation.cautions import cautions_of_mesh, cautions_of_run, mesh_sentence
 from liverjax.simulation.mesh_error import MeshError
 from liverjax.simulation.run import Result
@@ -32,6 +34,21 @@ def run(mesh: lj.TetMesh, gradients: list[np.ndarray], times: list[float]) -> Re
 
 
 BOX = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+
+
+def test_a_failed_run_with_a_sharp_cone_names_its_tip():
+    mesh = lj.quadratic(BOX)
+    cone = Obstacle(triangles=lj.boundary.boundary_triangles(mesh), shape="cone", position=(0.05, 0.05, 0.1))
+    failed, ended = (
+        SimpleNamespace(statistics=SimpleNamespace(status=np.array([code])))
+        for code in (status.STALLED, status.CONVERGED)
+    )
+    pressed = replace(scene(mesh), physics=(cone,))
+    assert "obstacle.0 is a cone with a sharp tip" in cautions._of_sharp_cones(pressed, failed)[0]
+    assert not cautions._of_sharp_cones(pressed, ended)
+    round_tip = replace(pressed, physics=(replace(cone, radius=1e-3),))
+    assert not cautions._of_sharp_cones(round_tip, failed)
+    assert not cautions._of_sharp_cones(replace(pressed, mesh=BOX), failed)
 
 
 def test_a_sound_run_has_none():

@@ -63,6 +63,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         *_of_pressures(scene, result),
         *_of_volumes(scene, result),
         *_of_friction_alone(scene, result),
+        *_of_sharp_cones(scene, result),
     ]
 
 
@@ -310,6 +311,22 @@ def _of_friction_alone(scene: Scene, result: Result) -> list[str]:
     return [
         f"the run failed, and only friction prevents sliding of {loose}: if the friction is too small for the sideways "
         "loads, no equilibrium exists; use a larger friction coefficient, [[fixed]], or kind = 'dynamic'"
+    ]
+
+
+def _of_sharp_cones(scene: Scene, result: Result) -> list[str]:
+    """Warn if a run with quadratic elements failed and a cone without a round tip is one of the obstacles."""
+    sharp = [
+        name
+        for name, own in named_physics(scene)
+        if isinstance(own, Obstacle) and own.shape == "cone" and not np.any(np.asarray(own.radius) > 0)
+    ]
+    fine = (status.CONVERGED, status.ONE_STEP)
+    if not sharp or scene.mesh.order == 1 or np.isin(result.statistics.status, fine).all():
+        return []
+    return [
+        f"the run failed, and {sharp[0]} is a cone with a sharp tip, under which quadratic elements may collapse: give "
+        "the cone a round tip (radius), or use linear elements"
     ]
 
 
