@@ -102,6 +102,7 @@ def test_places_in_another_unit_than_the_displacements_are_refused(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the error of the (mesh|time step) changes")
+@pytest.mark.filterwarnings("ignore:the effect of the mesh error on the fit is unknown")
 @pytest.mark.filterwarnings("ignore:residuals of points")
 def test_displacements_in_another_unit_are_told(tmp_path, capsys):
     """Displacements that are ten times too large give a tenth of the modulus, with a small error. Only the misfit shows
