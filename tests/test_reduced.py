@@ -9,7 +9,7 @@ from conftest import every_motion, moves_as_full
 
 import liverjax as lj
 from liverjax.core.struct import replace
-from liverjax.reduced import training
+from liverjax.reduced import estimate, training
 from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, refuse_unseen_numbers, solid_at_points, with_all_points
 from liverjax.reduced.sampling import MOST_STATES, Coordinates, nonnegative_weights, sampled, states_of
@@ -49,6 +49,13 @@ def test_the_error_of_a_body_that_is_about_to_buckle():
     away = np.asarray(lj.reduced_positions(model, pressed, run) - lj.simulate(pressed).check().positions)
     true = np.linalg.norm(away, axis=-1).max()
     assert 0.5 < float(lj.reduced_error(model, pressed, run).error.max()) / true < 2
+
+
+@pytest.mark.parametrize("factor", [np.nan, 0.0, -1.0])
+def test_a_reduced_run_that_failed_has_no_small_error(factor):
+    """The deformed body may have no stiffness that can be factorised."""
+    scene, r = _bar((3, 1, 1)), np.ones((16, 3))
+    assert estimate._softening(scene, r, factor * scene.mesh.points) == np.inf
 
 
 def test_failed_training_runs_are_told():

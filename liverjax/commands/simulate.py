@@ -182,8 +182,9 @@ def _write_and_tell(given: tuple["Scene", str, list[str]], ran: "Ran", target: P
 
     scene, text, said = given
     attributes = {"scene": text, "run_time_s": ran.run_time, "compile_time_s": ran.compile_time}
-    own = by_element(scene)
-    if own.porosity is not None:
+    if scene.porosity is not None:
+        own = by_element(scene)
+        assert own.porosity is not None
         attributes["bulk"] = porosity.bulk_in_force(own.porosity, own.law)
         print(attributes["bulk"])
     attributes |= {"warnings": said, "versions": versions()}

@@ -94,7 +94,8 @@ def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> R
 
 def _softening(scene: Scene, r: np.ndarray, x: jax.Array) -> float:
     """Return how much larger the response to forces r (V, 3) [N] is with the stiffness at positions x (V, 3) [m] than
-    with the stiffness of the reference shape: ratio of the largest displacements of a node. Viscosity is not used."""
+    with the stiffness of the reference shape: ratio of the largest displacements of a node. Viscosity is not used. The
+    ratio is infinite if the stiffness at x is singular or not finite."""
     from scipy.sparse.linalg import splu
 
     free = np.flatnonzero(np.asarray(free_directions(scene).mask).ravel())
@@ -103,7 +104,12 @@ def _softening(scene: Scene, r: np.ndarray, x: jax.Array) -> float:
     for at in (scene.mesh.points, x):
         K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), at)[free][:, free] + springs
         u = np.zeros(r.size)
-        u[free] = splu(K.tocsc()).solve(r.ravel()[free])
+        try:
+            if not np.all(np.isfinite(K.data)):
+                return np.inf
+            u[free] = splu(K.tocsc()).solve(r.ravel()[free])
+        except RuntimeError:  # SciPy's error for a singular matrix
+            return np.inf
         sizes.append(float(np.linalg.norm(u.reshape(-1, 3), axis=1).max()))
     return sizes[1] / sizes[0] if sizes[0] > 0 else 1.0
 
