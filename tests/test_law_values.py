@@ -13,8 +13,7 @@ import pytest
 from conftest import ROOT
 
 import liverjax as lj
-from liverjax.laws import products
-from liverjax.laws.terms import chapter_terms
+from liverjax.laws.terms import chapter_terms, products
 from liverjax.tensors.matrices import pack, unpack
 
 pytestmark = pytest.mark.quick_to_compile

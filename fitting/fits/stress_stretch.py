@@ -1,5 +1,5 @@
-"""Hyperelastic laws, fitted to stress-stretch curves by least squares from many starting points. The fitted laws are
-kept stable over the range of the data."""
+"""Hyperelastic laws, fitted to stress-stretch curves by least squares from many starting points. A stress of the
+law that falls within the range of the data adds a penalty to the residuals."""
 
 import itertools
 import time
@@ -25,7 +25,7 @@ from fitting.readers.curves import Curve, check_curves
 from liverjax import laws
 from liverjax.core.errors import InputError
 from liverjax.laws import Law, homogeneous
-from liverjax.laws.gradient_check import ellipticity
+from liverjax.laws.stability_check import ellipticity
 
 STARTS = 128
 #: Weight of a falling stress in the residuals: a fall by 1 % of the curve's stress scale counts like a misfit of 100 %.
@@ -70,9 +70,9 @@ _LEAST_NOISE = 1e-3
 #: Uneven noise differs in size between points. If the standard error for uneven noise exceeds the error for equal noise
 #: by this factor, the correlation for uneven noise is used.
 _UNEVEN = 1.2
-#: _REPEATS: number of repeated fits in which the law's stress gives the divisors of the residuals. They are not done if
-#: the law's stress is below _LEAST_SIZE times the measured stress in a curve. A stress that differs by more than the
-#: factor _FOREIGN from that of other curves of its test may be a fault, e.g. another unit.
+#: _REPEATS: number of repeated fits in which the law's stress gives the divisors of the residuals. No fit is repeated
+#: if the law's stress is below _LEAST_SIZE times the measured stress in a curve. If the stress of a curve differs by
+#: more than the factor _FOREIGN from that of other curves of the same test, it may be wrong, e.g. in another unit.
 _REPEATS, _LEAST_SIZE, _FOREIGN = 3, 0.05, 2.0
 _tangents = jax.jit(lambda law, F: law.tangent(F))
 
@@ -96,12 +96,13 @@ def initial_modulus(curves: list[Curve]) -> float:
 
 
 def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawFit:
-    """Minimise the sum of squares of the relative misfit: the difference of the nominal stress P of the law and the
-    measured one, divided by the root mean square of the curve's stress. A stress that falls while the sample is
-    deformed further also adds to this sum (`STIFFNESS`). The best minimum from many starting points is returned.
+    """Minimise the sum of squares of the relative misfit. The misfit is the difference between the nominal stress P of
+    the law and the measured stress, divided by the root mean square of the curve's stress. A stress that falls while
+    the sample is deformed further adds a penalty (`STIFFNESS`). Return the best minimum from many starting points.
 
-    If several curves belong to one test, the root mean square is that of the law's stress. Otherwise samples that are
-    soft by chance would have more weight, and the moduli would be too low: by 8 % if samples scatter by 20 %.
+    If several curves belong to one test, the root mean square of the law's stress is the divisor. With the measured
+    stress, samples that are soft by chance would have more weight, and the moduli would be too low: by 8 % if samples
+    scatter by 20 %.
     """
     check_curves(curves)
     scale = initial_modulus(curves)
@@ -143,9 +144,9 @@ def _sizes_of_law(found: Solution, curves: list[Curve], sizes: np.ndarray) -> li
     """Return the divisors [Pa] of the residuals of each curve for the best law. Return None if the stress of this law
     is far below the measured stress in a curve, or not finite.
 
-    The divisor is the root mean square of the law's stress if other curves belong to the same test. If the measured
-    stress differs by more than `_FOREIGN` from that of these curves, it is at least that of the measured stress.
-    `sizes` (n,): divisors of the n residuals of `found`.
+    If no other curve belongs to the same test, the divisor is the root mean square of the measured stress. Otherwise,
+    it is the root mean square of the law's stress. If the measured stress differs from that of the other curves by more
+    than the factor `_FOREIGN`, it is the larger of both. `sizes` (n,): divisors of the n residuals of `found`.
     """
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     off = np.asarray(found.residuals)[int(np.argmin(costs))][: len(sizes)] * sizes
@@ -166,7 +167,7 @@ def assessed(
 ) -> LawFit:
     """Return the fit from the best starting point, with its quality and with warnings for the user.
 
-    `of_tests`: whether each curve is one test, and the residuals are stress differences divided by its scale.
+    `of_tests`: whether each curve is one test, and the residuals are stress differences, divided by the curve's scale.
     """
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))
@@ -224,7 +225,8 @@ def assessed(
 
 
 def _relative_to_measured(curves: list[Curve], misfit: np.ndarray) -> list[np.ndarray]:
-    """Return the misfit (n,) of the curves, relative to their measured stress for all laws, for each curve."""
+    """Return the misfit of each curve, divided by the root mean square of its measured stress, so that laws can be
+    compared. `misfit` (n,): misfit of all n points, divided by `Curve.divisor`."""
     ends = np.cumsum([len(c.stress) for c in curves])[:-1]
     return [part * c.divisor / c.scale for c, part in zip(curves, np.split(misfit, ends), strict=True)]
 
@@ -288,8 +290,8 @@ def _errors_of_law(
     of_tests: bool,
 ) -> tuple[np.ndarray, np.ndarray, Alike | None, FactorNoise | None]:
     """Return the standard errors and the correlation of the P parameters, the noise that is correlated between
-    neighbouring points, and the factors that multiply the stress of each test. Each standard error is the largest one
-    that results from several kinds of noise.
+    neighbouring points, and the factors that multiply the stress of each test. Each standard error is the largest of
+    the standard errors for several kinds of noise.
 
     Args:
         curves: the fitted curves.
@@ -381,14 +383,14 @@ def _run_away(candidate: Candidate, values: np.ndarray, errors: np.ndarray, scal
     return ends
 
 
-#: The data determine a direction of the parameters at their limits if its derivative exceeds this fraction of the
-#: largest derivative of all parameters.
+#: A direction is a combination of the parameters that are at their limits. The data determine a direction if the
+#: derivative of the misfit along it exceeds this fraction of the largest derivative of all parameters.
 _DETERMINED = 1e-3
 
 
 def _with_products_of_limits(J: np.ndarray, slope: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives (n, k + q) of the misfit for the k known parameters and for q directions of the parameters
-    at their limits that the data determine. Also return the derivatives (k, k + q) of the known parameters.
+    """Return the derivatives (n, k + q) of the misfit with respect to the unknowns of the k known parameters and to q
+    directions (`_DETERMINED`). Also return the derivatives (k, k + q) of the known parameters.
 
     For example, one parameter goes to infinity and another to 0, and their product is a modulus. Without this product,
     the errors of the other parameters would hold only for a known modulus.
@@ -448,13 +450,14 @@ def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
     return told
 
 
-#: The stress of a curve has the same course as that of a law if a factor reduces the misfit below this value.
+#: The stress of a curve has the same course as the stress of a law if the relative misfit is below this value after the
+#: stress of the law is multiplied by a factor.
 _SAME_COURSE = 0.1
 
 
 def _only_a_factor(law: laws.Law, curve: Curve, curves: list[Curve]) -> float | None:
-    """Return the factor between the measured stress of a curve and that of a law. Return None if they also differ in
-    their course, or if no other of the `curves` belongs to the same test."""
+    """Return the factor between the measured stress of a curve and the stress of a law. Return None if their courses
+    differ too (`_SAME_COURSE`), or if no other curve in `curves` belongs to the same test."""
     if sum((c.test, c.component) == (curve.test, curve.component) for c in curves) == 1:
         return None
     model = np.asarray(homogeneous.nominal_stress(law, jnp.asarray(curve.F), constant=True))[:, *curve.component]

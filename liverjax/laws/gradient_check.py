@@ -14,29 +14,16 @@ import numpy as np
 
 from liverjax import laws
 from liverjax.core.errors import InputError
-from liverjax.laws import Law, autodiff, homogeneous
+from liverjax.laws import Law, autodiff
+from liverjax.laws.stability_check import EXACT_LIMIT, Row, as_numbers, jump_rows, stability_rows
 
 #: Steps of the difference quotients: norms of the change of the deformation gradient F.
 STEPS = 10.0 ** -np.arange(1.0, 10.5, 0.5)
 #: Limit for the relative error of difference quotients. Their roundoff and truncation errors are at least about
 #: eps^(2/3) of the largest term (eps: machine precision). The factor 1000 allows for large terms that cancel.
 DIFFERENCE_LIMIT = 1e3 * np.finfo(float).eps ** (2 / 3)
-#: Limit for the relative difference of results that are equal apart from roundoff. It allows for sums of some hundred
-#: terms, and for cancellation in deviatoric parts.
-EXACT_LIMIT = 1e-10
 #: Ranges of stretch for the comparisons. The narrower ranges are for laws with a limiting stretch, e.g. Gent's law.
 _MODERATE, _NARROWER = (0.7, 1.4), ((0.85, 1.18), (0.95, 1.05), (0.99, 1.01))
-#: Values at which stability is checked. Both arrays have the same length, so that they share one compiled program.
-STRETCHES, SHEARS = np.linspace(0.2, 4.0, 381), np.linspace(0.0, 3.8, 381)
-
-
-class Row(NamedTuple):
-    """One row of the table. `passed` is None for a row that gives information but tests nothing."""
-
-    name: str
-    found: str
-    limit: str
-    passed: bool | None
 
 
 class Check(NamedTuple):
@@ -55,7 +42,7 @@ class Check(NamedTuple):
 
 
 def load(name: str) -> Law:
-    """Return an included law by its name, or the law FILE.py:LAW of a Python file. A class gets its typical values.
+    """Return an included law by its name, or the law FILE.py:LAW of a Python file. A class gets typical values.
 
     Raises:
         InputError: the law or file does not exist or does not work, or a parameter has no typical value.
@@ -65,7 +52,7 @@ def load(name: str) -> Law:
     file, _, attribute = name.rpartition(":") if ":" in name else (name, "", "")
     if not Path(file).is_file():
         raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
-    # `dataclasses` needs the module in `sys.modules`, under another name than the file's (which may be jax.py).
+    # `dataclasses` needs the module in `sys.modules`. Its name there differs from the file name, which may be jax.py.
     spec = importlib.util.spec_from_file_location(f"_law_file_{Path(file).stem}", file)
     if spec is None:
         raise InputError(f"{file} is not a Python file: give FILE.py:LAW")
@@ -103,7 +90,11 @@ def _reason(error: BaseException) -> str:
 
 
 def _try(law: Law, name: str) -> None:
-    """Evaluate the shapes of energy, stress and tangent of the law. Every error is raised as `InputError`."""
+    """Check the shapes of energy, stress and tangent of the law. Every error is raised as `InputError`."""
+    if getattr(law, "bulk", None) is not None and not hasattr(law, "volumetric"):
+        raise InputError(
+            f"{name}: the law has a field bulk, but no field volumetric: add volumetric: str = lj.static('quadratic')"
+        )
     for shape in ((), (2,)):
         F = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 0.9, 1.05])), (*shape, 3, 3))
         for what, expected in (("energy", shape), ("first_piola", (*shape, 3, 3)), ("tangent", (*shape, 3, 3, 3, 3))):
@@ -122,7 +113,7 @@ def _try(law: Law, name: str) -> None:
 
 
 def _try_parts(law: Law, name: str) -> None:
-    """Evaluate the shapes of the isochoric and volumetric energies. Every error is raised as `InputError`."""
+    """Check that the isochoric and volumetric energies can be evaluated. Every error is raised as `InputError`."""
     for what in ("isochoric_part", "volumetric_part"):
         try:
             part = getattr(law, what)()
@@ -162,11 +153,11 @@ def check(law: Law) -> Check:
     """Run all checks of a law, and return their rows. A wrong law raises no error: some rows have `passed` = False."""
     programs = [jax.jit(lambda law, F, what=what: getattr(law, what)(F)) for what in _PROGRAMS]
     energy, stress, tangent = (partial(program, law) for program in programs)
-    more, stable = _stability(law, tangent)
-    more += _jumps(law, energy)
+    more, stable = stability_rows(law, tangent)
+    more += jump_rows(energy, stress, tangent)
     F, D, first = _finite_samples((energy, stress, tangent))
     rows, errors = [first], {}
-    W, P, A = (_as_numbers(f, F) for f in (energy, stress, tangent))
+    W, P, A = (as_numbers(f, F) for f in (energy, stress, tangent))
     slope, curved = np.einsum("nij,nij->n", P, D), np.einsum("nijkl,nkl->nij", A, D)
     for name, function, exact in (("energy to stress", energy, slope), ("stress to tangent", stress, curved)):
         errors[name] = np.array([_difference(function, F, D, h, exact) for h in STEPS])
@@ -174,12 +165,12 @@ def check(law: Law) -> Check:
     rows += _derivative_rows(law, F, stable["uniaxial"], programs[1:])
     Q = _rotation(4)
     size = np.abs(W).max() + np.abs(P).max()
-    rows.append(_exact("objective: W(QF) = W(F)", _as_numbers(energy, Q @ F), W, size))
-    rows.append(_exact("objective: P(QF) = Q P(F)", _as_numbers(stress, Q @ F), Q @ P))
+    rows.append(_exact("objective: W(QF) = W(F)", as_numbers(energy, Q @ F), W, size))
+    rows.append(_exact("objective: P(QF) = Q P(F)", as_numbers(stress, Q @ F), Q @ P))
     rows.append(_exact("tangent symmetric", A, np.transpose(A, (0, 3, 4, 1, 2))))
     rows += _rest_state(law, energy, stress, tangent)
     rows += _limits_of_energy(energy)
-    rows += _parts_row(law, F, W, size) + _idle_parameters_row(law, programs[:2], F)
+    rows += _parts_rows(law, F, W, size) + _idle_parameters_row(law, programs[:2], F)
     return Check(law, rows + more, STEPS, errors, stable)
 
 
@@ -191,7 +182,7 @@ def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarr
     """
     for low, high in (_MODERATE, *_NARROWER):
         F, D = _samples(low, high)
-        if all(np.isfinite(_as_numbers(f, F)).all() for f in functions):
+        if all(np.isfinite(as_numbers(f, F)).all() for f in functions):
             break
     else:
         return *_samples(), Row("finite at moderate stretches", "NaN or infinite", "0.7 to 1.4", False)
@@ -212,12 +203,12 @@ def _finite_samples(functions: Sequence[Callable]) -> tuple[np.ndarray, np.ndarr
 def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], programs: Sequence[Callable]) -> list[Row]:
     """Return two rows that compare stress and tangent with automatic differentiation.
 
-    Each row stands for three comparisons: at moderate stretches, over the stable range, and with changed parameters,
-    none of which is 0. The row shows the first comparison that fails.
+    Each row stands for three comparisons: at moderate stretches, over the stable range, and with changed parameters
+    that are not 0. The row shows the first comparison that fails. If none fails, it shows the first comparison.
     """
     low, high = max(stable[0], 0.5), min(stable[1], 2.0)
     sets = [("", law, F)]
-    if low < high:  # otherwise only the rest state is stable, where the stress is roundoff
+    if low < high:  # otherwise only the rest state is stable, and its stress is only roundoff
         sets.append((f", stretches {low:.2g} to {high:.2g}", law, _samples(low, high)[0]))
     sets.append((", parameters times 0.8 (0: 0.1)", _with_other_parameters(law), F))
     rows = []
@@ -225,7 +216,7 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
     for name, program, oracle in zip(("stress", "tangent"), programs, oracles, strict=True):
         exact, found = jax.jit(oracle), []
         for where, own, at in sets:
-            ours, theirs = (_as_numbers(partial(f, own), at).reshape(len(at), -1) for f in (program, exact))
+            ours, theirs = (as_numbers(partial(f, own), at).reshape(len(at), -1) for f in (program, exact))
             # A law may have a limiting stretch. So values that are not finite are ignored, except in the first set.
             known = (np.isfinite(ours) & np.isfinite(theirs)).all(axis=1) | (where == "")
             if np.any(known):
@@ -235,39 +226,52 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
 
 
 def _with_other_parameters(law: Law) -> Law:
-    """Return the law with changed parameters, none of which is 0."""
+    """Return the law with changed parameters. None of the changed parameters is 0."""
     return jax.tree.map(lambda v: jnp.where(jnp.asarray(v) == 0, 0.1, 0.8 * jnp.asarray(v)), law)
 
 
-def _parts_row(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]:
-    """Check that the energy is the sum of its isochoric and volumetric parts. Viscosity may use these parts."""
+def _parts_rows(law: Law, F: np.ndarray, W: np.ndarray, size: float) -> list[Row]:
+    """Check that the energy is the sum of its isochoric and volumetric parts. Viscosity may use these parts.
+
+    Two more rows are returned only if they fail: the isochoric part must not change with the volume, and the volumetric
+    part must not change with the shape.
+    """
     isochoric, volumetric = law.isochoric_part(), law.volumetric_part()
     if isochoric is None or volumetric is None:
         return []
-    both = _as_numbers(jax.jit(isochoric.energy), F) + _as_numbers(jax.jit(volumetric.energy), F)
-    return [_exact("energy is that of its parts", both, W, size)]
+    of_shape, of_volume = jax.jit(isochoric.energy), jax.jit(volumetric.energy)
+    both = as_numbers(of_shape, F) + as_numbers(of_volume, F)
+    swollen, round_ones = 1.1 * F, np.cbrt(np.linalg.det(F))[:, None, None] * np.eye(3)
+    alone = [
+        _exact(
+            "the isochoric part depends on the volume", as_numbers(of_shape, swollen), as_numbers(of_shape, F), size
+        ),
+        _exact(
+            "the volumetric part depends on the shape",
+            as_numbers(of_volume, round_ones),
+            as_numbers(of_volume, F),
+            size,
+        ),
+    ]
+    return [_exact("energy is that of its parts", both, W, size), *(row for row in alone if not row.passed)]
 
 
 def _idle_parameters_row(law: Law, programs: Sequence[Callable], F: np.ndarray) -> list[Row]:
-    """Return a row with the parameters that change neither energy nor stress. Otherwise return no row."""
+    """Return a row with the parameters that change neither energy nor stress, or no row if there are none."""
     law = _with_other_parameters(law)
     leaves, structure = jax.tree_util.tree_flatten_with_path(law)
-    before, idle = [_as_numbers(partial(f, law), F) for f in programs], []
+    before, idle = [as_numbers(partial(f, law), F) for f in programs], []
     for k, (path, value) in enumerate(leaves):
         values = [v for _, v in leaves]
         values[k] = 1.25 * value
         other = jax.tree.unflatten(structure, values)
-        if all(np.array_equal(_as_numbers(partial(f, other), F), b) for f, b in zip(programs, before, strict=True)):
+        if all(np.array_equal(as_numbers(partial(f, other), F), b) for f, b in zip(programs, before, strict=True)):
             idle.append(jax.tree_util.keystr(path).lstrip("."))
     return [Row("parameters without effect", ", ".join(idle), "is the energy complete?", False)] if idle else []
 
 
 #: Methods of a law. Each is compiled once for all values of the parameters.
 _PROGRAMS = ("energy", "first_piola", "tangent")
-
-
-def _as_numbers(function: Callable, F: np.ndarray) -> np.ndarray:
-    return np.asarray(function(jnp.asarray(F)), float)
 
 
 #: To find a jump of the stiffness at rest, the stiffness is computed for small strains of size `NEAR`. If there is no
@@ -293,7 +297,7 @@ def _samples(low: float = _MODERATE[0], high: float = _MODERATE[1]) -> tuple[np.
 def _difference(function: Callable, F: np.ndarray, D: np.ndarray, h: float, exact: np.ndarray) -> float:
     """Return the maximum difference between the central difference of `function` in the direction D, with step h, and
     the derivative `exact`, divided by the maximum of |exact|."""
-    quotient = (_as_numbers(function, F + h * D) - _as_numbers(function, F - h * D)) / (2 * h)
+    quotient = (as_numbers(function, F + h * D) - as_numbers(function, F - h * D)) / (2 * h)
     return float(np.abs(quotient - exact).max() / max(np.abs(exact).max(), 1e-300))
 
 
@@ -320,7 +324,7 @@ def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable)
 
     The moduli are Voigt means. For an isotropic law, each mean is the modulus in every direction.
     """
-    W, P, A = (_as_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
+    W, P, A = (as_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
     if not np.isfinite(A).all():
         return [Row("tangent at rest", "not finite", "finite", False)]
     scale = np.abs(A).max()
@@ -333,7 +337,7 @@ def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable)
     smallest = _smallest_stiffness(A)
     if smallest < -EXACT_LIMIT * scale:
         rows.append(Row("stiffness at rest", f"{smallest:.6g} Pa for a strain", "not negative", False))
-    moduli, near = _mean_moduli(A[None])[:, 0], _mean_moduli(_as_numbers(tangent, _near_rest()))
+    moduli, near = _mean_moduli(A[None])[:, 0], _mean_moduli(as_numbers(tangent, _near_rest()))
     jumps = np.ptp(near, axis=1).max() > JUMP * np.abs(near).max()
     if jumps:
         rows.append(Row("stiffness at rest jumps", "depends on the direction", "fibres that go slack?", None))
@@ -380,7 +384,7 @@ def _limits_of_energy(energy: Callable) -> list[Row]:
     """Return rows about the energy for J -> 0, J -> infinity, J = 0 and J < 0."""
 
     def along(*sizes: float) -> np.ndarray:
-        return _as_numbers(energy, np.stack([s ** (1 / 3) * np.eye(3) for s in sizes]))
+        return as_numbers(energy, np.stack([s ** (1 / 3) * np.eye(3) for s in sizes]))
 
     small, large = along(1e-4, 1e-8, 1e-16), along(1e4, 1e8)
     if not np.isfinite(small).all():
@@ -392,113 +396,12 @@ def _limits_of_energy(energy: Callable) -> list[Row]:
     grows = "not finite" if not np.isfinite(large).all() else "faster" if large[1] > 1e4 * large[0] else "no faster"
     swollen = grows if grows == "not finite" else f"grows {grows} than J"
     flat, inverted = np.diag([1.0, 1.0, 0.0]), np.diag([1.0, 1.0, -0.5])
-    ends = ["finite" if np.isfinite(_as_numbers(energy, F)).all() else "not finite" for F in (flat, inverted)]
+    ends = ["finite" if np.isfinite(as_numbers(energy, F)).all() else "not finite" for F in (flat, inverted)]
     return [
         Row("energy as J -> 0", crushed, "", None),
         Row("energy as J -> infinity", swollen, "", None),
         Row("energy at J = 0, J < 0", f"{ends[0]}, {ends[1]}", "", None),
     ]
-
-
-def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
-    """Return rows with the ranges around rest in which the stress increases and the law is strongly elliptic.
-
-    A row fails if the rest state is not stable. A law without stiffness at rest, for example a law with only fibres, is
-    neither stable nor unstable there, so its row does not fail.
-    """
-    rows, ranges = [], {}
-    stress = jax.jit(partial(homogeneous.nominal_stress, law))
-    for test, what in homogeneous.TESTS.items():
-        if test == "pure_shear":
-            continue
-        driven = SHEARS if what == "shear" else STRETCHES
-        F = np.asarray(homogeneous.deformation_gradient(test, driven))
-        P = _as_numbers(stress, F)
-        A = _as_numbers(tangent, F)
-        stable = _work_is_positive(test, driven, P) & (ellipticity(A) > 0)
-        start = int(np.argmin(np.abs(driven - (0.0 if what == "shear" else 1.0))))
-        low, high = _range(driven, stable, start)
-        ranges[test] = (low, high)
-        whole = " and maybe beyond" if (low, high) == (driven[0], driven[-1]) else ""
-        text, passed = f"{what} {low:.3g} to {high:.3g}{whole}", (True if stable[start] else None)
-        if not stable[start] and ellipticity(A[[start]])[0] >= -EXACT_LIMIT * np.abs(A[start]).max():
-            text = "no stiffness at rest in some direction: add a law that has stiffness there"
-        elif not stable[start]:
-            text, passed = "not even at rest", False
-        rows.append(Row(f"stable in {test.replace('_', ' ')}", text, "", passed))
-    return rows, ranges
-
-
-#: If the energy jumps in a step of the stretch, the change of the energy differs from the work of the stress. If the
-#: difference is above the fraction `_MISSED` of the change, the step is divided into `_PARTS` substeps. The substep
-#: with the largest difference is divided again, and so on (`_CUTS` divisions). A difference due to a jump stays in one
-#: substep. Other differences become smaller with each division.
-_MISSED, _PARTS, _CUTS = 0.05, 32, 3
-
-
-def _jumps(law: Law, energy: Callable) -> list[Row]:
-    """Return a row if the energy jumps, so that its change is not the work of the stress.
-
-    The other checks use only single states, so they cannot find a jump.
-    """
-    stress = jax.jit(partial(homogeneous.nominal_stress, law))
-    # If a law depends only on the volume, its energy is 0 in these tests, apart from roundoff.
-    swollen = np.abs(_as_numbers(lambda F: law.first_piola(F[0])[None], 1.1 * np.eye(3)[None]))
-    roundoff = 1e-12 * np.nan_to_num(swollen).max()
-
-    def missed(test: str, driven: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return |change of the energy - work| and |change of the energy| in each step, (n - 1,) [Pa]."""
-        F = np.asarray(homogeneous.deformation_gradient(test, driven))
-        P, W = _as_numbers(stress, F), _as_numbers(energy, F)
-        with np.errstate(all="ignore"):
-            work = 0.5 * np.einsum("eij,eij->e", P[1:] + P[:-1], np.diff(F, axis=0))
-            return np.nan_to_num(np.abs(np.diff(W) - work), posinf=0.0), np.abs(np.diff(W))
-
-    for test, what in homogeneous.TESTS.items():
-        driven = SHEARS if what == "shear" else STRETCHES
-        gap, change = missed(test, driven)
-        for k in np.flatnonzero(gap > _MISSED * change + 1e-9 * np.nan_to_num(change).max() + roundoff):
-            low, high, most = driven[k], driven[k + 1], gap[k]
-            for _ in range(_CUTS):
-                finer = np.linspace(low, high, _PARTS + 1)
-                parts, _ = missed(test, finer)
-                worst = int(np.argmax(parts))
-                low, high = finer[worst], finer[worst + 1]
-                if not parts[worst] > 0.5 * most:
-                    break
-            else:
-                at = low
-                found = f"by {parts.max():.3g} Pa at {what} {at:.3g} in {test.replace('_', ' ')}"
-                return [Row("the energy jumps", found, "the stress does not show this jump", False)]
-    return []
-
-
-def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Return whether the nominal stress increases at each of n states (n,). At the ends, differences are one-sided."""
-    stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
-    with np.errstate(all="ignore"):
-        return np.gradient(stress, driven) > 0
-
-
-def ellipticity(A: np.ndarray) -> np.ndarray:
-    """Return the minimum eigenvalue [Pa] of the acoustic tensor A_iJkL n_J n_L over 203 directions n, for every A."""
-    k = np.arange(200) + 0.5
-    z, angle = 1 - k / 200, np.pi * (1 + 5**0.5) * k  # the directions n are Fibonacci points on a half sphere
-    n = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
-    n = np.concatenate([n, np.eye(3)])
-    finite = np.isfinite(A).all(axis=(1, 2, 3, 4))
-    acoustic = np.einsum("eijkl,dj,dl->edik", np.where(finite[:, None, None, None, None], A, 0.0), n, n, optimize=True)
-    smallest = np.linalg.eigvalsh(0.5 * (acoustic + np.swapaxes(acoustic, -1, -2)))[..., 0].min(axis=1)
-    return np.where(finite, smallest, -np.inf)
-
-
-def _range(driven: np.ndarray, stable: np.ndarray, start: int) -> tuple[float, float]:
-    low = high = start
-    while low > 0 and stable[low - 1]:
-        low -= 1
-    while high < len(driven) - 1 and stable[high + 1]:
-        high += 1
-    return float(driven[low]), float(driven[high])
 
 
 def table(result: Check) -> str:

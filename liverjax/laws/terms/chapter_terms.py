@@ -3,7 +3,7 @@ h^k(J). The stiffness has six terms for every product.
 
 This is a variant for comparison. The default, `liverjax.laws.terms.invariant_terms`, first adds the scalar derivatives
 of all products. The default gives the same values up to roundoff, and its cost does not grow with the number of
-products. `liverjax.laws.products` writes the laws as such products.
+products. `liverjax.laws.terms.products` writes the laws as such products.
 """
 
 from typing import NamedTuple
@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.struct import Number, T
-from liverjax.laws import products
 from liverjax.laws.energies import Energies
+from liverjax.laws.terms import products
 from liverjax.tensors.matrices import (
     IDENTITY,
     Matrix,
@@ -56,7 +56,7 @@ def _term(k: products.Product, I1: Number, I2: Number, J: jax.Array) -> _Term:
     c, i, j, p = k
 
     def g(a: int, b: int) -> Number:
-        """Derivative of g, of order a with respect to I1 and of order b with respect to I2."""
+        """Return the derivative of g, of order a with respect to I1 and of order b with respect to I2."""
         factor = (1, i, i * (i - 1))[a] * (1, j, j * (j - 1))[b]
         return 0.0 if factor == 0 else c * factor * _power(I1, i - a) * _power(I2, j - b)
 
@@ -90,14 +90,14 @@ def _state_at(law: Energies, F: Matrix) -> _At:
 
 
 def _stress_of_product(t: _Term, s: _At) -> Matrix:
-    """Return S^k = 2 dg/dC of the term k = g(I1, I2) h(J). No matrix is inverted."""
+    """Return S^k = 2 dg/dC of the product W^k = g(I1, I2) h(J). No matrix is inverted."""
     return add_matrices(scale_matrix(2 * t.g1, IDENTITY), scale_matrix(2 * t.g2, s.B))
 
 
 def first_piola(law: Energies, F: Matrix) -> Matrix:
-    """First Piola-Kirchhoff stress [Pa] of the products g h: sum_k phi' (h' g cof F + h F S^k).
+    """Return the first Piola-Kirchhoff stress [Pa] of the products g h: sum_k phi' (h' g cof F + h F S^k).
 
-    phi is the function of a group of products (`liverjax.laws.products.Group`), and S^k = 2 dg/dC.
+    phi is the function of a group of products (`liverjax.laws.terms.products.Group`), and S^k = 2 dg/dC.
     """
     s = _state_at(law, F)
     total = scale_matrix(0.0, F)

@@ -39,7 +39,7 @@ class GreenModuli(NamedTuple):
 
 
 def stress(law: Energies, F: Matrix) -> Matrix:
-    """Second Piola-Kirchhoff stress [Pa] of the energy w(E) only."""
+    """Return the second Piola-Kirchhoff stress [Pa] of the energy w(E) only."""
     A = law.material_axes(F[0][0])
     return rotated(_stress_of_strain(law, green_strain(matmul(F, A))), A)
 

@@ -56,7 +56,7 @@ class Scalars(NamedTuple):
 class State(NamedTuple):
     """Values at one deformation gradient that both force and stiffness need."""
 
-    laws: tuple  # summands of the law, whose energies of stretches and of Green's strain are added
+    laws: tuple  # summands of the law; their energies of stretches and of Green's strain are added
     F: Matrix
     C: Matrix | None
     cof: Matrix
@@ -64,7 +64,7 @@ class State(NamedTuple):
     J: jax.Array
     first: dict
     second: dict
-    fibres: dict  # name of an invariant I4 -> fibre direction of the summand with this invariant
+    fibres: dict  # name of an invariant I4 -> fibre direction of the law with this invariant
     frame: Any  # principal stretches and axes, if a summand has an energy of stretches
 
 
@@ -144,20 +144,21 @@ def _spherical(S: Any) -> Matrix:
 
 
 def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
-    """First Piola-Kirchhoff stress P = F S + p cof F [Pa]."""
+    """Return the first Piola-Kirchhoff stress P = F S + p cof F [Pa]."""
     S, p = resultant
     FS = matmul(F, S) if isinstance(S, tuple) else scale_matrix(S, F)
     return tuple(tuple(FS[i][j] + p * cof[i][j] for j in range(3)) for i in range(3))
 
 
-#: For a smaller |J|, the second Piola-Kirchhoff stress is computed with this |J| in its denominator.
+#: Minimum |J| in the denominator of the second Piola-Kirchhoff stress. A smaller |J| is replaced by this value.
 _FLAT = 1e-3
 
 
 def second_piola(F: Matrix, resultant: Stress) -> Matrix:
-    """Second Piola-Kirchhoff stress S + p J C^-1 [Pa] of P = F S + p cof F, with J C^-1 = cof(F)^T cof(F) / J.
+    """Return the second Piola-Kirchhoff stress S + p J C^-1 [Pa] of P = F S + p cof F.
 
-    Section 4.2 of the book chapter uses F^-1, which does not exist at J = 0. Here |J| in the division is at least 1e-3.
+    Section 4.2 of the book chapter uses F^-1, which does not exist at J = 0. Here J C^-1 = cof(F)^T cof(F) / J is used,
+    with a denominator of at least 1e-3 in absolute value.
     """
     S, p = resultant
     cof = cofactor(F)
@@ -173,7 +174,7 @@ def second_piola(F: Matrix, resultant: Stress) -> Matrix:
 
 
 def first_piola(law: Energies, F: Matrix) -> Matrix:
-    """First Piola-Kirchhoff stress [Pa] at a deformation gradient F, a matrix of nested tuples."""
+    """Return the first Piola-Kirchhoff stress [Pa] at a deformation gradient F, a tuple matrix."""
     s = state(law, F)
     return piola(F, s.cof, stress(s))
 
@@ -204,7 +205,7 @@ class _Parts(NamedTuple):
     second: dict
     slopes: list[dict]  # `slopes` of every node
     diagonal: dict  # (i, j) -> D_i . S D_j
-    turning: dict  # (i, j) -> W_J F (D_i x D_j), for pairs for which this is not 0
+    turning: dict  # (i, j) -> W_J F (D_i x D_j), only for i != j (otherwise it is 0)
     metric: dict  # (i, j) -> D_i . D_j, if the energy depends on I2
     left: Matrix | None  # F F^T, if the energy depends on I2
 

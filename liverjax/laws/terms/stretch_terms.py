@@ -9,7 +9,7 @@ tau_m = dw/d ln lambda_m. The moduli are
     C_mnmn = (S_m - S_n) / (lambda_m^2 - lambda_n^2).
 
 The formula for C_mnmn is evaluated such that it is exact if stretches are equal. The A H A form of the book chapter
-(section 4.1.2) has a geometric mean instead, which is wrong except for alpha = 2 and 4.
+(section 4.1.2) has a geometric mean instead. This mean is correct only for alpha = 2 and 4.
 
 Values are computed with these formulas. Their derivatives are computed from the energy, expanded in frozen principal
 axes (`liverjax.tensors.principal`). If stretches are equal, this expansion is smooth, but the principal axes are not.
@@ -108,7 +108,7 @@ def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
 
 
 def stress(law: Energies, F: Matrix, frame: Frame) -> Matrix:
-    """Second Piola-Kirchhoff stress [Pa] of the energy w, without the volumetric energy. `frame`: `principal(F)`."""
+    """Return the second Piola-Kirchhoff stress [Pa] of w, without the volumetric energy. `frame`: `principal(F)`."""
     return symmetric(_stress(_arrays(law, F), F, frame))
 
 
@@ -214,7 +214,7 @@ def _vanishes(t: Number) -> bool:
 
 
 def _expanded_energy(law: Energies, logs: Vector, axes: Matrix, log_J0: Number, Y: tuple) -> jax.Array:
-    """Return w for C changed by Y. In the frozen principal axes N, the changed C is diag(lambda^2) + N^T Y N."""
+    """Return w for the tensor C + Y. In the frozen principal axes N, this tensor is diag(lambda^2) + N^T Y N."""
     X = six_of(rotated(symmetric(Y), transpose(axes)))
     relative = [x * jnp.exp(-logs[i] - logs[j]) for x, (i, j) in zip(X, SIX, strict=True)]
     one_plus = symmetric(tuple(r + (1.0 if i == j else 0.0) for r, (i, j) in zip(relative, SIX, strict=True)))
@@ -233,10 +233,10 @@ def _energy_of_change(law: Energies, F: Matrix, frame: Frame, orders: int) -> tu
 
 
 def _strain_derivatives(function: Any, Y: tuple) -> jax.Array:
-    """Derivatives of `function` with respect to the six entries of E (first axis).
+    """Return the derivatives of `function` with respect to the six entries of E (first axis).
 
-    Y is the change of C, so dY = 2 dE. A shear component of E stands at two positions of the tensor, so its factor is
-    1, not 2.
+    Y is the change of C, so dY = 2 dE. A shear component occurs at two positions of the tensor, so its factor is 1,
+    not 2.
     """
 
     def along(direction):
