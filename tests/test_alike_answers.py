@@ -214,3 +214,35 @@ def test_errors_contain_the_error_of_a_subtracted_offset(tmp_path):
     both = choose_together([test, test], "prony", 2)
     one, two = (uncertainty.equilibrium_error(f.uncertainty) for f in (fit, both))
     assert np.isclose(two, one / np.sqrt(2), rtol=0.05)
+
+
+@pytest.mark.parametrize("rate", [0.01, pytest.param(-0.01, marks=pytest.mark.slow)])
+def test_a_drift_of_the_sensor_is_subtracted(rate, tmp_path):
+    """The mean of the rows before the load was subtracted as an offset, although the sensor drifted. The equilibrium
+    modulus was then wrong by 2.8 standard errors.
+    """
+    time = np.geomspace(0.1, 160.0, 200)
+    exact = np.asarray(_relaxation(time, np.zeros(len(time))).answer[2:])
+    before = np.arange(0.0, 100.0, 0.5)
+    at = np.concatenate([before, [100.0], 100.0 + time])
+    strain = np.concatenate([np.zeros(len(before) + 1), np.full(len(time), STRAIN)])
+    noise = 0.2 * np.random.default_rng(5).standard_normal(len(at))
+    stress = np.concatenate([np.zeros(len(before) + 1), exact]) + rate * at + noise
+    np.savetxt(
+        tmp_path / "t.csv", np.column_stack([at, strain, stress]), delimiter=",", header="time_s,strain,stress_Pa"
+    )
+    test = reader.read_time_test(tmp_path / "t.csv", "relaxation", ramp=0.0)
+    assert any("the sensor drifts" in note for note in test.notes)
+    left = test.answer[test.used] - exact
+    # The standard error of the line at 160 s after the load: 0.2 / sqrt(200) * sqrt(1 + 3 * 4.2^2) = 0.1.
+    assert np.abs(left - noise[len(before) + 1 :]).max() < 0.4
+    assert np.isclose(test.drift_error, 0.005, rtol=0.1)
+    fit = choose_in_time(test, "prony", 2)
+    truth, found = G0 * (1 - RATIOS.sum()), fit.model.shear_modulus * (1 - np.sum(fit.model.ratios))
+    error = uncertainty.equilibrium_error(fit.uncertainty)
+    assert abs(found - truth) < 2 * error
+    # The posterior contains the error of the drift as well (without it, the ratio is 0.15). It is narrower than the
+    # standard error, because a steady drift differs from relaxation.
+    drawn = posterior.of_time_test(fit, test, 500)
+    rest = drawn.draws[..., drawn.names.index("equilibrium_modulus")]
+    assert 0.4 < np.std(rest) / error < 1.25

@@ -46,7 +46,7 @@ PRIORS = {
     "fractional": "moduli at the middle of the band are log-uniform within a factor of 1000 of the measured moduli; "
     "exponents are uniform",
 }
-#: Words of `PRIORS` -> words for a test in time, whose prior is relative to the fitted G0 (`of_time_test`).
+#: Words of `PRIORS` -> words for a relaxation or creep test. Its prior is relative to the fitted G0 (`of_time_test`).
 _OF_TIME_TESTS = {
     "from the smallest measured modulus to 1000 times the largest": "from 0.01 to 1000 times the fitted G0",
     "within a factor of 1000 of the measured moduli": "from 1e-5 to 1000 times the fitted G0",
@@ -373,8 +373,8 @@ SIMULATED, DIFFERENT = 12, 0.1
 def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a fit of Prony modes through the torsion simulation.
 
-    The density is computed with the linear rig: the same test for small strain, which needs no time steps. For each
-    frequency, a complex factor corrects the linear rig so that it agrees with the simulation at the minimum. Then some
+    The density is computed with the linear rig: the same test for small strain, which needs no time integration. For
+    each frequency, a complex factor corrects the linear rig so that it agrees with the simulation at the minimum. Some
     draws are simulated in full. `Posterior.simulated` contains the largest difference between the simulated and the
     approximate log likelihood of these draws. This difference shows how good the approximation is.
     """
@@ -414,7 +414,7 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
     test.
 
     If the noise of neighbouring measured values is correlated, the log likelihood is multiplied by the fraction of
-    independent values. The error of a subtracted sensor offset is common to all values (`_beside_offset`).
+    independent values. The error of a subtracted base line is common to all values (`_beside_base_line`).
     """
     test = test._replace(constant_noise=fit.details.get(time_tests.CONSTANT_NOISE, False))
     if fit.kind.values is None:
@@ -425,8 +425,8 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
     size = np.abs(fit.model.shear_modulus) * np.array([1e-2, 1.0])
     weight = fit.details.get(INDEPENDENT, len(fit.measured)) / len(fit.measured)
     noise = time_tests.data_in_time(test)[-1] * max(fit.uncertainty.noise, QUIETEST)
-    offset = np.sqrt(weight) * test.offset_error / noise
-    own = target(fit.kind, _beside_offset(residuals, offset), test.resolved, size, False)
+    base_line = np.sqrt(weight) * test.base_line_errors(time_tests.thinned(test)) / noise
+    own = target(fit.kind, _beside_base_line(residuals, base_line), test.resolved, size, False)
     assert not isinstance(own.prior, WithInstrument)
     prior = own.prior._replace(words=_of_time_test(own.prior.words))
     return sample(own._replace(weight=weight, prior=prior), len(fit.solution.u), count, seed)
@@ -439,20 +439,21 @@ def _of_time_test(words: str) -> str:
     return words
 
 
-def _beside_offset(residuals: Callable, offset: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from u (W, P) to uncorrelated residuals (W, m). The measured values contain a common offset
-    error, so their residuals are correlated, and the function transforms the residuals.
+def _beside_base_line(residuals: Callable, changes: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function from u (W, P) to uncorrelated residuals (W, m). The measured values contain common errors of
+    the base line, so their residuals are correlated, and the function transforms the residuals.
 
-    The covariance of m residuals is s^2 (I + d d^T) with the noise s. `offset`: d (m,), the change of all residuals
-    by one standard error of the offset, divided by s. The residuals are multiplied by (I + d d^T)^(-1/2).
+    The covariance of m residuals is s^2 (I + D^T D) with the noise s. `changes`: D (k, m), the change of all residuals
+    by one standard error of each of k independent errors, divided by s. The residuals are multiplied by
+    (I + D^T D)^(-1/2).
     """
-    square = float(offset @ offset)
-    if square == 0:
+    if not len(changes):
         return lambda u: np.asarray(residuals(u))
-    reduced = (1 - 1 / np.sqrt(1 + square)) / square * offset
+    _, sizes, axes = np.linalg.svd(changes, full_matrices=False)
+    reduced = (1 - 1 / np.sqrt(1 + sizes**2))[:, None] * axes
 
     def uncorrelated(u: np.ndarray) -> np.ndarray:
         r = np.asarray(residuals(u))
-        return r - (r @ offset)[..., None] * reduced
+        return r - (r @ axes.T) @ reduced
 
     return uncorrelated

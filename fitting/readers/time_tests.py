@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fitting.readers.base_line import OFFSET, RESTING, base_line
 from fitting.readers.noise_of_series import noise_of_series, sizes_of_series, told_of_far_values
 from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.time_columns import FORMS, beyond_small, read_columns
@@ -36,7 +37,10 @@ class TimeTest(NamedTuple):
     constant_noise: bool = False  # whether the noise of all responses has the same size
     rise: str = BETWEEN_ROWS  # how the load changed where no row shows it
     described: bool = False  # whether a TOML file describes the test
-    offset_error: float = 0.0  # standard error of the subtracted offset of the sensor, in the unit of the response
+    # Standard errors of the subtracted base line of the sensor, in the unit of the response: error at the beginning of
+    # the load, and error of the change per second.
+    offset_error: float = 0.0
+    drift_error: float = 0.0
 
     @property
     def scales(self) -> np.ndarray:
@@ -70,6 +74,14 @@ class TimeTest(NamedTuple):
         while first > 0 and driven[first] - driven[first - 1] > 1e-6 * driven.max():  # go back to the start of the rise
             first -= 1
         return float(self.time[first])
+
+    def base_line_errors(self, rows: np.ndarray) -> np.ndarray:
+        """Return the changes (k, m) of the responses in m rows by k independent errors of the subtracted base line.
+
+        Each error is one standard error. k is 0 if no base line was subtracted.
+        """
+        one = np.stack([np.full(len(rows), self.offset_error), self.drift_error * (self.time[rows] - self.begun)])
+        return one[np.any(one != 0, axis=1)]
 
     @property
     def jumps(self) -> np.ndarray:
@@ -442,26 +454,32 @@ def _as_shear(path, form, columns, sample):
     return strain, columns["force"] / (3 * np.pi * r**2), [note, *beyond_small(float(np.nanmax(np.abs(strain))))]
 
 
-#: Minimum number of rows at rest that can show an offset. An offset below OFFSET times the largest response is ignored.
-RESTING, OFFSET = 3, 0.003
-
-
-def _without_offset(test: TimeTest) -> tuple[np.ndarray, float, list[str]]:
-    """Return the responses, the standard error of the subtracted offset, and a note. The mean response before the load
-    is subtracted from all responses if this mean is clearly larger than its standard error."""
+def _without_base_line(test: TimeTest) -> tuple[TimeTest, list[str]]:
+    """Return the test without the base line of its sensor, and a note if a base line was subtracted."""
     rest = np.isfinite(test.answer) & (test.time < test.begun) & ~((test.time == 0) & (test.answer == 0))
     count, size = int(rest.sum()), float(np.nanmax(np.abs(test.answer)))
     if count < RESTING:
-        return test.answer, 0.0, _of_one_row_at_rest(test, size)
-    mean, error = float(np.mean(test.answer[rest])), float(np.std(test.answer[rest], ddof=1)) / np.sqrt(count)
-    if not abs(mean) > max(3 * error, OFFSET * size):
-        return test.answer, 0.0, []
+        return test, _of_one_row_at_rest(test, size)
+    time = test.time - test.begun
+    line = base_line(time[rest], test.answer[rest], size, float(time[-1]))
+    if line is None:
+        return test, []
     what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
-    told = (
-        f"the {what} of the {count} rows before the load is {mean:.3g}{unit} on average, which is "
-        f"{100 * abs(mean) / size:.2g} % of the largest {what} (absolute value): this sensor offset is subtracted"
-    )
-    return test.answer - mean, error, [told]
+    if line.slope:
+        told = (
+            f"the {what} of the {count} rows before the load changes steadily, by {line.slope:.3g}{unit} per second: "
+            f"the sensor drifts. This straight line is subtracted from all rows: {line.level:.3g}{unit} at the "
+            f"beginning of the load, {line.level + line.slope * time[-1]:.3g}{unit} at the end of the test. Nothing "
+            "shows how the drift continues under load, so the errors allow for half of it"
+        )
+    else:
+        told = (
+            f"the {what} of the {count} rows before the load is {line.level:.3g}{unit} on average, which is "
+            f"{100 * abs(line.level) / size:.2g} % of the largest {what} (absolute value): this sensor offset is "
+            "subtracted"
+        )
+    answer = test.answer - line.level - line.slope * time
+    return test._replace(answer=answer, offset_error=line.level_error, drift_error=line.slope_error), [told]
 
 
 def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
@@ -486,8 +504,8 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         word = "strain" if test.kind == "relaxation" else "stress"
         raise InputError(f"{test.source}: the {word} is zero throughout; give a {test.kind} test with a load")
     sign = np.sign(test.driven[np.argmax(np.abs(test.driven))])
-    driven, (answer, error, told) = sign * test.driven, _without_offset(test)
-    answer = sign * answer
+    test, told = _without_base_line(test)
+    driven, answer = sign * test.driven, sign * test.answer
     used = test.used & np.isfinite(answer) & (test.time >= start) & (test.time > test.begun)
     if used.sum() < 4:
         raise InputError(
@@ -502,4 +520,4 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
     if np.sum(test.time <= test.begun) > 2:
         told = [*told, f"the load begins at {test.begun:.3g} s: the rows before it are not fitted"]
     told = [*told, *told_of_far_values(test.time[used], driven[used], answer[used])]
-    return test._replace(driven=driven, answer=answer, used=used, notes=(*test.notes, *told), offset_error=error)
+    return test._replace(driven=driven, answer=answer, used=used, notes=(*test.notes, *told))

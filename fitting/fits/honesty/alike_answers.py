@@ -66,9 +66,9 @@ def with_own_noise(fit: TimeFit) -> TimeFit:
 
 
 def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
-    """Return the estimate with some larger standard errors. `root` (P, k) is the square root of a second covariance of
-    the P parameters, with k columns. If the second covariance gives a standard error more than `_UNEVEN_FROM` times
-    larger, this standard error is used."""
+    """Return the estimate, in which some standard errors are replaced by larger ones from a second covariance. `root`
+    (P, k) is the square root of this covariance of the P parameters, with k columns. A standard error is replaced if
+    the second covariance gives a value more than `_UNEVEN_FROM` times larger."""
     ratio = np.linalg.norm(root, axis=1) / np.where(estimate.standard_errors > 0, estimate.standard_errors, np.inf)
     factor = np.where(np.isfinite(ratio) & (ratio > _UNEVEN_FROM), ratio, 1.0)
     return estimate._replace(
@@ -119,8 +119,8 @@ def _modes_of(fit: TimeFit | Together) -> Callable:
     return partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
 
 
-#: Noise of constant size is assumed if the log of its probability exceeds that of noise proportional to the response by
-#: more than this value.
+#: Noise of constant size is compared with noise that is proportional to the response. Constant size is assumed if the
+#: log of its probability is larger by more than this value.
 _CONSTANT = 3.0
 
 
@@ -144,9 +144,9 @@ def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool
 def _of_such_noise(
     estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray, independent: float | None = None
 ) -> Estimate:
-    """Return the estimate with standard errors from another covariance of the p unknowns u. `root` (p, k): square root
-    of this covariance, with k columns. `independent`: number of independent residuals, or None if it does not
-    change."""
+    """Return the estimate with standard errors from another covariance of the p unknowns u. `natural_of`: function from
+    u to the parameters. `root` (p, k): square root of this covariance, with k columns. `independent`: number of
+    independent residuals, or None if it does not change."""
     root = host.with_jacobian(natural_of, u)[1] @ root
     errors, correlation = errors_and_correlation(root)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
@@ -160,10 +160,10 @@ AFit = TypeVar("AFit", TimeFit, Together)
 
 def with_offset_errors(fit: AFit, tests: Sequence[Measured], factors: Sequence[float]) -> tuple[AFit, float]:
     """Return (fit, error): the fit with larger standard errors, which also contain the errors of the sensor offsets
-    that were subtracted from the data.
+    and drifts that were subtracted from the data.
 
-    `error` is the standard error [Pa] of the equilibrium modulus due to these offsets alone. All measured values of a
-    test contain the same offset error, so more measured values do not make this standard error smaller.
+    `error` is the standard error [Pa] of the equilibrium modulus due to these base lines alone. All measured values of
+    a test contain the same error of the base line, so more measured values do not make this standard error smaller.
 
     Args:
         fit: the fit of these tests.
@@ -173,9 +173,10 @@ def with_offset_errors(fit: AFit, tests: Sequence[Measured], factors: Sequence[f
     J, u, row, columns = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.u), 0, []
     for test, factor in zip(tests, factors, strict=True):
         scales = reported_numbers(test)[2] * factor
-        if isinstance(test, TimeTest) and test.offset_error > 0:
+        errors = test.base_line_errors(time_tests.thinned(test)) if isinstance(test, TimeTest) else ()
+        for error in errors:
             change = np.zeros(len(J))
-            change[row : row + len(scales)] = test.offset_error / scales
+            change[row : row + len(scales)] = error / scales
             columns.append(change)
         row += len(scales)
     if not columns:
@@ -193,7 +194,8 @@ def _with_shifts(
     estimate: Estimate, natural_of: Callable, u: np.ndarray, shifts: np.ndarray
 ) -> tuple[Estimate, np.ndarray]:
     """Return the estimate with additional independent errors, and the changes of the parameters due to these errors.
-    Each column of `shifts` is the change of the unknowns u if one of the errors is one standard deviation."""
+    `natural_of`: function from the unknowns u to the parameters. Each column of `shifts` belongs to one error, and is
+    the change of u if this error is one standard deviation."""
     moved = host.with_jacobian(natural_of, u)[1] @ shifts
     root = np.column_stack([estimate.root, moved])
     errors, correlation = errors_and_correlation(root)

@@ -7,7 +7,8 @@ import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from fitting.readers import trios_json, workbook
+from fitting.readers import workbook
+from fitting.readers.tables import trios_json
 from liverjax.core.errors import InputError
 
 #: Maximum length of a line: Python's CSV reader cannot read longer cells.
