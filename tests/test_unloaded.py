@@ -213,6 +213,48 @@ def test_the_relaxed_body_lies_as_given():
 
 
 @pytest.mark.slow
+def test_mixed_elements_of_a_viscous_body_return_to_the_given_shape():
+    """The part of the bulk modulus in the displacement terms depends on the shear modulus. The search used the relaxed
+    modulus, the run used the other one: the body stayed 6 % of its motion away from the given shape.
+    """
+    table = content(2, viscosity={"ratios": [0.8], "relaxation_times": [0.01], "part": "isochoric"})
+    table["law"] |= {"mu": 3000.0, "bulk": 1e5}
+    table["mesh"]["size"] = [0.06, 0.03, 0.03]
+    table["solve"] |= {"dt": 0.5, "steps": 30, "volumetric": "mixed"}
+    scene = scene_from(table)
+    found = lj.unloaded(scene)
+    back = lj.simulate(found.scene).check().positions[-1] - scene.mesh.points
+    assert np.abs(np.asarray(back)[: scene.mesh.number_of_vertices]).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_the_default_stiffness_of_an_obstacle_is_that_of_the_run():
+    """The search used the stiffness that follows from the relaxed modulus, which was five times smaller."""
+    plane = {"shape": "plane", "position": [0, 0, 1.5e-6], "axis": [0, 0, 1], "where": {"x_min": 0.02, "z_max": 0.0}}
+    table = content(viscosity={"ratios": [0.8], "relaxation_times": [0.1]}, obstacle=[plane])
+    table["mesh"] |= {"size": [0.06, 0.04, 0.03], "cells": [3, 2, 2]}
+    table["body"]["gravity"] = [0, 0, -3.0]
+    table["solve"]["dt"] = 0.5
+    scene = scene_from(table)
+    stiffness = scene.physics[0].in_body(scene.mesh, scene.law).stiffness
+    given = replace(scene, physics=(replace(scene.physics[0], stiffness=stiffness),))
+    own, same = (np.asarray(lj.unloaded(s).scene.mesh.points - s.mesh.points) for s in (scene, given))
+    # The stiffness depends on the size of the triangles, which differs a little between the two shapes.
+    assert np.abs(own - same).max() < 0.05 * np.abs(same).max()
+
+
+@pytest.mark.slow
+def test_a_loaded_shape_with_inverted_elements_is_refused():
+    """The edges of loaded quadratic elements are curved. The elements were checked with straight edges."""
+    table = content(2, law={"name": "neo_hookean", "mu": 600.0, "bulk": 6e5})
+    table["mesh"] |= {"size": [0.1, 0.04, 0.04], "cells": [4, 2, 2]}
+    table["body"]["gravity"] = [2.8, 0, -2.1]
+    table["solve"] |= {"volumetric": "mixed"}
+    with pytest.raises(InputError, match="no reference shape was found"):
+        lj.unloaded(scene_from(table))
+
+
+@pytest.mark.slow
 def test_an_obstacle_that_comes_later_changes_nothing():
     """A sphere that presses on the body during the run is not part of the load in the scan."""
     sphere = {"shape": "sphere", "radius": 0.01, "position": [0.03, 0.005, 0.021], "by": [0, 0, -0.004]}

@@ -44,6 +44,7 @@ def law_at_rest(scene: Any) -> Law:
 def physics_of(scene: Any) -> tuple[Physics, ...]:
     """Return all physics objects (law, viscosity, loads, supports, …) that act in a `liverjax.scenes.scene.Scene`."""
     law, averaged, mixed = law_at_rest(scene), scene.solve.volumetric == "nodal", scene.solve.volumetric == "mixed"
+    unrelaxed = scene.law if scene.unrelaxed is None else scene.unrelaxed
     if averaged or mixed:
         law = isochoric_part(scene.law)
     solid: Physics = Elasticity(law=law)
@@ -55,7 +56,7 @@ def physics_of(scene: Any) -> tuple[Physics, ...]:
     elif averaged:
         found.append(AveragedVolume(law=scene.law))
     elif mixed:
-        found.append(MixedVolume(law=scene.law))
+        found.append(MixedVolume(law=unrelaxed))
     body = scene.body
     if body is not None and scene.solve.kind == "dynamic":
         found.append(Inertia(density=body.density, integrator=scene.solve.integrator, mass=body.mass))
@@ -63,4 +64,4 @@ def physics_of(scene: Any) -> tuple[Physics, ...]:
         keys = ("density", "gravity", "times", "history")
         weight = {} if body is None else {key: getattr(body, key) for key in keys}
         found.append(Loads(traction=scene.traction, **weight))
-    return (*found, *(p.in_body(scene.mesh, scene.law) for p in scene.physics))
+    return (*found, *(p.in_body(scene.mesh, unrelaxed) for p in scene.physics))

@@ -26,7 +26,8 @@ def by_element(scene: Scene) -> Scene:
             prony = viscosity_of_elements(prony, scene.region, mesh.number_of_elements)
         if sponge is not None:
             sponge = porosity_of_elements(sponge, scene.region, mesh)
-    return replace(scene, law=mesh.at_points(law), viscosity=prony, porosity=sponge, region=())
+    law, unrelaxed = mesh.at_points((law, scene.unrelaxed))
+    return replace(scene, law=law, unrelaxed=unrelaxed, viscosity=prony, porosity=sponge, region=())
 
 
 def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Law:

@@ -115,6 +115,9 @@ class Scene:
     traction: tuple[Traction, ...] = param("1", "loads", default=())
     physics: tuple[Physics, ...] = unnamed("further physics: supports, …", places="named", default=())
     solve: Solve = param("1", "how it is solved", default=Solve())
+    #: Law before its stress relaxed, if `law` is relaxed (`liverjax.simulation.unloaded.resting`). The default
+    #: stiffness of obstacles and the terms of mixed elements depend on this law, so that they are those of the run.
+    unrelaxed: Law | None = param("1", "law before its stress relaxed; None: the law itself", default=None)
     points_are: str = static(
         default="reference", about="reference: the mesh is unloaded; loaded: the mesh is the shape under the loads"
     )
@@ -131,7 +134,7 @@ def named_physics(scene: Scene) -> list[tuple[str, Physics]]:
 
 
 def histories(scene: Scene) -> dict[str, object]:
-    """Return the entries of a scene with a history, by name: body, motions, loads, inlets, supports and obstacles."""
+    """Return all entries of a scene that have a history, by name: body, motions, loads, inlets, supports, obstacles."""
     inlets = () if scene.porosity is None else scene.porosity.inlet
     parts: dict[str, object] = {"body": scene.body}
     for key, several in (("displaced", scene.displaced), ("traction", scene.traction), ("porosity.inlet", inlets)):

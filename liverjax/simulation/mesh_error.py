@@ -20,7 +20,7 @@ multiplied by 4/3, because an error of second order is a quarter as large on the
 
 In dynamics the errors of the steps accumulate. The richer run has consistent masses, so that the added functions have
 the same acceleration under gravity as the other functions. The inertia forces follow from the accelerations of the
-richer run. Each step of the richer run is linearised at its positions before the step plus the displacement of the
+richer run. Each step is linearised at the positions of the richer run before the step, plus the displacement of the
 first run in this step.
 """
 
@@ -82,7 +82,7 @@ _ROUNDS, _SETTLED = 24, 1e-3
 #: With a flowing fluid, the solves end if the relative residual (as for `_SETTLED`) is below this value. One solve is
 #: not exact, because it only approximates the inverse of the pressure matrix (`liverjax.physics.darcy.nearly_solved`).
 _WITH_FLUID = 1e-5
-#: If the change from a repeated solve does not reduce the residual, it is halved, at most this number of times.
+#: If the change from a repeated solve does not reduce the residual, the change is halved, at most this number of times.
 _HALVINGS = 4
 
 
@@ -90,7 +90,7 @@ _HALVINGS = 4
 class MeshError:
     """Estimated mesh error of a run of T steps: how the result would change on an infinitely fine mesh.
 
-    The numbers of a step that was not `found` show at most the size of its error.
+    If `found` is false for a step, the numbers of this step show only the order of magnitude of the error.
     """
 
     positions: jax.Array = param("m", "(T, V, 3)")
@@ -104,7 +104,7 @@ class MeshError:
         """Return a quantity of interest and its estimated change on an infinitely fine mesh.
 
         The sum of both is the corrected quantity. The error bar is `BAR` times the absolute value of the change. A
-        warning is given if a step was not `found` (not inside jit).
+        warning is given if `found` is false for a step (not inside jit).
 
         Args:
             of: function (positions (T, V, 3), reactions (T, V, 3)) -> the quantity, as a pytree of numbers. The change
@@ -131,15 +131,15 @@ def mesh_error_of(
 ) -> MeshError:
     """Estimate the mesh error of a run that began at the reference positions.
 
-    The node numbers of the scene must be known (not inside jit), and the run must contain all steps.
+    The node numbers of the scene must be known (not inside jit), and the arrays must contain all steps of the run.
 
     Args:
         scene: the scene that was run (`liverjax.simulation.run.prepared`).
         positions, reactions: positions [m] and reactions [N] of the run (T, V, 3) with T steps.
         pressure: pressures [Pa] of the run (T, V), if it has a fluid.
-        finer: function of a richer mesh (E elements with Q integration points) -> numbers by dotted name, (Q, E) each,
-            or (E,) if Q = 1. They replace the numbers of the scene, which vary less than they should within an element.
-            The estimate then contains this error, too.
+        finer: function of a richer mesh (E elements with Q integration points) -> dotted names with values (Q, E), or
+            (E,) if Q = 1. These values replace the numbers of the scene, which do not vary enough within an element.
+            The estimate then also contains the error due to these numbers.
 
     Raises:
         InputError: the scene has another mesh than the run, or uses the one-step scheme, which has an additional error.
@@ -176,7 +176,7 @@ class Richer:
         return jnp.concatenate([x, jnp.zeros((rich.number_of_nodes - len(x), 3), x.dtype)])
 
     def on_nodes(self, force: jax.Array, number_of_nodes: int) -> jax.Array:
-        """Forces (V, 3) [N] on the nodes of the run, from forces on the functions of the richer space."""
+        """Convert forces on the functions of the richer space to forces (V, 3) [N] on the nodes of the run."""
         rich = self.scene.mesh
         if self.within is not None:
             return self.within.forces(force, number_of_nodes)
@@ -214,12 +214,13 @@ def _with_richer_elements(scene: Scene) -> Scene:
     sponge = None if rich.porosity is None else sponge_at_points(rich.porosity, rich.mesh)
     # With lumped masses, the added functions would have a different acceleration under gravity.
     body = None if rich.body is None else replace(rich.body, mass="consistent")
-    rich = replace(rich, law=rich.mesh.at_points(rich.law), porosity=sponge, body=body, solve=solve)
+    law, unrelaxed = rich.mesh.at_points((rich.law, rich.unrelaxed))
+    rich = replace(rich, law=law, unrelaxed=unrelaxed, porosity=sponge, body=body, solve=solve)
     return replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
 
 
 def _may_lock(scene: Scene) -> bool:
-    """Whether the bulk modulus exceeds `_LOCKS` times the shear modulus in any material; True if moduli are unknown."""
+    """Return whether bulk modulus / shear modulus exceeds `_LOCKS` in any material; True if the moduli are unknown."""
     laws = list(laws_of(scene.law, scene.region))
     for region in scene.region:
         own = scene.law
@@ -294,12 +295,12 @@ def _step(scene: Scene, rich: Richer, sizes: Sizes, state: State, given: Any) ->
     return advanced(e, End(end.x, end.F, end.pressure), by_end_forces), (change, found)
 
 
-#: Result of a linear solve: the change dq, the number of iterations, and whether the matrix was positive definite.
+#: Result of a linear solve: the change dq, the number of iterations, and whether the solve succeeded.
 _Solved = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _Solved]:
-    """Return the unknowns about which the last linear system is linearised, and the solution of this system.
+    """Return the unknowns at which the equations were linearised last, and the solution of this linear system.
 
     Without contact and without a flowing fluid, there is one solve, at q. With contact, more solves are needed to find
     the contact points in the richer space. With a flowing fluid, more solves are needed because one solve is not exact.

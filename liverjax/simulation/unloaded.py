@@ -20,7 +20,7 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, replace
 from liverjax.elements.gradients import volume_ratios
-from liverjax.mesh.tetrahedra import TetMesh, with_points
+from liverjax.mesh.tetrahedra import with_points
 from liverjax.physics.prescribed import Fixed
 from liverjax.physics.viscosity import lasting
 from liverjax.scenes.scene import Scene
@@ -62,7 +62,7 @@ def unload(scene: Scene) -> Unloaded:
 
 
 def resting(scene: Scene) -> Scene:
-    """Return the scene of the same body after a long time under the loads of time 0: static and fully relaxed."""
+    """Return a static scene of the same body, which has fully relaxed under the loads at time 0."""
     if scene.springpots is not None:
         scene = replace(scene, viscosity=series_at_rest(scene.springpots), springpots=None)
     law = scene.law
@@ -80,12 +80,13 @@ def resting(scene: Scene) -> Scene:
     # There is one step with dt = 0, so each history has its first value.
     solve = replace(scene.solve, kind="static", steps=1, dt=0.0, newton="converged", robust="off")
     changed: Content = {"fixed": (*scene.fixed, *held), "physics": tuple(p.at_beginning() for p in scene.physics)}
-    return replace(scene, law=law, viscosity=None, displaced=(), solve=solve, points_are="reference", **changed)
+    changed |= {"displaced": (), "solve": solve, "points_are": "reference"}
+    return replace(scene, law=law, unrelaxed=scene.law, viscosity=None, **changed)
 
 
 @jax.jit
 def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Reference positions (V, 3) [m], status code, and residual divided by the norm of all forces."""
+    """Find the reference positions (V, 3) [m]. Return them, a status code, and the relative residual."""
     one, given = jnp.ones((), scene.mesh.points.dtype), scene.mesh.points
     sizes = force_sizes(scene)
     first = jax.lax.stop_gradient(equations(scene, initial_state(scene), one, sizes))
@@ -95,14 +96,16 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
     K = tangent.tangent(first, pressure, given, one)
 
     def held(z: jax.Array) -> jax.Array:
-        e, q = _with_displacements(scene, given, z, sizes)
+        e, q = _with_displacements_in(scene, given, z, sizes)
         # Unknowns that are not free must be 0. Equations for this are added, so that the matrix has no empty rows.
         return residual(e, q, one)[0] + (z - _free_part(first, z))
 
     options = _OPTIONS._replace(tolerance=jax.lax.stop_gradient(scene.solve.tolerance))
     z, found = newton_root(held, jnp.zeros_like(q), tangent.preconditioner(first, K), loads, options)
-    mesh = _reference_shape(scene.mesh, given, first, z)
-    good = jnp.all(volume_ratios(mesh, given) > 0) & jnp.all(mesh.volumes > 0)
+    u = _displacements_in(first, z)
+    mesh = with_points(scene.mesh, given - u)
+    # Loaded quadratic elements have curved edges, so their middles are not those of the given mesh.
+    good = jnp.all(volume_ratios(mesh, mesh.points + u) > 0) & jnp.all(mesh.volumes > 0)
     code = jnp.where((found.status == status.CONVERGED) & ~good, status.INVERTED, found.status)
     return mesh.points, code, found.residual
 
@@ -113,18 +116,17 @@ def _free_part(e: Equations, z: jax.Array) -> jax.Array:
     return jnp.concatenate([jnp.concatenate(e.free.columns(columns(z[:n]))), z[n:]])
 
 
-def _reference_shape(mesh: TetMesh, given: jax.Array, e: Equations, z: jax.Array) -> TetMesh:
-    u = jnp.stack(e.free.columns(columns(z[: 3 * mesh.number_of_nodes])), axis=-1)
-    return with_points(mesh, given - u)
+def _displacements_in(e: Equations, z: jax.Array) -> jax.Array:
+    """Return the displacements (V, 3) [m] in the unknowns z. Held nodes have the displacement 0."""
+    return jnp.stack(e.free.columns(columns(z[: 3 * e.mesh.number_of_nodes])), axis=-1)
 
 
-def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
+def _with_displacements_in(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
     """Return the equations of the body with the reference shape that follows from the unknowns z, and the unknowns of
     the loaded body."""
-    n = 3 * scene.mesh.number_of_nodes
     still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)
-    mesh = _reference_shape(scene.mesh, given, still, z)
+    mesh = with_points(scene.mesh, given - _displacements_in(still, z))
     one = replace(scene, mesh=mesh)
     e = equations(one, initial_state(one), jnp.ones((), given.dtype), sizes)
-    u = jnp.stack(e.free.columns(columns(z[:n])), axis=-1)
-    return e, jnp.concatenate([flat(e.free.vectors(mesh.points + u)), z[n:]])
+    x = mesh.points + _displacements_in(e, z)
+    return e, jnp.concatenate([flat(e.free.vectors(x)), z[3 * mesh.number_of_nodes :]])
